@@ -1,0 +1,1 @@
+"""Digital twin of an underwater laser triangulation sensor: renders captures with Mitsuba 3."""
