@@ -1,0 +1,1 @@
+"""Calibration of the sensor: camera, laser sheet and window from captures."""

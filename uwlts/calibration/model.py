@@ -1,0 +1,142 @@
+"""The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from uwlts.errors import CaptureError
+from uwlts.files import written_aside
+from uwlts.placement import camera_from_object, laser_pose
+from uwlts.sensor import Description, Distortion, Positive, Sensor, Vector
+
+FORMAT = "uwlts-calibration"
+VERSION = 1
+Matrix4 = tuple[tuple[float, float, float, float], ...]
+
+
+class CameraModel(Description):
+    """Pinhole with Brown-Conrady distortion, as OpenCV has it; pixel (0, 0) is the centre of the first pixel."""
+
+    width_px: int
+    height_px: int
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: float
+    cy_px: float
+    distortion: Distortion = Distortion()
+
+    def matrix(self) -> np.ndarray:
+        """Camera matrix K (3, 3)."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    def coefficients(self) -> np.ndarray:
+        """Distortion coefficients (5,) in OpenCV's order k1 k2 p1 p2 k3."""
+        d = self.distortion
+        return np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+
+
+class WindowModel(Description):
+    """The camera's window as the reconstruction sees it, in the camera frame.
+
+    ``refractions`` is 2 for a glass plate (air, glass, medium) and 1 for a single interface between air and medium, as
+    in the thesis's first model; then thickness and glass index are not used. ``distance_mm`` runs along the camera's
+    axis from the entrance pupil to the inner face (or to the single interface).
+    """
+
+    refractions: Literal[1, 2]
+    distance_mm: Positive
+    normal: Vector = (0.0, 0.0, 1.0)
+    thickness_mm: Annotated[float, Field(ge=0)] = 0.0
+    glass_index: Annotated[float, Field(ge=1, lt=4)] = 1.0
+
+
+class SheetModel(Description):
+    """The laser sheet as a plane in the camera frame: the points x with ``normal . x = offset_mm``."""
+
+    normal: Vector
+    offset_mm: float
+
+
+class Calibration(Description):
+    """A calibrated sensor.
+
+    ``window`` is None where none stands in the light's way, or where its effect in air was left to the distortion and
+    no calibration in water has been made. ``camera_from_object`` is the 4x4 matrix ``T_camera_object`` of the OCS: X
+    normal to the sheet, Z along the laser's axis, Y along the stripe. ``stripe_along`` is as in the sensor description.
+    ``residuals`` are named figures of each step, ``provenance`` tells what the calibration was made from.
+    """
+
+    sensor_name: str
+    stripe_along: Literal["width", "height"]
+    wavelength_nm: Positive
+    camera: CameraModel
+    window: WindowModel | None
+    sheet: SheetModel
+    camera_from_object: Matrix4
+    residuals: dict[str, Any] = {}
+    provenance: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _rigid(self) -> "Calibration":
+        rotation = np.array(self.camera_from_object)[:3, :3]
+        if np.shape(self.camera_from_object) != (4, 4) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise ValueError("camera_from_object must be a 4x4 rigid transform")
+        if not np.isclose(np.linalg.norm(self.sheet.normal), 1, atol=1e-6):
+            raise ValueError(f"the sheet's normal {self.sheet.normal} is not a unit vector")
+        return self
+
+    def object_transform(self) -> np.ndarray:
+        """``T_camera_object`` as an array (4, 4)."""
+        return np.array(self.camera_from_object)
+
+
+def nominal_calibration(sensor: Sensor, *, window: bool = True) -> Calibration:
+    """The calibration a sensor would have if it were built exactly as its description says."""
+    camera, pose = sensor.camera, laser_pose(sensor)
+    f, (cx, cy) = camera.focal_length_px(), camera.principal_point()
+    plate = camera.window
+    return Calibration(
+        sensor_name=sensor.name,
+        stripe_along=camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
+        camera=CameraModel(
+            width_px=camera.width_px, height_px=camera.height_px, fx_px=f, fy_px=f, cx_px=cx, cy_px=cy,
+            distortion=camera.distortion,
+        ),
+        window=WindowModel(
+            refractions=2, distance_mm=plate.distance_mm, normal=tuple(plate.normal()),
+            thickness_mm=plate.thickness_mm, glass_index=plate.index(sensor.laser.wavelength_nm),
+        ) if window and plate.mounted else None,
+        sheet=SheetModel(normal=tuple(pose.normal), offset_mm=float(pose.normal @ pose.origin_mm)),
+        camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
+        provenance={"source": f"description of the sensor '{sensor.name}'"},
+    )  # fmt: skip
+
+
+def write_calibration(path: str | Path, calibration: Calibration, *, overwrite: bool = False) -> None:
+    """Write a calibration as indented JSON, whole or not at all; OutputError where that fails."""
+    content = {"format": FORMAT, "version": VERSION} | calibration.model_dump(mode="json")
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read a calibration; CaptureError where the file is missing, foreign, newer or damaged."""
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read the calibration {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise CaptureError(f"{path} is not a calibration, or is truncated: {error}") from error
+    if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
+        raise CaptureError(f"{path} is JSON but not a calibration: expected \"format\": \"{FORMAT}\"")
+    if (version := content.pop("version", None)) != VERSION:
+        raise CaptureError(f"{path} has version {version}; this program reads {VERSION}")
+    try:
+        return Calibration.model_validate(content)
+    except ValidationError as error:
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
+        raise CaptureError(f"{path} is not a valid calibration: {details}") from error

@@ -1,0 +1,259 @@
+"""Description of a sensor: what drawings and data sheets say, read from TOML, validated when made.
+
+Everything here is nominal. Lengths are mm, the camera frame is x right, y down, z along the optical axis with its
+origin at the entrance pupil; all refractive indices are relative to air.
+"""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from uwlts import media
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Vector = tuple[float, float, float]
+
+
+class Description(BaseModel):
+    """Base of all descriptions: frozen, unknown keys and non-finite numbers refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Window(Description):
+    """A flat window before a module. ``distance_mm`` runs along the module's axis from its origin to the inner face.
+
+    The normal is the module's axis turned by ``tilt_x_deg`` about the module's x axis, then ``tilt_y_deg`` about its y
+    axis. ``glass`` is a name known to `uwlts.media` or a refractive index relative to air. An unmounted window is
+    left out of the light's way: the module looks straight into the medium, which is then air.
+    """
+
+    distance_mm: Positive
+    thickness_mm: Positive
+    glass: str | Annotated[float, Field(gt=1, lt=4)]
+    aperture_diameter_mm: Positive
+    tilt_x_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.0
+    tilt_y_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.0
+    absorption_per_m: NotNegative | None = None
+    mounted: bool = True
+
+    @field_validator("glass")
+    @classmethod
+    def _known_glass(cls, value: str | float) -> str | float:
+        if isinstance(value, str):
+            media.find_glass(value)
+        return value
+
+    def index(self, wavelength_nm: float) -> float:
+        """Refractive index of the glass relative to air."""
+        return self.glass if isinstance(self.glass, float) else media.glass_index(self.glass, wavelength_nm=wavelength_nm)
+
+    def absorption_per_mm(self) -> float:
+        """Absorption of the glass in 1/mm: the given value, else the named glass's at 635 nm, else none."""
+        if self.absorption_per_m is not None:
+            return 1e-3 * self.absorption_per_m
+        return 1e-3 * media.find_glass(self.glass).absorption_per_m if isinstance(self.glass, str) else 0.0
+
+    def normal(self) -> np.ndarray:
+        """Unit normal (3,) in the module's frame, pointing along the light of a camera ray (away from the module)."""
+        x, y = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
+        return np.array([math.cos(x) * math.sin(y), -math.sin(x), math.cos(x) * math.cos(y)])
+
+
+class Distortion(Description):
+    """Brown-Conrady coefficients in OpenCV's order and sense."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+
+class Camera(Description):
+    """Image sensor and lens. ``focal_length_mm`` is the pinhole's image distance (camera constant).
+
+    ``stripe_along`` tells along which side of the image the laser stripe runs: "width" (1280 in the thesis's camera,
+    one peak per column) or "height" (1024, one peak per row). It also places the laser: above the camera (-y) for
+    "width", to its right (+x) for "height".
+    """
+
+    width_px: Annotated[int, Field(ge=16, le=20000)]
+    height_px: Annotated[int, Field(ge=16, le=20000)]
+    pixel_size_um: Positive
+    focal_length_mm: Positive
+    principal_point_px: tuple[float, float] | None = None
+    distortion: Distortion = Distortion()
+    f_number: Positive
+    focus_distance_mm: Positive
+    stripe_along: Literal["width", "height"]
+    window: Window
+
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point in px; the image centre unless given. Pixel (0, 0) is the centre of the first pixel."""
+        return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+    def focal_length_px(self) -> float:
+        """Focal length in pixels."""
+        return 1e3 * self.focal_length_mm / self.pixel_size_um
+
+    def lines(self) -> int:
+        """Number of profile lines in an image: its columns if the stripe runs along the width, else its rows."""
+        return self.width_px if self.stripe_along == "width" else self.height_px
+
+
+class Laser(Description):
+    """Sheet source. Place it by ``baseline_mm`` and ``triangulation_angle_deg``, or by ``origin_mm`` and ``axis``.
+
+    The baseline runs in the camera's x-y plane from the entrance pupil to the fan's origin, the angle lies between the
+    camera's and the laser's axis. ``waist_radius_mm`` is the 1/e2 radius across the sheet at ``waist_distance_mm`` from
+    the origin, in the medium of use. ``roll_deg`` turns the fan about the laser's axis.
+    """
+
+    wavelength_nm: Annotated[float, Field(ge=400, le=700)]
+    power_mw: Positive
+    fan_angle_deg: Annotated[float, Field(gt=0, lt=120)]
+    roll_deg: Annotated[float, Field(gt=-90, lt=90)] = 0.0
+    waist_radius_mm: Positive
+    waist_distance_mm: Positive
+    beam_quality_m2: Annotated[float, Field(ge=1)] = 1.0
+    baseline_mm: Positive | None = None
+    triangulation_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
+    origin_mm: Vector | None = None
+    axis: Vector | None = None
+    window: Window
+
+    @model_validator(mode="after")
+    def _placed_once(self) -> "Laser":
+        by_angle = (self.baseline_mm is not None, self.triangulation_angle_deg is not None)
+        by_axis = (self.origin_mm is not None, self.axis is not None)
+        if (all(by_angle), any(by_axis)) != (True, False) and (any(by_angle), all(by_axis)) != (False, True):
+            raise ValueError("place the laser by baseline_mm and triangulation_angle_deg, or by origin_mm and axis")
+        if self.axis is not None and np.linalg.norm(self.axis) < 1e-9:
+            raise ValueError(f"axis {self.axis} has no direction")
+        return self
+
+
+class Medium(Description):
+    """Air, fresh or sea water by temperature and salinity, or any medium with its index given.
+
+    ``absorption_per_m`` and ``scattering_per_m`` replace the tables of pure water. ``phase`` is the phase function of
+    the scattering: "molecular", or "henyey-greenstein" with ``asymmetry`` for water with particles.
+    """
+
+    kind: Literal["air", "fresh", "sea", "custom"]
+    temperature_c: float = 20.0
+    salinity_g_kg: NotNegative = 0.0
+    index: Annotated[float, Field(ge=1, lt=2)] | None = None
+    absorption_per_m: NotNegative | None = None
+    scattering_per_m: NotNegative | None = None
+    phase: Literal["molecular", "henyey-greenstein"] = "molecular"
+    asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.924
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Medium":
+        if self.kind == "custom" and self.index is None:
+            raise ValueError("a custom medium needs its index")
+        if self.kind == "fresh" and self.salinity_g_kg > 0:
+            raise ValueError(f"fresh water with salinity {self.salinity_g_kg:g} g/kg: use kind = 'sea'")
+        if self.kind in ("fresh", "sea") and self.index is None:
+            self.refractive_index(635.0)
+        return self
+
+    def refractive_index(self, wavelength_nm: float) -> float:
+        """Refractive index relative to air; RangeError outside the formula's range."""
+        if self.index is not None:
+            return self.index
+        if self.kind == "air":
+            return 1.0
+        return media.water_index(
+            wavelength_nm=wavelength_nm, temperature_c=self.temperature_c, salinity_g_kg=self.salinity_g_kg
+        )
+
+    def absorption_per_mm(self, wavelength_nm: float) -> float:
+        """Absorption coefficient a in 1/mm."""
+        if self.absorption_per_m is not None:
+            return 1e-3 * self.absorption_per_m
+        water = self.kind in ("fresh", "sea")
+        return 1e-3 * media.water_absorption_per_m(wavelength_nm=wavelength_nm) if water else 0.0
+
+    def scattering_per_mm(self, wavelength_nm: float) -> float:
+        """Scattering coefficient b in 1/mm."""
+        if self.scattering_per_m is not None:
+            return 1e-3 * self.scattering_per_m
+        if self.kind not in ("fresh", "sea"):
+            return 0.0
+        return 1e-3 * media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
+
+
+class Detector(Description):
+    """Image sensor after EMVA 1288: photons to electrons to grey values. The gain maps the full well to full scale."""
+
+    bits: Literal[8, 10, 12]
+    quantum_efficiency: Annotated[float, Field(gt=0, le=1)]
+    full_well_e: Positive
+    read_noise_e: NotNegative
+    dark_current_e_per_s: NotNegative = 0.0
+    black_level_dn: NotNegative = 0.0
+
+    def full_scale_dn(self) -> int:
+        """Largest grey value."""
+        return 2**self.bits - 1
+
+    def gain_dn_per_e(self) -> float:
+        """Overall system gain K in grey values per electron."""
+        return self.full_scale_dn() / self.full_well_e
+
+
+class Exposure(Description):
+    """Exposure of laser and of lamp images in ms; "auto" brings the brightest light to ``auto_level`` of full scale."""
+
+    laser_ms: Positive | Literal["auto"] = "auto"
+    lamp_ms: Positive | Literal["auto"] = "auto"
+    auto_level: Annotated[float, Field(gt=0.05, lt=1)] = 0.8
+    longest_ms: Positive = 1000.0
+
+
+class Lamp(Description):
+    """Diffuse light on the target when the laser is off: the irradiance it puts on every surface."""
+
+    irradiance_w_per_m2: Positive = 5.0
+
+
+class Stage(Description):
+    """Linear stage that moves the sensor."""
+
+    travel_mm: Positive
+    resolution_mm: Positive
+    settling_s: NotNegative = 0.0
+
+
+class Volume(Description):
+    """Measuring volume along the camera's axis, counted from the outer face of its window."""
+
+    near_mm: Positive
+    far_mm: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Volume":
+        if self.near_mm >= self.far_mm:
+            raise ValueError(f"near_mm {self.near_mm:g} must be smaller than far_mm {self.far_mm:g}")
+        return self
+
+
+class Sensor(Description):
+    """A complete sensor with the media it is used in."""
+
+    name: str
+    notes: str = ""
+    camera: Camera
+    laser: Laser
+    detector: Detector
+    exposure: Exposure = Exposure()
+    lamp: Lamp = Lamp()
+    stage: Stage
+    volume: Volume
+    media: dict[str, Medium]
