@@ -1,0 +1,84 @@
+# Everything runs in a virtual environment in .venv, which the first target that needs it sets up.
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+INSTALLED := $(VENV)/.installed
+
+# An activated environment, or settings that redirect Python or pip, must not reach into .venv.
+unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_NO_INPUT := 1
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test bench setup clean
+
+help:
+	@echo "make demo    scan with the simulated sensor and show the result"
+	@echo "make test    run the tests"
+	@echo "make bench   measure speed"
+	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
+	@echo "make clean   remove .venv, .llvm, caches and build results"
+
+demo: setup
+	@$(PYTHON) -m twin.demo
+
+test: setup
+	@$(PYTHON) -m pytest -q
+
+bench: setup
+	@$(PYTHON) -m tests.bench
+
+setup: $(INSTALLED)
+	@$(PYTHON) -m twin.llvm --install
+
+$(INSTALLED): pyproject.toml
+	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV) && $(create_venv); }
+	@echo "setup: installing the project and its libraries into $(VENV) (about a minute)"
+	@$(PYTHON) -m pip install --quiet --editable '.[test]'
+	@touch $@
+
+clean:
+	@rm -rf $(VENV) .llvm build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.
+define create_venv
+{ \
+	python=; incomplete=; \
+	for name in python3.13 python3.12 python3.11 python3; do \
+		$$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || continue; \
+		if $$name -c 'import venv, ensurepip' 2>/dev/null; then python=$$name; break; fi; \
+		incomplete=$${incomplete:-$$name}; \
+	done; \
+	if [ -z "$$python$$incomplete" ]; then \
+		echo "error: no Python 3.11 or newer: tried python3.13, python3.12, python3.11 and python3. Install one" \
+			"(Debian, Ubuntu: apt-get install python3 python3-venv) and run make again." >&2; \
+		exit 2; \
+	fi; \
+	if [ -z "$$python" ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		package=$$($$incomplete -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'); \
+		echo "setup: installing $$package (apt-get install)"; \
+		log=$$(mktemp); \
+		for step in install update install; do \
+			if [ $$step = update ]; then apt-get update; \
+			else DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends "$$package" && break; \
+			fi; \
+		done >"$$log" 2>&1 </dev/null; \
+		if $$incomplete -c 'import venv, ensurepip' 2>/dev/null; then python=$$incomplete; \
+		else tail -n 5 "$$log" >&2; fi; \
+		rm -f "$$log"; \
+	fi; \
+	if [ -n "$$python" ]; then \
+		echo "setup: creating $(VENV) with $$python"; \
+		"$$python" -m venv $(VENV); \
+	elif command -v virtualenv >/dev/null; then \
+		echo "setup: creating $(VENV) with virtualenv and $$incomplete"; \
+		virtualenv --quiet --python "$$incomplete" $(VENV); \
+	else \
+		echo "error: $$incomplete has no venv with pip. Install it (Debian, Ubuntu: apt-get install python3-venv) or" \
+			"install virtualenv, and run make again." >&2; \
+		exit 2; \
+	fi; \
+}
+endef

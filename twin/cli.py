@@ -1,0 +1,109 @@
+"""The ``twin`` command: renders virtual recordings."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+import uwlts
+from twin.scene import load_scene, scene_names
+from twin.variant import CPU, GPU, use_variant
+from uwlts.console import progress_bar, run
+from uwlts.errors import DescriptionError
+from uwlts.library import load_sensor, names
+
+app = App(
+    name="twin",
+    help="Digital twin of an underwater laser triangulation sensor.",
+    version=uwlts.__version__,
+    help_format="plaintext",
+)
+
+
+@app.command
+def simulate(
+    scene: str,
+    *,
+    sensor: str = "thesis",
+    out: Path,
+    as_built: str | None = None,
+    placement: str | None = None,
+    medium: str | None = None,
+    spp: int = 16,
+    seed: int = 0,
+    ideal: Annotated[bool, Parameter(negative="")] = False,
+    resume: Annotated[bool, Parameter(negative="")] = False,
+    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
+) -> None:
+    """Render a scene into a capture, with the ground truth in a file beside it.
+
+    Example: twin simulate spheres --sensor thesis --placement far --out spheres-far.h5
+
+    Parameters
+    ----------
+    scene
+        Name of a scene (see: twin scenes) or path of its TOML file.
+    sensor
+        Name or path of the sensor description that the capture states.
+    out
+        Capture to write, such as capture.h5; the truth goes to capture.truth.h5.
+    as_built
+        Name or path of the sensor that is really rendered, if it differs from the description.
+    placement
+        Named place of the objects, such as near, standoff or far.
+    medium
+        Name of one of the sensor's media, in place of the scene's.
+    spp
+        Samples per lit pixel.
+    seed
+        Seed of all noise; the same seed gives the same capture.
+    ideal
+        Leave out all noise of the detector.
+    resume
+        Go on with an interrupted run.
+    overwrite
+        Replace existing files.
+    variant
+        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
+    """
+    changes = {"placement": placement, "medium": medium}
+    description = load_scene(scene, changes={key: value for key, value in changes.items() if value is not None})
+    nominal = load_sensor(sensor)
+    built = load_sensor(as_built) if as_built else None
+    if built and built.camera.model_dump(include={"width_px", "height_px", "stripe_along"}) != nominal.camera.model_dump(
+        include={"width_px", "height_px", "stripe_along"}
+    ):
+        raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{sensor}'")
+    use_variant(variant)
+    from twin.simulate import Options
+    from twin.simulate import simulate as record
+
+    options = Options(spp=spp, seed=seed, ideal=ideal)
+    with progress_bar(f"{description.title}, {description.placement}") as progress:
+        record(
+            description, nominal, out, as_built=built, options=options, overwrite=overwrite, resume=resume, progress=progress
+        )
+    print(f"wrote {out}")
+
+
+@app.command
+def scenes() -> None:
+    """List the scenes and sensors that ship with the program.
+
+    Example: twin scenes
+    """
+    for name in scene_names():
+        scene = load_scene(name)
+        print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
+    print(f"sensors: {', '.join(names('sensors'))}")
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(app))
+
+
+if __name__ == "__main__":
+    main()

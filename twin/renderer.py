@@ -1,0 +1,225 @@
+"""Renders what reaches the image sensor: laser and lamp images as irradiance, only where there is light.
+
+A frame is made in two passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe (or, under
+the lamp, the pixels in which the picture changes); only these are rendered with many samples, all others take the mean
+of their nodes. The windows stand still before the camera, so the nodes' rays behind the window are traced once; the
+objects stand still in the scene, so nothing is rebuilt or recompiled between frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.camera import LensRays
+from twin.objects import build_objects
+from twin.scene import Scene
+from twin.sheet import Sheet
+from twin.water import single_scattering
+from twin.windows import WindowFaces
+from uwlts.placement import camera_from_object, check_design
+from uwlts.sensor import Medium, Sensor
+
+NODE_SPACING_PX = 2
+LIT_SIGMAS = 4.5
+"""The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
+CHANGE_SHARE = 2e-3
+"""Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Camera rays in the medium, in the sensor's OCS: origins, unit directions, and sensor irradiance per radiance."""
+
+    origin: mi.Point3f
+    direction: mi.Vector3f
+    weight: mi.Float
+
+
+class SensorPose:
+    """Where the sensor's OCS stands in the scene, kept opaque so that moving it never recompiles a kernel."""
+
+    def __init__(self, scene_from_object: np.ndarray):
+        to_scene = mi.Matrix4f(scene_from_object)
+        to_object = mi.Matrix4f(np.linalg.inv(scene_from_object))
+        dr.make_opaque(to_scene, to_object)
+        self._to_scene, self._to_object = mi.Transform4f(to_scene), mi.Transform4f(to_object)
+
+    def ray(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Ray3f:
+        """A ray of the OCS in the scene."""
+        return mi.Ray3f(self._to_scene @ origin, self._to_scene @ direction)
+
+    def direction(self, direction: mi.Vector3f) -> mi.Vector3f:
+        """A direction of the OCS in the scene."""
+        return self._to_scene @ direction
+
+    def normal(self, normal: mi.Normal3f) -> mi.Vector3f:
+        """A direction of the scene in the OCS."""
+        return self._to_object @ mi.Vector3f(normal)
+
+
+class Renderer:
+    """One sensor in one medium before one scene.
+
+    Raises
+    ------
+    DesignError, DescriptionError
+        The sensor cannot work in the medium, or an object cannot be built.
+    """
+
+    def __init__(self, sensor: Sensor, medium: Medium, scene: Scene):
+        self.view = check_design(sensor, medium)
+        self.sensor, self.medium = sensor, medium
+        self.wavelength_nm = sensor.laser.wavelength_nm
+        self.objects = build_objects(scene)
+        self.sheet = Sheet(sensor, medium)
+        self.lens = LensRays(sensor.camera)
+        self._faces = WindowFaces(
+            sensor.camera.window, medium, wavelength_nm=self.wavelength_nm, origin_mm=np.zeros(3), rotation=np.eye(3)
+        )
+        self._to_object = np.linalg.inv(camera_from_object(sensor))
+        self._extinction = medium.absorption_per_mm(self.wavelength_nm) + medium.scattering_per_mm(self.wavelength_nm)
+        self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
+
+    def bundle(self, x: mi.Float, y: mi.Float) -> Bundle:
+        """Rays behind the window of image points; pixel (0, 0) is the centre of the first pixel."""
+        directions = self.lens.directions(x, y)
+        path = self._faces.through(mi.Point3f(0.0), directions, mode=mi.TransportMode.Radiance)
+        transform = mi.Transform4f(mi.Matrix4f(self._to_object))
+        cosine = dr.square(dr.square(directions.z))
+        weight = dr.select(path.valid, path.weight * cosine * self.lens.irradiance_on_axis(), 0.0)
+        return Bundle(transform @ path.origin, transform @ path.direction, weight)
+
+    def _grid(self, spacing: int) -> tuple[Bundle, tuple[int, int]]:
+        """Rays of the nodes at pixel corners every ``spacing`` pixels, and the grid's shape (rows, columns)."""
+        if spacing not in self._grids:
+            camera = self.sensor.camera
+            columns, rows = -(-camera.width_px // spacing) + 1, -(-camera.height_px // spacing) + 1
+            x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
+            bundle = self.bundle(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)))
+            dr.eval(bundle.origin, bundle.direction, bundle.weight)
+            self._grids[spacing] = bundle, (rows, columns)
+        return self._grids[spacing]
+
+    def irradiance(self, light: Literal["lamp", "laser"], scene_from_object: np.ndarray, *, spp: int, seed: int) -> np.ndarray:
+        """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
+
+        ``spp`` samples are taken per lit pixel, low-discrepancy and shifted per pixel by ``seed``.
+        """
+        pose = SensorPose(scene_from_object)
+        if light == "laser":
+            image, fine = self.laser_nodes(pose)
+        else:
+            image, fine = self._lamp_nodes(pose)
+        rows, columns = np.nonzero(fine)
+        if len(rows):
+            image[rows, columns] = self._fine(light, pose, rows, columns, spp=spp, seed=seed)
+        return image
+
+    def laser_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Haze (H, W) in W/mm2 from the nodes, and the mask (H, W) of pixels close to the lit stripe."""
+        bundle, shape = self._grid(NODE_SPACING_PX)
+        ray = pose.ray(bundle.origin, bundle.direction)
+        hit = self.objects.ray_intersect_preliminary(ray)
+        valid = hit.is_valid() & (bundle.weight > 0)
+        light = self.sheet.at(bundle.origin + bundle.direction * dr.select(valid, hit.t, 1.0))
+        across = dr.select(valid, light.distance_mm / light.sigma_mm, dr.inf)
+        haze = bundle.weight * self._haze(pose, bundle, valid, hit.t, light.distance_mm)
+        dr.eval(across, haze)
+        corners = _corners(across.numpy().reshape(shape))
+        with np.errstate(invalid="ignore"):
+            near = (np.abs(corners).min(axis=0) < LIT_SIGMAS) | (corners.min(axis=0) * corners.max(axis=0) < 0)
+        return self._spread(_corners(haze.numpy().reshape(shape)).mean(axis=0)), self._spread(near)
+
+    def _lamp_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Lamp image (H, W) in W/mm2 from the pixels' corners, and the mask of pixels in which it changes."""
+        bundle, shape = self._grid(1)
+        corners = _corners(self._lamp(pose, bundle).numpy().reshape(shape))
+        change = corners.max(axis=0) - corners.min(axis=0)
+        return corners.mean(axis=0), change > CHANGE_SHARE * corners.max()
+
+    def _spread(self, cells: np.ndarray) -> np.ndarray:
+        """Values of grid cells given to their pixels, (H, W)."""
+        camera = self.sensor.camera
+        full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
+        return full[: camera.height_px, : camera.width_px]
+
+    def _fine(
+        self, light: str, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, *, spp: int, seed: int
+    ) -> np.ndarray:
+        """Mean irradiance (P,) in W/mm2 over the area of pixels."""
+        count = len(rows)
+        x, y = mi.Float(columns.astype(np.float32)), mi.Float(rows.astype(np.float32))
+        number = mi.UInt32((rows * self.sensor.camera.width_px + columns).astype(np.uint32))
+        opaque_seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
+        index = dr.arange(mi.UInt32, count * spp)
+        pixel, sample = index // spp, mi.Float(index % spp)
+        shift_x, shift_y = mi.sample_tea_32(dr.gather(mi.UInt32, number, pixel), opaque_seed)
+        to_unit = 2.0**-32
+        # The R2 sequence (Roberts 2018): additive recurrence with powers of the plastic number.
+        u = sample * 0.7548776662 + mi.Float(shift_x) * to_unit
+        v = sample * 0.5698402910 + mi.Float(shift_y) * to_unit
+        bundle = self.bundle(
+            dr.gather(mi.Float, x, pixel) + u - dr.floor(u) - 0.5, dr.gather(mi.Float, y, pixel) + v - dr.floor(v) - 0.5
+        )
+        values = self.laser(pose, bundle) if light == "laser" else self._lamp(pose, bundle)
+        return dr.block_sum(values, spp).numpy() / spp
+
+    def laser(self, pose: SensorPose, bundle: Bundle) -> mi.Float:
+        """Irradiance of laser light per ray, in W/mm2: the lit surface seen through the water, and the haze before it."""
+        ray = pose.ray(bundle.origin, bundle.direction)
+        si = self.objects.ray_intersect(ray)
+        valid = si.is_valid() & (bundle.weight > 0)
+        point = bundle.origin + bundle.direction * si.t
+        light = self.sheet.at(point)
+        towards = pose.direction(-light.direction)
+        lit = valid & (light.irradiance > 0) & ~self._shadowed(si.p, towards, light.exit_mm, valid)
+        reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(towards), lit)[0]
+        radiance = dr.select(lit, reflected * light.irradiance * dr.exp(-self._extinction * si.t), 0.0)
+        return bundle.weight * (radiance + self._haze(pose, bundle, valid, si.t, light.distance_mm))
+
+    def _shadowed(self, p: mi.Point3f, towards: mi.Vector3f, exit_mm: mi.Float, active: mi.Bool) -> mi.Bool:
+        """Whether an object stands between points of the scene and the laser's window."""
+        ray = mi.Ray3f(p + towards * 1e-2, towards)
+        ray.maxt = exit_mm - 2e-2
+        return self.objects.ray_test(ray, active)
+
+    def _haze(
+        self, pose: SensorPose, bundle: Bundle, on_surface: mi.Bool, depth: mi.Float, across: mi.Float
+    ) -> mi.Float | float:
+        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr; no more than one crossing."""
+        if self.medium.scattering_per_mm(self.wavelength_nm) == 0:
+            return 0.0 * bundle.weight
+        t = -bundle.origin.x / bundle.direction.x
+        for _ in range(2):
+            light = self.sheet.at(bundle.origin + bundle.direction * t)
+            t -= light.distance_mm / dr.dot(bundle.direction, light.normal)
+        end = dr.select(on_surface, across * dr.sign(bundle.direction.x), dr.inf)
+        scattered = single_scattering(
+            self.medium, light, wavelength_nm=self.wavelength_nm, direction=bundle.direction, surface_distance_mm=end
+        )
+        ray = pose.ray(bundle.origin + bundle.direction * t, -light.direction)
+        blocked = self._shadowed(ray.o, ray.d, light.exit_mm, scattered > 0)
+        return dr.select((t > 0) & ~blocked, scattered * dr.exp(-self._extinction * t), 0.0)
+
+    def _lamp(self, pose: SensorPose, bundle: Bundle) -> mi.Float:
+        """Irradiance of lamp light per ray in W/mm2: every surface evenly lit, seen through the water."""
+        si = self.objects.ray_intersect(pose.ray(bundle.origin, bundle.direction))
+        valid = si.is_valid() & (bundle.weight > 0)
+        # A diffuse surface reflects the irradiance E as the radiance albedo E / pi; looking at it square on, the
+        # BSDF's value times cosine is albedo / pi.
+        straight = mi.SurfaceInteraction3f(si)
+        straight.wi = mi.Vector3f(0.0, 0.0, 1.0)
+        facing = valid & (si.wi.z > 0)
+        albedo = si.bsdf().eval(mi.BSDFContext(), straight, mi.Vector3f(0.0, 0.0, 1.0), facing)[0]
+        lamp = 1e-6 * self.sensor.lamp.irradiance_w_per_m2
+        return dr.select(facing, bundle.weight * albedo * lamp * dr.exp(-self._extinction * si.t), 0.0)
+
+
+def _corners(nodes: np.ndarray) -> np.ndarray:
+    """The four corners (4, rows - 1, columns - 1) of every grid cell."""
+    return np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]])

@@ -1,0 +1,199 @@
+"""A virtual recording: renders a scene's shots into a capture, with the ground truth in a file beside it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import mitsuba as mi
+import numpy as np
+
+from twin.detector import electrons_per_ms, grey_values
+from twin.renderer import Renderer
+from twin.scene import Scene, Shot
+from twin.truth import FrameTruth, depth_map, no_stripe, true_stripe
+from uwlts.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.errors import DescriptionError, DesignError, OutputError
+from uwlts.placement import camera_from_object
+from uwlts.sensor import Medium, Sensor
+from uwlts.truth import Truth, TruthHeader, truth_path, write_truth
+
+Progress = Callable[[int, int], None]
+PROBE_SPP = 4
+BRIGHT_SHARE = 0.98
+"""Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to render: samples per lit pixel, seed, and whether the detector is ideal (noise-free)."""
+
+    spp: int = 16
+    seed: int = 0
+    ideal: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.spp <= 65536:
+            raise DescriptionError(f"spp is {self.spp}; take 1 to 65536 samples per lit pixel")
+        if self.seed < 0:
+            raise DescriptionError(f"seed is {self.seed}; it must not be negative")
+
+
+def medium_of(sensor: Sensor, scene: Scene) -> Medium:
+    """The medium that a scene names, from the sensor's list."""
+    if scene.medium not in sensor.media:
+        raise DescriptionError(f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{scene.medium}'")
+    return sensor.media[scene.medium]
+
+
+def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
+    """The sensor with its camera's window in place or taken off."""
+    window = sensor.camera.window.model_copy(update={"mounted": mounted})
+    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
+
+
+def check_scene(renderer: Renderer, scene: Scene) -> None:
+    """Refuse a scene whose objects the sensor cannot measure, with numbers.
+
+    Raises
+    ------
+    DesignError
+        All objects lie outside the depth of the measuring volume, or the scan never brings the sheet to them.
+    """
+    volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
+    # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
+    nearest, farthest = ((edge - renderer.view.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
+    box = renderer.objects.bbox()
+    offsets = np.array([shot.stage_mm * scene.motion.unit_direction() for shot in scene.motion.shots()])
+    low, high = (np.array(corner) - offsets for corner in (box.min, box.max))
+    if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
+        raise DesignError(
+            f"the objects lie from Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm about the stand-off, outside the "
+            f"measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
+        )
+    if not ((low[:, 0] <= 0) & (high[:, 0] >= 0)).any():
+        raise DesignError(
+            f"the sheet never meets the objects: seen from the sensor they stay between X = {low[:, 0].min():.1f} and "
+            f"{high[:, 0].max():.1f} mm, the sheet is at X = 0: change the motion or the objects' position"
+        )
+
+
+class Studio:
+    """A sensor before a scene, ready to take shots; exposures are settled once, before the first."""
+
+    def __init__(self, sensor: Sensor, scene: Scene, options: Options):
+        self.sensor = with_window(sensor, mounted=sensor.camera.window.mounted and scene.window_mounted)
+        self.scene, self.options = scene, options
+        self.medium = medium_of(sensor, scene)
+        self.renderer = Renderer(self.sensor, self.medium, scene)
+        check_scene(self.renderer, scene)
+        self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
+
+    def pose(self, shot: Shot) -> np.ndarray:
+        """``T_scene_object`` (4, 4) of the sensor's OCS at a shot."""
+        transform = np.eye(4)
+        transform[:3, 3] = shot.stage_mm * self.scene.motion.unit_direction()
+        return transform
+
+    def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W) of a shot."""
+        irradiance = self.renderer.irradiance(shot.light, self.pose(shot), spp=spp, seed=seed)
+        return electrons_per_ms(
+            irradiance, self.sensor.camera, self.sensor.detector, wavelength_nm=self.sensor.laser.wavelength_nm
+        )
+
+    def image(self, shot: Shot, index: int) -> np.ndarray:
+        """Grey values (H, W) of a shot; the noise depends only on the seed and the frame's index."""
+        rng = None if self.options.ideal else np.random.default_rng([self.options.seed, index])
+        frame_seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
+        exposure = self.exposure_ms[shot.light]
+        light = exposure * self.electrons_per_ms(shot, spp=self.options.spp, seed=frame_seed)
+        return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng)
+
+    def _exposure(self, light: Literal["lamp", "laser"]) -> float:
+        """Exposure in ms as described, or so that the first, middle or last shot just reaches the wanted level."""
+        wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
+        if wanted != "auto":
+            return wanted
+        shots = [shot for shot in self.scene.motion.shots() if shot.light == light]
+        axis = 0 if self.sensor.camera.stripe_along == "width" else 1
+        brightest = 0.0
+        for shot in {0: shots[0], 1: shots[len(shots) // 2], 2: shots[-1]}.values():
+            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP, seed=0).max(axis=axis)
+            if (peaks > 0).any():
+                brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
+        longest = self.sensor.exposure.longest_ms
+        level = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
+        return min(longest, level / brightest) if brightest > 0 else longest
+
+
+def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> CaptureHeader:
+    """What an operator would note in the capture: nominal values only."""
+    window_mounted = studio.sensor.camera.window.mounted
+    return CaptureHeader(
+        name=name,
+        sensor=with_window(nominal, mounted=window_mounted),
+        medium_name=scene.medium,
+        medium=medium_of(nominal, scene),
+        stage_direction=scene.motion.recorded_direction(),
+        saturation_dn=nominal.detector.full_scale_dn(),
+        target=scene.target,
+        artefact=scene.artefact,
+        provenance={
+            "source": "twin", "seed": studio.options.seed, "spp": studio.options.spp, "ideal": studio.options.ideal,
+            "variant": mi.variant(), "mitsuba": version("mitsuba"), "drjit": version("drjit"), "uwlts": version("uwlts"),
+        },
+    )  # fmt: skip
+
+
+def simulate(
+    scene: Scene,
+    sensor: Sensor,
+    path: str | Path,
+    *,
+    as_built: Sensor | None = None,
+    options: Options = Options(),
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> None:
+    """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
+
+    Images show ``as_built`` (the sensor itself unless given), the capture states ``sensor``. An interrupted run leaves
+    ``path.part`` with all complete frames; ``resume`` goes on from there and gives the same capture as an undisturbed
+    run. ``progress(done, total)`` is called after every frame.
+
+    Raises
+    ------
+    DesignError, DescriptionError
+        The sensor or the scene cannot work.
+    OutputError
+        A file exists already, or cannot be written.
+    """
+    path = Path(path)
+    if truth_path(path).exists() and not overwrite:
+        raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
+    built = as_built or sensor
+    studio = Studio(built, scene, options)
+    header = _header(path.stem, sensor, studio, scene)
+    shots = list(scene.motion.shots())
+    truths: list[FrameTruth] = []
+    dtype = np.uint8 if sensor.detector.bits == 8 else np.uint16
+    with CaptureWriter(path, header, dtype=dtype, overwrite=overwrite, resume=resume) as writer:
+        done = len(writer)
+        for index, shot in enumerate(shots):
+            if shot.light == "laser":
+                truths.append(true_stripe(studio.renderer, studio.pose(shot)))
+            else:
+                truths.append(no_stripe(built.camera.lines()))
+            if index >= done:
+                time_s = index * (sensor.stage.settling_s + 1e-3 * studio.exposure_ms[shot.light])
+                writer.append(
+                    Frame(studio.image(shot, index), shot.stage_mm, shot.light == "laser", studio.exposure_ms[shot.light], time_s)
+                )
+            progress(index + 1, len(shots))
+        truth_header = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
+        stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
+        truth = Truth(**stacked, depth_mm=depth_map(studio.renderer, studio.pose(shots[0])))
+        write_truth(truth_path(path), truth_header, truth, overwrite=overwrite or resume)

@@ -1,0 +1,102 @@
+"""Ground truth of a frame: where every profile line truly sees the middle of the sheet, and what lies there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.renderer import Renderer, SensorPose
+from uwlts.placement import camera_from_object
+from uwlts.truth import TruthStatus
+
+_FALSE_POSITIONS = 5
+"""Within one pixel the distance bends by about 1e-2 of its change: each step gains two digits."""
+_TOLERANCE_MM = 5e-4
+"""A root is where the surface truly passes the sheet's middle; across a depth edge the distance jumps instead."""
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """Truth of one frame, as in `uwlts.truth.Truth` without the frames' axis."""
+
+    centre_px: np.ndarray
+    point_mm: np.ndarray
+    normal: np.ndarray
+    status: np.ndarray
+    crossings: np.ndarray
+
+
+def no_stripe(lines: int) -> FrameTruth:
+    """Truth of a frame without laser light."""
+    nothing = np.full(lines, np.nan)
+    empty = np.zeros(lines, np.uint8)
+    return FrameTruth(nothing, np.full((lines, 3), np.nan), np.full((lines, 3), np.nan), empty + TruthStatus.NO_STRIPE, empty)
+
+
+def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth:
+    """True stripe of a frame, by false position on Mitsuba's own hit points along every profile line."""
+    camera = renderer.sensor.camera
+    pose = SensorPose(scene_from_object)
+    _, lit = renderer.laser_nodes(pose)
+    along_width = camera.stripe_along == "width"
+    line, cell = np.nonzero(lit.T if along_width else lit)
+    truth = no_stripe(camera.lines())
+    if len(line) == 0:
+        return truth
+
+    def position(across: mi.Float, at: mi.Float) -> tuple[mi.Float, mi.Float]:
+        return (at, across) if along_width else (across, at)
+
+    def distance(across: mi.Float, at: mi.Float) -> mi.Float:
+        bundle = renderer.bundle(*position(across, at))
+        hit = renderer.objects.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
+        light = renderer.sheet.at(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
+        return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
+
+    at, middle = mi.Float(line.astype(np.float32)), mi.Float(cell.astype(np.float32))
+    below, above = distance(middle - 0.5, at), distance(middle + 0.5, at)
+    dr.eval(below, above)
+    below, above = below.numpy(), above.numpy()
+    bracketed = (below <= 0) != (above <= 0)
+    bracketed &= np.isfinite(below) & np.isfinite(above)
+    line, cell, below, above = line[bracketed], cell[bracketed], below[bracketed], above[bracketed]
+    if len(line) == 0:
+        return truth
+    at, low = mi.Float(line.astype(np.float32)), mi.Float(cell.astype(np.float32) - 0.5)
+    high, below, above = low + 1.0, mi.Float(below), mi.Float(above)
+    for _ in range(_FALSE_POSITIONS):
+        centre = low + (high - low) * below / (below - above)
+        found = distance(centre, at)
+        same_side = (found <= 0) == (below <= 0)
+        low, below = dr.select(same_side, centre, low), dr.select(same_side, found, below)
+        high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
+    centre = low + (high - low) * below / (below - above)
+    bundle = renderer.bundle(*position(centre, at))
+    brightness = renderer.laser(pose, bundle)
+    si = renderer.objects.ray_intersect(pose.ray(bundle.origin, bundle.direction))
+    offset = distance(centre, at)
+    dr.eval(centre, brightness, si.p, si.n, offset)
+    brightness = brightness.numpy()
+    good = (np.abs(offset.numpy()) < _TOLERANCE_MM) & (brightness > 0)
+    dimmest_first = np.flatnonzero(good)[np.argsort(brightness[good], kind="stable")]
+    chosen = line[dimmest_first]
+    np.add.at(truth.crossings, chosen, 1)
+    truth.centre_px[chosen] = centre.numpy()[dimmest_first]
+    truth.point_mm[chosen] = si.p.numpy().T[dimmest_first]
+    truth.normal[chosen] = si.n.numpy().T[dimmest_first]
+    truth.status[chosen] = TruthStatus.VISIBLE
+    return truth
+
+
+def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
+    """Camera-frame z in mm (H, W), float32, of the surface that every pixel's centre sees; NaN where there is none."""
+    camera = renderer.sensor.camera
+    x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
+    bundle = renderer.bundle(mi.Float(x.ravel()), mi.Float(y.ravel()))
+    hit = renderer.objects.ray_intersect_preliminary(SensorPose(scene_from_object).ray(bundle.origin, bundle.direction))
+    point = mi.Transform4f(mi.Matrix4f(camera_from_object(renderer.sensor))) @ (bundle.origin + bundle.direction * hit.t)
+    depth = dr.select(hit.is_valid() & (bundle.weight > 0), point.z, dr.nan)
+    return depth.numpy().reshape(camera.height_px, camera.width_px)

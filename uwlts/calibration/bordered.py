@@ -1,0 +1,210 @@
+"""Levenberg-Marquardt for observations in groups: parameters shared by all groups, and some of each group's own."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.errors import CalibrationError
+
+_ROUNDS = 200
+_SMALLEST_STEP = 1e-11
+_SMALLEST_GAIN = 1e-13
+# Columns are scaled to length one: a smaller eigenvalue of the shared parameters' normal matrix is rounding.
+_SINGULAR = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Residuals (n, 2) of one group and their derivatives by shared (2 n, k) and own (2 n, b) parameters."""
+
+    residuals: np.ndarray
+    by_shared: np.ndarray
+    by_own: np.ndarray
+
+
+Model = Callable[[int, np.ndarray, np.ndarray], Observation | None]
+
+
+@dataclass(frozen=True, eq=False)
+class BorderedFit:
+    """Solution of a grouped least-squares problem.
+
+    Attributes
+    ----------
+    shared : (k,)
+    own : list of (b,)
+    residuals : list of (n, 2)
+    covariance : (k, k)
+        Of the shared parameters, scaled by the residuals' variance.
+    own_covariances : list of (b, b)
+    sigma : float
+        Standard deviation of one coordinate of a residual, with the degrees of freedom counted.
+    rounds : int
+    stopped : str
+        Why the iteration ended.
+    """
+
+    shared: np.ndarray
+    own: list[np.ndarray]
+    residuals: list[np.ndarray]
+    covariance: np.ndarray
+    own_covariances: list[np.ndarray]
+    sigma: float
+    rounds: int
+    stopped: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Normal equations in blocks, with columns scaled to length one, and the cost they belong to."""
+
+    cost: float
+    observations: list[Observation]
+    shared: np.ndarray
+    border: list[np.ndarray]
+    own: list[np.ndarray]
+    shared_gradient: np.ndarray
+    own_gradients: list[np.ndarray]
+    shared_scale: np.ndarray
+    own_scales: list[np.ndarray]
+
+
+def fit_bordered(
+    model: Model, shared: np.ndarray, own: Sequence[np.ndarray], *, soft_limit: float | None = None
+) -> BorderedFit:
+    """Least squares over all groups; each step eliminates the groups' own parameters (Schur complement).
+
+    Parameters
+    ----------
+    model : callable
+        (group, shared, own of the group) to its `Observation`, or None where the parameters have no meaning.
+    shared : (k,)
+        Start.
+    own : sequence of (b,)
+        Starts of the groups.
+    soft_limit : float, optional
+        Residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s; quadratic
+        without it.
+
+    Raises
+    ------
+    CalibrationError
+        The start has no meaning, the observations do not determine the parameters, or no end within 200 rounds.
+    """
+    shared, own = np.array(shared, dtype=np.float64), [np.array(o, dtype=np.float64) for o in own]
+    normal = _assembled(model, shared, own, soft_limit)
+    if normal is None:
+        raise CalibrationError("the calibration's start puts target points behind the camera: check points and poses")
+    damping = 1e-4
+    for rounds in range(1, _ROUNDS + 1):
+        shared_step, own_steps = _step(normal, damping)
+        tried_shared = shared + shared_step
+        tried_own = [value + step for value, step in zip(own, own_steps, strict=True)]
+        size = max(
+            float(np.max(np.abs(step * scale))) if len(step) else 0.0
+            for step, scale in zip((shared_step, *own_steps), (normal.shared_scale, *normal.own_scales), strict=True)
+        )
+        # Scaled steps are in the unit of the residuals, summed over all of them.
+        small = size <= _SMALLEST_STEP * np.sqrt(sum(o.residuals.size for o in normal.observations))
+        tried = _assembled(model, tried_shared, tried_own, soft_limit)
+        if tried is not None and tried.cost <= normal.cost:
+            gain = normal.cost - tried.cost
+            finished = small or gain <= _SMALLEST_GAIN * normal.cost
+            shared, own, normal, damping = tried_shared, tried_own, tried, max(damping / 10, 1e-12)
+            if finished:
+                return _account(shared, own, normal, rounds, "step below rounding" if small else "cost settled")
+        elif small or damping > 1e8:
+            return _account(shared, own, normal, rounds, "no step lowers the cost further")
+        else:
+            damping *= 10
+    raise CalibrationError(f"the camera calibration did not settle in {_ROUNDS} rounds: check points and poses")
+
+
+def _assembled(
+    model: Model, shared: np.ndarray, own: list[np.ndarray], soft_limit: float | None
+) -> _Normal | None:
+    observations, weights, cost = [], [], 0.0
+    for group, values in enumerate(own):
+        observation = model(group, shared, values)
+        if observation is None or not np.isfinite(observation.residuals).all():
+            return None
+        squares = np.sum(observation.residuals**2, axis=1)
+        if soft_limit is None:
+            weight, group_cost = np.ones(len(squares)), squares.sum()
+        else:
+            root = np.sqrt(1 + squares / soft_limit**2)
+            weight, group_cost = 1 / root, np.sum(2 * soft_limit**2 * (root - 1))
+        observations.append(observation)
+        weights.append(np.repeat(weight, 2))
+        cost += float(group_cost)
+    shared_scale = _lengths(sum(np.einsum("i,ij,ij->j", w, o.by_shared, o.by_shared) for o, w in zip(observations, weights, strict=True)))
+    matrix, gradient = np.zeros((len(shared),) * 2), np.zeros(len(shared))
+    border, blocks, gradients, scales = [], [], [], []
+    for observation, weight in zip(observations, weights, strict=True):
+        scale = _lengths(np.einsum("i,ij,ij->j", weight, observation.by_own, observation.by_own))
+        by_shared, by_own = observation.by_shared / shared_scale, observation.by_own / scale
+        weighted, residuals = weight[:, None] * by_own, weight * observation.residuals.ravel()
+        matrix += by_shared.T @ (weight[:, None] * by_shared)
+        gradient += by_shared.T @ residuals
+        border.append(by_shared.T @ weighted)
+        blocks.append(by_own.T @ weighted)
+        gradients.append(by_own.T @ residuals)
+        scales.append(scale)
+    return _Normal(cost, observations, matrix, border, blocks, gradient, gradients, shared_scale, scales)
+
+
+def _lengths(squares: np.ndarray) -> np.ndarray:
+    return np.where(squares > 0, np.sqrt(squares), 1.0)
+
+
+def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Damped step that lowers the cost; every block is positive definite for positive damping."""
+    reduced = normal.shared + damping * np.eye(len(normal.shared))
+    right = -normal.shared_gradient
+    inverses = [np.linalg.inv(block + damping * np.eye(len(block))) for block in normal.own]
+    for border, inverse, gradient in zip(normal.border, inverses, normal.own_gradients, strict=True):
+        reduced = reduced - border @ inverse @ border.T
+        right = right + border @ inverse @ gradient
+    step = np.linalg.lstsq(reduced, right, rcond=1e-15)[0]
+    own = [
+        -inverse @ (gradient + border.T @ step) / scale
+        for border, inverse, gradient, scale in zip(
+            normal.border, inverses, normal.own_gradients, normal.own_scales, strict=True
+        )
+    ]
+    return step / normal.shared_scale, own
+
+
+def _account(shared: np.ndarray, own: list[np.ndarray], normal: _Normal, rounds: int, stopped: str) -> BorderedFit:
+    undetermined = CalibrationError(
+        "the target images do not determine the camera: tilt the target differently between images, cover more of the "
+        "image, or fix some parameters (square pixels, principal point, fewer distortion coefficients)"
+    )
+    reduced = normal.shared.copy()
+    inverses = []
+    for border, block in zip(normal.border, normal.own, strict=True):
+        if np.linalg.eigvalsh(block)[0] < _SINGULAR:
+            raise undetermined
+        inverses.append(np.linalg.inv(block))
+        reduced -= border @ inverses[-1] @ border.T
+    if np.linalg.eigvalsh(reduced)[0] < _SINGULAR:
+        raise undetermined
+    count = sum(o.residuals.size for o in normal.observations)
+    freedom = count - len(shared) - sum(map(len, own))
+    sigma = float(np.sqrt(normal.cost / freedom))
+    covariance = np.linalg.inv(reduced)
+    own_covariances = []
+    for border, inverse, scale in zip(normal.border, inverses, normal.own_scales, strict=True):
+        spread = inverse @ border.T
+        own_covariances.append(sigma**2 * (inverse + spread @ covariance @ spread.T) / np.outer(scale, scale))
+    return BorderedFit(
+        shared=shared,
+        own=own,
+        residuals=[o.residuals for o in normal.observations],
+        covariance=sigma**2 * covariance / np.outer(normal.shared_scale, normal.shared_scale),
+        own_covariances=own_covariances,
+        sigma=sigma,
+        rounds=rounds,
+        stopped=stopped,
+    )

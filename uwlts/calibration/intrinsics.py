@@ -1,0 +1,91 @@
+"""Which camera parameters a calibration estimates, and how they make up the camera model."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uwlts.calibration.model import CameraModel
+from uwlts.sensor import Distortion
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """What is estimated.
+
+    Attributes
+    ----------
+    distortion : tuple of str
+        Those of k1, k2, p1, p2, k3 that are estimated; the others are zero.
+    square_pixels : bool
+        Whether fx and fy are one focal length f.
+    principal_point_px : (cx, cy), optional
+        Given, it is not estimated.
+    soft_limit_px : float, optional
+        Distances well beyond it count linearly ("soft L1") rather than squared.
+    """
+
+    distortion: tuple[str, ...] = ("k1", "k2")
+    square_pixels: bool = True
+    principal_point_px: tuple[float, float] | None = None
+    soft_limit_px: float | None = None
+
+    def __post_init__(self) -> None:
+        unknown = set(self.distortion) - set(DISTORTION)
+        if unknown or len(set(self.distortion)) < len(self.distortion):
+            raise ValueError(f"distortion takes each of {', '.join(DISTORTION)} once, not {self.distortion}")
+        if self.soft_limit_px is not None and not self.soft_limit_px > 0:
+            raise ValueError(f"soft_limit_px must be positive, not {self.soft_limit_px}")
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """The estimated parameters (P,) as a part of (fx, fy, cx, cy, k1, k2, p1, p2, k3): fixed + map @ estimated."""
+
+    options: CameraOptions
+    width_px: int
+    height_px: int
+    names: tuple[str, ...] = field(init=False)
+    map: np.ndarray = field(init=False)
+    fixed: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        order = ("fx", "fy", "cx", "cy", *DISTORTION)
+        centre = self.options.principal_point_px
+        names = [*(("f",) if self.options.square_pixels else ("fx", "fy")), *(() if centre else ("cx", "cy"))]
+        names += [name for name in DISTORTION if name in self.options.distortion]
+        rows = [[float(name == row or (name == "f" and row in ("fx", "fy"))) for name in names] for row in order]
+        object.__setattr__(self, "names", tuple(names))
+        object.__setattr__(self, "map", np.array(rows))
+        object.__setattr__(self, "fixed", np.array([0, 0, *(centre or (0, 0)), 0, 0, 0, 0, 0], dtype=np.float64))
+
+    def _all(self, estimated: np.ndarray) -> np.ndarray:
+        return self.fixed + self.map @ estimated
+
+    def matrix(self, estimated: np.ndarray) -> np.ndarray:
+        """Camera matrix K (3, 3)."""
+        fx, fy, cx, cy = self._all(estimated)[:4]
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    def coefficients(self, estimated: np.ndarray) -> np.ndarray:
+        """Distortion coefficients (5,) in OpenCV's order."""
+        return self._all(estimated)[4:]
+
+    def from_matrix(self, matrix: np.ndarray) -> np.ndarray:
+        """Start (P,) from a camera matrix of whatever skew and aspect, without distortion."""
+        fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+        values = {"f": (fx + fy) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        return np.array([values.get(name, 0.0) for name in self.names])
+
+    def plain_matrix(self, matrix: np.ndarray) -> np.ndarray:
+        """The nearest camera matrix (3, 3) that the options allow."""
+        return self.matrix(self.from_matrix(matrix))
+
+    def model(self, estimated: np.ndarray) -> CameraModel:
+        """The camera model."""
+        fx, fy, cx, cy, *coefficients = self._all(estimated).tolist()
+        return CameraModel(
+            width_px=self.width_px, height_px=self.height_px, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy,
+            distortion=Distortion(**dict(zip(DISTORTION, coefficients, strict=True))),
+        )  # fmt: skip

@@ -1,0 +1,214 @@
+"""A measured point cloud, and its file: binary PLY that CloudCompare and MeshLab open with all scalar fields."""
+
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from uwlts.errors import CaptureError
+from uwlts.files import written_aside
+
+NO_INDEX = -1
+"""Frame and line of points whose file does not name them."""
+
+_COMMENT = "uwlts-metadata"
+# CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
+_PIECE_LENGTH = 900
+_PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points in the object coordinate system (OCS) and what is known of each.
+
+    OCS: X normal to the laser sheet (the direction of the scan), Y along the stripe, Z parallel to the laser's axis,
+    away from the sensor.
+
+    Attributes
+    ----------
+    points_mm : (N, 3) float64
+        Position, mm, OCS; finite.
+    intensity : (N,) float32
+        Brightness of the stripe, in the units of the image; NaN where unknown.
+    frame, line : (N,) int32
+        Image of the scan and row (or column) of that image; -1 where unknown.
+    deviation_mm : (N,) float32 or None
+        Signed distance to the fitted or true surface; NaN where not evaluated.
+    metadata : dict
+        What JSON can hold: medium, sensor, artefact, capture, digest of the calibration.
+
+    Raises
+    ------
+    CaptureError
+        The arrays do not fit together, points are not finite, or the metadata is not JSON.
+    """
+
+    points_mm: np.ndarray
+    intensity: np.ndarray
+    frame: np.ndarray
+    line: np.ndarray
+    deviation_mm: np.ndarray | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        points = _read_only(self.points_mm, np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise CaptureError(f"the points of a cloud have the shape (N, 3), not {points.shape}")
+        unusable = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
+        if unusable:
+            raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
+        object.__setattr__(self, "points_mm", points)
+        for name, kind in (("intensity", np.float32), ("frame", np.int32), ("line", np.int32)):
+            object.__setattr__(self, name, _per_point(name, getattr(self, name), kind, len(points)))
+        if self.deviation_mm is not None:
+            deviation = _per_point("deviation_mm", self.deviation_mm, np.float32, len(points))
+            object.__setattr__(self, "deviation_mm", deviation)
+        _as_json(self.metadata)
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+
+def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
+    """Write a cloud as binary little-endian PLY, whole or not at all.
+
+    The vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). The metadata is JSON
+    in numbered comments, short enough for every reader.
+
+    Raises
+    ------
+    OutputError
+        The file exists and `overwrite` is not set, the folder is missing, the disk is full.
+    """
+    vertices = np.empty(
+        len(cloud),
+        dtype=[
+            ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
+            ("intensity", "<f4"), ("deviation", "<f4"), ("frame", "<i4"), ("line", "<i4"),
+        ],
+    )  # fmt: skip
+    vertices["x"], vertices["y"], vertices["z"] = cloud.points_mm.T
+    vertices["intensity"] = cloud.intensity
+    vertices["deviation"] = np.nan if cloud.deviation_mm is None else cloud.deviation_mm
+    vertices["frame"] = cloud.frame
+    vertices["line"] = cloud.line
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
+    with written_aside(path, overwrite=overwrite) as aside:
+        ply.write(str(aside))
+
+
+def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
+    """Read a cloud from PLY, its own or another program's (x, y, z are enough).
+
+    Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
+    missing frame and line are -1, a deviation that is missing or NaN throughout is None.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, not a PLY file, truncated, without vertices' x, y, z, or its metadata is damaged.
+    """
+    path = Path(path)
+    vertices, comments = _read_ply(path)
+    names = vertices.dtype.names or ()
+    missing = [axis for axis in "xyz" if axis not in names]
+    if missing:
+        raise CaptureError(f"{path}: the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
+
+    def column(name: str, default: float, kind: type) -> np.ndarray:
+        for known_as in (name, f"scalar_{name}"):
+            if known_as in names:
+                return _numbers(path, vertices, known_as).astype(kind)
+        return np.full(len(vertices), default, kind)
+
+    deviation = column("deviation", np.nan, np.float32)
+    try:
+        return PointCloud(
+            points_mm=np.column_stack([_numbers(path, vertices, axis).astype(np.float64) for axis in "xyz"]),
+            intensity=column("intensity", np.nan, np.float32),
+            frame=_indices(path, "frame", column("frame", NO_INDEX, np.float64)),
+            line=_indices(path, "line", column("line", NO_INDEX, np.float64)),
+            deviation_mm=None if np.isnan(deviation).all() else deviation,
+            metadata=_metadata(path, comments),
+        )
+    except CaptureError as error:
+        raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def _read_only(values: Any, kind: type) -> np.ndarray:
+    view = np.asarray(values, dtype=kind).view()
+    view.flags.writeable = False
+    return view
+
+
+def _per_point(name: str, values: Any, kind: type, count: int) -> np.ndarray:
+    column = _read_only(values, kind)
+    if column.shape != (count,):
+        raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {count} points")
+    return column
+
+
+def _as_json(metadata: dict[str, Any]) -> str:
+    try:
+        text = json.dumps(metadata, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError) as error:
+        raise CaptureError(f"the metadata of a cloud must be plain JSON without NaN: {error}") from error
+    if not isinstance(metadata, dict) or json.loads(text) != metadata:
+        raise CaptureError("the metadata of a cloud must be a dict of strings, numbers, booleans, lists and dicts")
+    return text
+
+
+def _comments(metadata: dict[str, Any]) -> list[str]:
+    text = _as_json(metadata)
+    pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
+    # The semicolon keeps a piece's last blank from being stripped by readers.
+    return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
+
+
+def _metadata(path: Path, comments: list[str]) -> dict[str, Any]:
+    own = [comment for comment in comments if comment.startswith(_COMMENT)]
+    if not own:
+        return {}
+    pieces = [_PIECE.fullmatch(comment) for comment in own]
+    wanted = [(str(number), str(len(own))) for number in range(1, len(own) + 1)]
+    if [piece and piece.groups()[:2] for piece in pieces] != wanted:
+        raise CaptureError(f"{path}: its metadata is incomplete; write the file again or remove those comments")
+    try:
+        metadata = json.loads("".join(piece.group(3) for piece in pieces if piece))
+    except json.JSONDecodeError as error:
+        raise CaptureError(f"{path}: its metadata is damaged: {error}") from error
+    if not isinstance(metadata, dict):
+        raise CaptureError(f"{path}: its metadata is a {type(metadata).__name__}; expected a JSON object")
+    return metadata
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray, list[str]]:
+    try:
+        ply = PlyData.read(str(path))
+    except FileNotFoundError as error:
+        raise CaptureError(f"{path} does not exist") from error
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (PlyParseError, ValueError, MemoryError) as error:
+        raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
+    if "vertex" not in ply:
+        raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
+    return ply["vertex"].data, ply.comments
+
+
+def _numbers(path: Path, vertices: np.ndarray, name: str) -> np.ndarray:
+    if vertices.dtype[name].kind not in "iuf":
+        raise CaptureError(f"{path}: the property {name} is a list; expected one number per point")
+    return vertices[name]
+
+
+def _indices(path: Path, name: str, values: np.ndarray) -> np.ndarray:
+    whole = np.isfinite(values) & (values == np.round(values)) & (np.abs(values) < 2**31)
+    if not whole.all():
+        raise CaptureError(f"{path}: {np.count_nonzero(~whole)} values of {name} are no whole numbers")
+    return values.astype(np.int32)

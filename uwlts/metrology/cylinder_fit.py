@@ -1,0 +1,208 @@
+"""Cylinder by orthogonal distances, with free or known radius, from a patch of its surface."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from uwlts.errors import EvaluationError
+from uwlts.metrology.least_squares import (
+    LARGEST_RELATIVE_STD,
+    accepted_points,
+    covariance_of,
+    evenly_thinned,
+    is_flat,
+    minimised,
+    normalise,
+    principal_axes,
+    require_convergence,
+)
+from uwlts.metrology.round_starts import algebraic_centres, centres_of_known_radius
+
+_THINNED = 600
+_NEIGHBOURS = 12
+_DIRECTIONS = 80
+_TRIED = 5
+_LARGEST_SLOPE_STD = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class CylinderFit:
+    """A cylinder through points.
+
+    Attributes
+    ----------
+    point_mm : (3,)
+        Point of the axis nearest to the centroid of the points.
+    axis : (3,)
+        Unit direction, its largest component positive.
+    across : (2, 3)
+        Unit directions normal to the axis and to each other.
+    radius_mm : float
+        Fitted, or the known one.
+    residuals_mm : (N,)
+        Distance to the axis less the radius, positive outside.
+    std_mm : float
+        Standard deviation of the residuals, with N less the number of parameters as degrees of freedom.
+    covariance : (5, 5) or (4, 4)
+        Of the offsets of the axis along `across` at `point_mm` (mm), its slopes towards them (rad) and, where it was
+        free, the radius (mm), for equal independent noise on all points.
+    """
+
+    point_mm: np.ndarray
+    axis: np.ndarray
+    across: np.ndarray
+    radius_mm: float
+    residuals_mm: np.ndarray
+    std_mm: float
+    covariance: np.ndarray
+
+    def distances_mm(self, points: np.ndarray) -> np.ndarray:
+        """Signed distances (M,) of any points (M, 3), as in `residuals_mm`."""
+        across = (np.asarray(points, dtype=np.float64) - self.point_mm) @ self.across.T
+        return np.hypot(across[:, 0], across[:, 1]) - self.radius_mm
+
+
+def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = None) -> CylinderFit:
+    """Least-squares cylinder through points (N, 3), mm.
+
+    Parameters
+    ----------
+    radius_mm : float, optional
+        Known radius; without it the radius is fitted.
+    axis_start : (3,), optional
+        Approximate direction of the axis. Without it the direction is searched: the principal axes of the points, the
+        direction most nearly normal to all local surface normals, and an even grid over the half sphere are judged by
+        a circle through the points seen along them; the best few are refined on some of the points.
+
+    Raises
+    ------
+    EvaluationError
+        Too few points (6, or 5 with known radius), points that are not finite or lie in one plane, or a patch so
+        small or noisy that it leaves the axis open.
+    """
+    what = "a cylinder fit"
+    points = accepted_points(points, least=6 if radius_mm is None else 5, what=what)
+    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
+        raise ValueError(f"a radius is positive, not {radius_mm}")
+    unit = normalise(points, what=what)
+    extents, _ = principal_axes(unit.points)
+    if is_flat(extents, 2):
+        raise EvaluationError(f"{what}: all {len(points)} points lie in one plane")
+    known = None if radius_mm is None else radius_mm / unit.scale_mm
+    thinned = evenly_thinned(unit.points, _THINNED)
+    trials = [_refined(thinned, frame, start, known) for frame, start in _starts(thinned, known, axis_start)]
+    frame, start, _ = min(trials, key=lambda trial: trial[2])
+    frame, parameters, cost = _refined(unit.points, frame, start, known)
+    require_convergence(cost, what=what)
+
+    covariance, std = covariance_of(_jacobian(parameters, unit.points, frame), cost, what="a cylinder")
+    radius = known if known is not None else float(parameters[4])
+    sigma = np.sqrt(np.diag(covariance))
+    if np.hypot(*sigma[:2]) > LARGEST_RELATIVE_STD * radius or np.hypot(*sigma[2:4]) > _LARGEST_SLOPE_STD:
+        raise EvaluationError(
+            f"the {len(points)} points do not determine a cylinder: its axis would be uncertain by "
+            f"{np.hypot(*sigma[:2]) * unit.scale_mm:.3g} mm and {np.degrees(np.hypot(*sigma[2:4])):.3g} deg, "
+            f"its radius {radius * unit.scale_mm:.3g} mm"
+        )
+    units = np.array([unit.scale_mm, unit.scale_mm, 1.0, 1.0, unit.scale_mm])[: len(parameters)]
+    point = unit.centroid_mm + unit.scale_mm * parameters[:2] @ frame[:2]
+    radius = float(radius_mm if radius_mm is not None else radius * unit.scale_mm)
+    across = (points - point) @ frame[:2].T
+    return CylinderFit(
+        point_mm=point,
+        axis=frame[2],
+        across=frame[:2],
+        radius_mm=radius,
+        residuals_mm=np.hypot(across[:, 0], across[:, 1]) - radius,
+        std_mm=std * unit.scale_mm,
+        covariance=covariance * np.outer(units, units),
+    )
+
+
+def _geometry(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray):
+    """Radial vectors (N, 3), positions along the axis (N,), stretch of the direction a + s u + t v."""
+    direction = frame[2] + parameters[2:4] @ frame[:2]
+    stretch = float(np.linalg.norm(direction))
+    direction = direction / stretch
+    away = points - parameters[:2] @ frame[:2]
+    along = away @ direction
+    return away - along[:, None] * direction, along, stretch
+
+
+def _residuals(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray, known: float | None) -> np.ndarray:
+    radial, _, _ = _geometry(parameters, points, frame)
+    return np.linalg.norm(radial, axis=1) - (parameters[4] if known is None else known)
+
+
+def _jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """With the radial unit vector e, normal to the axis: -e.u, -e.v; -along e.u / stretch, same with v; -1."""
+    radial, along, stretch = _geometry(parameters, points, frame)
+    radial /= np.maximum(np.linalg.norm(radial, axis=1, keepdims=True), np.finfo(float).tiny)
+    across = radial @ frame[:2].T
+    jacobian = np.full((len(points), len(parameters)), -1.0)
+    jacobian[:, :2] = -across
+    jacobian[:, 2:4] = -across * (along / stretch)[:, None]
+    return jacobian
+
+
+def _refined(points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None):
+    """Solution as (frame, parameters, cost) with the frame turned so that both slopes are zero."""
+    parameters, cost = minimised(
+        lambda x: _residuals(x, points, frame, known), lambda x: _jacobian(x, points, frame), start
+    )
+    turned = _frame(frame[2] + parameters[2:4] @ frame[:2])
+    foot = turned[:2] @ (parameters[:2] @ frame[:2])
+    return turned, np.array([*foot, 0.0, 0.0, *parameters[4:]]), cost
+
+
+def _frame(axis: np.ndarray) -> np.ndarray:
+    """Right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive."""
+    axis = axis / np.linalg.norm(axis)
+    if axis[np.argmax(np.abs(axis))] < 0:
+        axis = -axis
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(axis, first), axis])
+
+
+def _starts(points: np.ndarray, known: float | None, axis_start: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    if axis_start is None:
+        directions = np.vstack([principal_axes(points)[1], _normal_to_normals(points), _half_sphere(_DIRECTIONS)])
+    else:
+        directions = np.asarray(axis_start, dtype=np.float64).reshape(1, 3)
+        if not np.isfinite(directions).all() or not directions.any():
+            raise ValueError(f"axis_start must be a direction, not {axis_start}")
+    frames = np.array([_frame(direction) for direction in directions])
+    seen = np.einsum("nd,kcd->knc", points, frames[:, :2])
+    seen_mean = seen.mean(axis=1, keepdims=True)
+    centres, radii = algebraic_centres(seen - seen_mean)
+    centres += seen_mean[:, 0]
+    misfit = np.sum((np.linalg.norm(seen - centres[:, None], axis=2) - radii[:, None]) ** 2, axis=1)
+    starts = []
+    for best in np.argsort(misfit)[:_TRIED]:
+        if known is None:
+            starts.append((frames[best], np.array([*centres[best], 0.0, 0.0, radii[best]])))
+        else:
+            for centre in centres_of_known_radius(seen[best], known):
+                starts.append((frames[best], np.array([*centre, 0.0, 0.0])))
+    return starts
+
+
+def _normal_to_normals(points: np.ndarray) -> np.ndarray:
+    """The direction most nearly normal to the surface normals of small neighbourhoods."""
+    _, nearest = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
+    patches = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.swapaxes(patches, 1, 2) @ patches)
+    normals = vectors[:, :, 0]
+    return np.linalg.eigh(normals.T @ normals)[1][:, 0]
+
+
+def _half_sphere(count: int) -> np.ndarray:
+    """Evenly spread directions (count, 3) with z > 0: a Fibonacci lattice."""
+    step = np.arange(count) + 0.5
+    z = step / count
+    angle = np.pi * (3.0 - 5.0**0.5) * step
+    radius = np.sqrt(1.0 - z**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])

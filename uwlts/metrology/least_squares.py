@@ -1,0 +1,116 @@
+"""What all fits share: accepted points, coordinates of size one, a checked solution and its covariance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from uwlts.errors import EvaluationError
+
+# Singular values this much smaller than the largest one are rounding noise of coordinates of size one.
+_SINGULAR = 1e-9
+_STEPS = 300
+
+LARGEST_RELATIVE_STD = 0.2
+"""A radius that is uncertain by more than this share of itself may as well be infinite: the shape may be a plane."""
+
+
+@dataclass(frozen=True)
+class Normalised:
+    """Points moved to their centroid and scaled to a root mean square distance of one from it."""
+
+    points: np.ndarray
+    centroid_mm: np.ndarray
+    scale_mm: float
+
+
+def accepted_points(points: Any, *, least: int, what: str, dimensions: tuple[int, ...] = (3,)) -> np.ndarray:
+    """Refuse what no fit can use.
+
+    Raises
+    ------
+    EvaluationError
+        Fewer than `least` points, or points that are not finite.
+    ValueError
+        Not an (N, D) array with D in `dimensions`.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] not in dimensions:
+        raise ValueError(f"points of the shape (N, {' or '.join(map(str, dimensions))}) expected, not {points.shape}")
+    if len(points) < least:
+        raise EvaluationError(f"{what} needs at least {least} points; there are {len(points)}")
+    unusable = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
+    if unusable:
+        raise EvaluationError(f"{what}: {unusable} of {len(points)} points are not finite; leave them out")
+    return points
+
+
+def normalise(points: np.ndarray, *, what: str) -> Normalised:
+    """Centre and scale (N, D) points; all points in one place are refused."""
+    centroid = points.mean(axis=0)
+    centred = points - centroid
+    scale = float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
+    if scale <= 1e-12 * float(np.abs(centroid).max()):
+        raise EvaluationError(f"{what}: all {len(points)} points lie in one place")
+    return Normalised(centred / scale, centroid, scale)
+
+
+def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root sums of squares (D,) along, and directions (D, D) in rows of, the principal axes, the longest first.
+
+    By the singular values of the points themselves: their scatter matrix would lose half of the digits.
+    """
+    triangle = np.linalg.qr(points, mode="r")
+    _, extents, axes = np.linalg.svd(triangle)
+    return extents, axes
+
+
+def is_flat(extents: np.ndarray, dimension: int) -> bool:
+    """Whether points with these principal extents span no more than `dimension` directions."""
+    return bool(extents[dimension] <= _SINGULAR * extents[0])
+
+
+def evenly_thinned(points: np.ndarray, at_most: int) -> np.ndarray:
+    """At most about `at_most` of the points, spread evenly over their order."""
+    return points[:: max(1, -(-len(points) // at_most))]
+
+
+def minimised(
+    residuals: Callable[[np.ndarray], np.ndarray], jacobian: Callable[[np.ndarray], np.ndarray], start: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Parameters and sum of squares of a least-squares solution (Levenberg-Marquardt, MINPACK).
+
+    The sum is infinite where the search does not converge, so that the best of several starts can be taken.
+    """
+    solution = least_squares(
+        residuals, start, jac=jacobian, method="lm", xtol=1e-13, ftol=1e-15, gtol=1e-15, max_nfev=_STEPS
+    )
+    converged = solution.success and np.isfinite(solution.x).all()
+    return solution.x, 2.0 * float(solution.cost) if converged else np.inf
+
+
+def require_convergence(sum_of_squares: float, *, what: str) -> None:
+    """Raise EvaluationError for the infinite sum of a search that did not converge."""
+    if not np.isfinite(sum_of_squares):
+        raise EvaluationError(f"{what} does not converge; the points do not have this shape")
+
+
+def covariance_of(jacobian: np.ndarray, sum_of_squares: float, *, what: str) -> tuple[np.ndarray, float]:
+    """Covariance (P, P) of the parameters and standard deviation of one residual.
+
+    s2 (J^T J)^-1 with s2 = sum of squares / (N - P): equal, independent noise on every residual.
+
+    Raises
+    ------
+    EvaluationError
+        The Jacobian (N, P) is singular: some parameter could have any value.
+    """
+    count, parameters = jacobian.shape
+    _, strengths, directions = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
+    if not strengths[-1] > _SINGULAR * strengths[0]:
+        raise EvaluationError(f"the {count} points do not determine {what}")
+    variance = sum_of_squares / (count - parameters)
+    inverse = directions.T / strengths
+    return variance * inverse @ inverse.T, float(np.sqrt(variance))

@@ -1,0 +1,225 @@
+"""Treads of a step standard: which points lie on them, and how far they are apart.
+
+Points are (N, 2) of one profile (Y, Z) or (N, 3) of a scan (X, Y, Z); the last coordinate points away from the sensor.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from uwlts.errors import EvaluationError
+from uwlts.metrology.flat_fits import LineFit, PlaneFit, fit_line, fit_plane
+from uwlts.metrology.least_squares import accepted_points, evenly_thinned, principal_axes
+from uwlts.metrology.robust_fit import DEFAULT_K, MAD_TO_STD
+
+# Shares of the height.
+_SEARCH_LIMIT = 0.05
+_HEIGHT_TOLERANCE = 0.25
+_LIMITS = (0.01, 0.3)
+_LARGEST_STD = 0.125
+
+_PROPOSALS = 500
+_THINNED = 800
+_SMALLEST_TREAD = 0.02
+_ROUNDS = 5
+
+
+class Tread(IntEnum):
+    """Label of a point: on the tread farther from the sensor, on the nearer one, or on neither."""
+
+    NEITHER = 0
+    LOWER = 1
+    UPPER = 2
+
+
+@dataclass(frozen=True)
+class StepHeight:
+    """Height of a step and its standard uncertainty from the scatter of the points alone, mm."""
+
+    height_mm: float
+    std_mm: float
+
+
+def label_treads(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Tread of every point (N,) int8, as `Tread`.
+
+    Two parallel lines (planes) about one height apart, within a quarter, are searched among the directions of random
+    pairs (triples) of points; the treads may be in several pieces (base - block - base) and lie at any angle. A point
+    belongs to a tread when it is nearer to it than five robust standard deviations (within 1 to 30 % of the height)
+    and, along the tread, farther than `edge_mm` from all points that are not on it: so the rounded, mixed points at
+    edges and the riser stay out.
+
+    Parameters
+    ----------
+    points : (N, 2) or (N, 3), mm
+    height_mm : float
+        Approximate height.
+    edge_mm : float
+        Width of the strip left out beside edges.
+    seed : int
+        Of the random choice.
+
+    Raises
+    ------
+    EvaluationError
+        Too few points, or no two such treads; the message says what was found.
+    """
+    dimension = points.shape[1] if np.ndim(points) == 2 else 0
+    least = 10 if dimension == 2 else 40
+    points = accepted_points(points, least=2 * least, what="a step", dimensions=(2, 3))
+    proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
+    if proposal is None:
+        raise EvaluationError(
+            f"no two parallel treads about {height_mm:g} mm apart among {len(points)} points; "
+            f"show both treads, or correct the height"
+        )
+    normal, level = proposal
+    for _ in range(_ROUNDS):
+        lower, upper = _levels(points @ normal, level, height_mm)
+        normal = _common_normal(points[lower], points[upper], normal)
+        level = float(np.median(points[lower] @ normal))
+    labels = np.zeros(len(points), dtype=np.int8)
+    along = points @ principal_axes(normal[None])[1][1:].T
+    for tread, on_it in ((Tread.LOWER, lower), (Tread.UPPER, upper)):
+        labels[_away_from_edges(along, on_it, edge_mm)] = tread
+    _require_treads(heights=points @ normal, labels=labels, height=height_mm, least=least)
+    return labels
+
+
+def step_height_of_profile(
+    points_yz: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
+) -> StepHeight:
+    """Mean distance of one tread's points to the line through the other's, in one profile (thesis, section 3.2).
+
+    Where the sheet does not cut the step along its normal this is the height over the cosine of the angle between.
+
+    Parameters
+    ----------
+    points_yz : (N, 2), mm
+    labels : (N,)
+        From `label_treads`. While points move a little, as in a calibration, the labels can stay.
+    reference : str
+        The tread to which the line is fitted.
+
+    Raises
+    ------
+    EvaluationError
+        Too few points on a tread.
+    """
+    return _step_height(points_yz, labels, reference, fit_line)
+
+
+def step_height_of_scan(
+    points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
+) -> StepHeight:
+    """Mean distance of one tread's points (N, 3), mm, to the plane through the other's; see `step_height_of_profile`."""
+    return _step_height(points, labels, reference, fit_plane)
+
+
+def _step_height(points: np.ndarray, labels: np.ndarray, reference: str, fit) -> StepHeight:
+    base, other = (Tread.LOWER, Tread.UPPER) if reference == "lower" else (Tread.UPPER, Tread.LOWER)
+    points = np.asarray(points, dtype=np.float64)
+    surface: LineFit | PlaneFit = fit(points[labels == base])
+    across = accepted_points(points[labels == other], least=2, what="a tread", dimensions=(2, 3))
+    distances = surface.distances_mm(across)
+    axes = surface.axes if isinstance(surface, PlaneFit) else surface.direction[None]
+    lever = np.array([1.0, *(axes @ (across.mean(axis=0) - surface.point_mm))])
+    variance = lever @ surface.covariance @ lever + distances.var(ddof=1) / len(distances)
+    return StepHeight(abs(float(distances.mean())), float(np.sqrt(variance)))
+
+
+def _require_treads(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
+    """Two levels at the right distance, each with enough points and narrow: a slope or curve fills its whole band."""
+    lower, upper = heights[labels == Tread.LOWER], heights[labels == Tread.UPPER]
+    if min(len(lower), len(upper)) < least:
+        raise EvaluationError(
+            f"no two treads about {height:g} mm apart: {len(lower)} points on the lower level, {len(upper)} on the "
+            f"upper one, at least {least} needed on each; show both treads, or correct the height"
+        )
+    widest = max(float(lower.std()), float(upper.std()))
+    if widest > _LARGEST_STD * height:
+        raise EvaluationError(
+            f"no two treads about {height:g} mm apart: what lies at these levels scatters by {widest:.2g} mm "
+            f"(standard deviation) and is sloping or curved; show both treads, or correct the height"
+        )
+    distance = float(upper.mean() - lower.mean())
+    if abs(distance - height) > _HEIGHT_TOLERANCE * height:
+        raise EvaluationError(f"the treads found are {distance:.2f} mm apart; the step is described with {height:g} mm")
+
+
+def _best_proposal(points: np.ndarray, height: float, rng: np.random.Generator) -> tuple[np.ndarray, float] | None:
+    """Normal towards the sensor and level of the lower tread with most points on both levels."""
+    limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_TREAD * len(points))
+    most, best = 0.0, None
+    for normal in _proposed_normals(points, rng):
+        heights = np.sort(points @ normal)
+
+        def between(low: np.ndarray, high: np.ndarray, heights: np.ndarray = heights) -> np.ndarray:
+            return np.searchsorted(heights, high, side="right") - np.searchsorted(heights, low)
+
+        here = between(heights - limit, heights + limit)
+        for side in (1.0, -1.0):
+            middle = heights + side * height
+            there = between(middle - _HEIGHT_TOLERANCE * height, middle + _HEIGHT_TOLERANCE * height)
+            support = np.where((here >= least) & (there >= least), here + there, 0)
+            top = int(np.argmax(support))
+            if support[top] > most:
+                most = float(support[top])
+                best = (normal, float(heights[top]) if side > 0 else float(heights[top]) - height)
+    return best
+
+
+def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Unit normals (M, D), towards the sensor, of lines (planes) through random pairs (triples) of points."""
+    dimension = points.shape[1]
+    corners = points[rng.integers(len(points), size=(_PROPOSALS, dimension))]
+    side = corners[:, 1] - corners[:, 0]
+    normals = (
+        np.column_stack([-side[:, 1], side[:, 0]])
+        if dimension == 2
+        else np.cross(side, corners[:, 2] - corners[:, 0])
+    )
+    length = np.linalg.norm(normals, axis=1)
+    proper = length > 1e-6 * length.max()
+    normals = normals[proper] / length[proper, None]
+    return np.where(normals[:, -1:] > 0, -normals, normals)
+
+
+def _levels(heights: np.ndarray, level: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N,) bool on the lower tread, near the level, and on the upper one, where points crowd most above it."""
+    above = np.sort(heights[np.abs(heights - level - height) <= _HEIGHT_TOLERANCE * height])
+    window = _SEARCH_LIMIT * height
+    crowd = np.searchsorted(above, above + 2 * window, side="right") - np.arange(len(above))
+    upper_level = float(above[np.argmax(crowd)]) + window if len(above) else level + height
+    return _near_level(heights, level, height), _near_level(heights, upper_level, height)
+
+
+def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
+    limit = 2 * _SEARCH_LIMIT * height
+    for _ in range(3):
+        near = heights[np.abs(heights - level) <= limit]
+        if not len(near):
+            break
+        level = float(np.median(near))
+        spread = MAD_TO_STD * float(np.median(np.abs(near - level)))
+        limit = float(np.clip(DEFAULT_K * spread, _LIMITS[0] * height, _LIMITS[1] * height))
+    return np.abs(heights - level) <= limit
+
+
+def _common_normal(lower: np.ndarray, upper: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """Normal (D,) of two parallel lines or planes, each through the middle of its points."""
+    treads = [tread - tread.mean(axis=0) for tread in (lower, upper) if len(tread)]
+    _, axes = principal_axes(np.vstack(treads))
+    return axes[-1] if axes[-1] @ towards > 0 else -axes[-1]
+
+
+def _away_from_edges(along: np.ndarray, on_it: np.ndarray, edge: float) -> np.ndarray:
+    """Indices of the points of a tread that no other point comes near along the tread."""
+    tread, others = np.flatnonzero(on_it), along[~on_it]
+    if not len(others) or not len(tread) or edge == 0:
+        return tread
+    distance, _ = cKDTree(others).query(along[tread], distance_upper_bound=edge)
+    return tread[distance > edge]

@@ -1,0 +1,166 @@
+"""From stripe centres in the image to points on the surface: lens, window, sheet, then the stage (thesis Fig. 43)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.model import Calibration, SheetModel
+from uwlts.camera import directions
+from uwlts.errors import RangeError
+from uwlts.refraction import RaysInMedium, RayStatus, trace_window
+
+# Sine of the angle to the sheet below which a ray counts as parallel to it. A ray that meets the sheet within 10 m at
+# all does so at more than 1e-6.
+_PARALLEL = 1e-12
+
+
+@dataclass(frozen=True)
+class SheetPoints:
+    """Points where camera rays cross the laser sheet, in the camera frame.
+
+    Attributes
+    ----------
+    points_camera_mm : (N, 3) float64, NaN where the status is not OK
+    status : (N,) uint8, `uwlts.refraction.RayStatus`
+    """
+
+    points_camera_mm: np.ndarray
+    status: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObjectPoints:
+    """Measured points in the object coordinate system (OCS), at the stage position 0.
+
+    Attributes
+    ----------
+    points_mm : (N, 3) float64, NaN where the status is not OK
+    status : (N,) uint8, `uwlts.refraction.RayStatus`
+    """
+
+    points_mm: np.ndarray
+    status: np.ndarray
+
+
+def reconstruct_profile(
+    calibration: Calibration,
+    lines: np.ndarray,
+    centres_px: np.ndarray,
+    *,
+    medium_index: float,
+    stage_mm: np.ndarray | float,
+    stage_direction: np.ndarray,
+) -> ObjectPoints:
+    """Measured points of the stripe centres of one profile, or of many joined together.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    lines : (N,)
+        Numbers of the profile lines: image columns if the stripe runs along the width, else image rows.
+    centres_px : (N,)
+        Stripe centre in each line.
+    medium_index, stage_mm, stage_direction
+        As for `reconstruct_pixels`.
+    """
+    pair = (lines, centres_px) if calibration.stripe_along == "width" else (centres_px, lines)
+    return reconstruct_pixels(
+        calibration,
+        np.stack(pair, axis=1),
+        medium_index=medium_index,
+        stage_mm=stage_mm,
+        stage_direction=stage_direction,
+    )
+
+
+def reconstruct_pixels(
+    calibration: Calibration,
+    pixels: np.ndarray,
+    *,
+    medium_index: float,
+    stage_mm: np.ndarray | float,
+    stage_direction: np.ndarray,
+) -> ObjectPoints:
+    """Measured points in the OCS of pixels (N, 2), given as (u, v) in px; see `points_on_sheet` and `to_object`."""
+    found = points_on_sheet(calibration, pixels, medium_index=medium_index)
+    points = to_object(calibration, found.points_camera_mm, stage_mm=stage_mm, stage_direction=stage_direction)
+    return ObjectPoints(points, found.status)
+
+
+def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_index: float) -> SheetPoints:
+    """Where the camera rays of pixels cross the laser sheet in the medium (thesis Eqs. 3.3 to 3.9).
+
+    Parameters
+    ----------
+    calibration : Calibration
+    pixels : (N, 2)
+        (u, v) in px; the pixels of many frames may be given at once.
+    medium_index : float
+        Refractive index of the medium relative to air; not used by a calibration without a window.
+
+    Returns
+    -------
+    SheetPoints
+
+    Raises
+    ------
+    RangeError
+        A pixel is not finite, or the index is not finite and positive.
+    """
+    rays = trace_window(directions(calibration.camera, pixels), calibration.window, medium_index=medium_index)
+    return _crossings(rays, calibration.sheet)
+
+
+def to_object(
+    calibration: Calibration, points_camera: np.ndarray, *, stage_mm: np.ndarray | float, stage_direction: np.ndarray
+) -> np.ndarray:
+    """Points (N, 3) in the OCS at stage position 0, mm, from points (N, 3) in the camera frame at ``stage_mm``.
+
+    ``p_object = T_object_camera p_camera + stage_mm * stage_direction``; rows of NaN stay NaN.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    points_camera : (N, 3)
+    stage_mm : float or (N,)
+        Position of the stage, of all points or of each.
+    stage_direction : (3,)
+        Unit direction in the OCS in which the stage moves the sensor.
+
+    Raises
+    ------
+    RangeError
+        A stage position is not finite, or the direction is not a unit vector.
+    """
+    stage_mm, stage_direction = np.asarray(stage_mm, dtype=float), np.asarray(stage_direction, dtype=float)
+    if not np.isfinite(stage_mm).all():
+        raise RangeError("a stage position is not finite")
+    if not abs(np.linalg.norm(stage_direction) - 1.0) <= 1e-6:
+        raise RangeError(f"the stage's direction {stage_direction} is not a unit vector")
+    object_from_camera = np.linalg.inv(calibration.object_transform())
+    points = object_from_camera[:3, :3] @ np.asarray(points_camera, dtype=float).T + object_from_camera[:3, 3, None]
+    points += np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
+    return np.ascontiguousarray(points.T)
+
+
+def _crossings(rays: RaysInMedium, sheet: SheetModel) -> SheetPoints:
+    """Crossings of rays in the medium with the sheet's plane (thesis Eq. 3.9).
+
+    A crossing that is not ahead of the ray is BEHIND if the light passed the sheet between the pupil and the medium,
+    that is, if the two lie on different sides of it; otherwise the ray runs away from the sheet.
+    """
+    normal = np.array(sheet.normal)
+    gap = sheet.offset_mm - rays.origins @ normal
+    approach = rays.directions @ normal
+    parallel = np.abs(approach) <= _PARALLEL
+    if parallel.any():
+        approach[parallel] = np.nan
+    length = gap / approach
+    points = (rays.origins.T + length * rays.directions.T).T
+    status = rays.status
+    if not np.all(length > 0):
+        passed = gap * sheet.offset_mm <= 0
+        missed = (status == RayStatus.OK) & ~(length > 0)
+        status = np.where(missed, np.where(passed, RayStatus.BEHIND, RayStatus.NO_CROSSING), status).astype(np.uint8)
+        points[status != RayStatus.OK] = np.nan
+    return SheetPoints(points, status)

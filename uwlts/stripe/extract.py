@@ -1,0 +1,236 @@
+"""From an image to one stripe centre per profile line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uwlts.stripe.candidates import (
+    block_contrast,
+    block_extremes,
+    coarse_threshold,
+    first_true,
+    last_true,
+    noise_from_contrast,
+)
+from uwlts.stripe.centre import place_centre
+from uwlts.stripe.image import (
+    as_profiles,
+    average_lines,
+    check_image,
+    check_length,
+    saturation_of,
+    subtract_background,
+)
+from uwlts.stripe.lobe import FLANK, Lobe, look, noise_gain, off_centre
+from uwlts.stripe.result import FWHM_PER_SIGMA, PeakRule, Stripe, StripeOptions, StripeStatus
+
+_LOOKS = 4
+"""Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
+
+_COARSE_SLACK = 0.75
+"""Block contrasts of equal stripes differ by this factor through where the pixels fall on them (sigma 0.7 px)."""
+
+_SEARCHED_BLOCKS = np.array([[-2], [-1], [0], [1], [2]])
+"""Blocks that one window covers."""
+
+_LEAST_KERNEL = 0.6
+"""Sigma of the narrowest weight, px; a narrower one would see too few pixels."""
+
+
+def extract_stripe(
+    image: np.ndarray,
+    *,
+    stripe_along: str,
+    options: StripeOptions | None = None,
+    background: np.ndarray | None = None,
+    saturation: float | None = None,
+) -> Stripe:
+    """Sub-pixel stripe centre on every profile line.
+
+    Parameters
+    ----------
+    image : (H, W) uint8, uint16 or float32
+        Grey levels. A float32 image is in grey levels too: scale it, or set ``options.threshold_floor``.
+    stripe_along : str
+        ``"height"``: the stripe runs along the image height, the H rows are the lines. ``"width"``: the W columns are.
+    options : StripeOptions, optional
+        Method, rules and thresholds.
+    background : (H, W) array of the image's type, optional
+        The same view with the laser off, subtracted. A linear background is fitted beside each stripe in any case.
+    saturation : float, optional
+        Grey value at which pixels clip. By default the largest of the integer type, none for float32; 10- or 12-bit
+        images in uint16 need it given.
+
+    Returns
+    -------
+    Stripe
+        With L = H or W lines.
+
+    Raises
+    ------
+    ImageError
+        If the image, the background, `stripe_along` or `saturation` is not as described, or the lines are shorter
+        than the search window.
+    """
+    options = StripeOptions() if options is None else options
+    half, block = options.half_window_px, options.half_window_px // 2
+    check_image(image, name="image")
+    check_length(image, stripe_along=stripe_along, least=2 * half + 1)
+    clip = saturation_of(image, saturation)
+
+    signal = image if background is None else subtract_background(image, background)
+    if options.smoothing_lines > 1:
+        signal = average_lines(signal, options.smoothing_lines, stripe_along=stripe_along)
+    profiles = as_profiles(signal, stripe_along=stripe_along)
+    high, low = block_extremes(profiles, block)
+    contrast = block_contrast(high, low)
+    noise = noise_from_contrast(contrast, block)
+    found = _search(profiles, contrast, noise, options)
+
+    none = found.status == StripeStatus.NO_STRIPE
+    if none.any():
+        if signal is not image:
+            _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
+        found.status[none & (low >= clip).any(axis=0)] = StripeStatus.SATURATED
+    return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Results of L lines, filled while the search goes on."""
+
+    centre: np.ndarray
+    amplitude: np.ndarray
+    width: np.ndarray
+    status: np.ndarray
+    height: np.ndarray
+
+    @classmethod
+    def empty(cls, count: int) -> _Lines:
+        nothing = np.full(count, np.nan, np.float32)
+        return cls(
+            centre=np.full(count, np.nan),
+            amplitude=nothing,
+            width=nothing.copy(),
+            status=np.full(count, StripeStatus.NO_STRIPE, np.uint8),
+            height=np.zeros(count, np.float32),
+        )
+
+    def discard(self, lines: np.ndarray, status: StripeStatus) -> None:
+        self.status[lines] = status
+        for values in (self.centre, self.amplitude, self.width):
+            values[lines] = np.nan
+
+
+def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: StripeOptions) -> _Lines:
+    """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
+
+    Under rule `strongest` a line with a stripe is searched once more for a second one.
+    """
+    block = options.half_window_px // 2
+    board = np.zeros((contrast.shape[0] + 4, contrast.shape[1]), contrast.dtype)
+    board[2:-2] = contrast
+    found = _Lines.empty(board.shape[1])
+    coarse = coarse_threshold(noise, block=block, floor=options.threshold_floor)
+    fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
+    lines = np.arange(board.shape[1])
+    least = np.full(lines.size, coarse)
+
+    for _ in range(_LOOKS):
+        lines, chosen, contrast_there = _next_blocks(board, lines, least[lines], options.peak)
+        if lines.size == 0:
+            break
+        lobe = _look_centred(profiles, lines, (chosen - 2) * block, fine, options)
+        verdict = _judge(lobe, profiles.shape[0], fine, options)
+        stripe = verdict != StripeStatus.NO_STRIPE
+        again = found.status[lines] == StripeStatus.OK
+
+        rival = stripe & again & (lobe.height >= options.ambiguous_ratio * found.height[lines])
+        found.discard(lines[rival], StripeStatus.AMBIGUOUS)
+        new = stripe & ~again
+        found.status[lines[new]] = verdict[new]
+        _measure(found, lines, lobe, new & (verdict == StripeStatus.OK), options)
+
+        # The window has been searched for rivals already; of what is no stripe only the block itself is done with.
+        board[chosen, lines] = 0
+        board.ravel()[(chosen[stripe] + _SEARCHED_BLOCKS) * board.shape[1] + lines[stripe]] = 0
+        share = np.float32(options.ambiguous_ratio * _COARSE_SLACK)
+        least[lines[new]] = np.maximum(coarse, share * contrast_there[new])
+        status = found.status[lines]
+        unsettled = status == StripeStatus.NO_STRIPE
+        if options.peak is PeakRule.STRONGEST:
+            unsettled |= status == StripeStatus.OK
+        lines = lines[unsettled]
+    return found
+
+
+def _next_blocks(
+    board: np.ndarray, lines: np.ndarray, least: np.ndarray, rule: PeakRule
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The lines on which a block reaches `least`, the block the rule names and its contrast."""
+    columns = board if lines.size == board.shape[1] else board[:, lines]
+    highest = columns.max(axis=0)
+    stands_out = highest >= least
+    if not stands_out.all():
+        lines, least, highest = lines[stands_out], least[stands_out], highest[stands_out]
+        columns = columns[:, stands_out]
+    wanted = columns == highest if rule is PeakRule.STRONGEST else columns >= least
+    chosen = first_true(wanted) if rule is not PeakRule.LAST else last_true(wanted)
+    return lines, chosen, columns[chosen, np.arange(lines.size)].astype(np.float32)
+
+
+def _look_centred(
+    profiles: np.ndarray, lines: np.ndarray, place: np.ndarray, fine: float, options: StripeOptions
+) -> Lobe:
+    """`look`, and a second time where what is seen is not in the middle, as with a wide plateau."""
+    settings = {
+        "half": options.half_window_px,
+        "block": options.half_window_px // 2,
+        "smoothing": options.smoothing_px,
+        "share": options.ambiguous_ratio,
+        "whole": options.peak is PeakRule.STRONGEST,
+    }
+    lobe = look(profiles, lines, place, **settings)
+    shift, needed = off_centre(lobe, block=settings["block"])
+    needed &= lobe.height >= fine
+    if needed.any():
+        lobe = lobe.replaced(needed, look(profiles, lines[needed], (place + shift)[needed], **settings))
+    return lobe
+
+
+def _judge(lobe: Lobe, count: int, fine: float, options: StripeOptions) -> np.ndarray:
+    """(M,) uint8 `StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
+    fwhm = _true_sigma(lobe, options) * np.float32(FWHM_PER_SIGMA)
+    peak = lobe.start + lobe.peak
+    shaped = lobe.closed & (fwhm >= options.min_fwhm_px) & (fwhm <= options.half_window_px)
+    middle = lobe.start + lobe.middle
+    extent = lobe.reach + FLANK - 1
+    beyond = (middle - extent < 0) | (middle + extent > count - 1)
+    cut = ~lobe.closed & ((lobe.start < 0) | (lobe.start + lobe.window.shape[0] > count)) & (peak > 1) & (peak < count - 2)
+    verdict = np.full(peak.size, StripeStatus.NO_STRIPE, np.uint8)
+    verdict[shaped] = StripeStatus.OK
+    verdict[shaped & lobe.crowded] = StripeStatus.AMBIGUOUS
+    verdict[(shaped & beyond) | cut] = StripeStatus.BORDER
+    verdict[lobe.height < fine] = StripeStatus.NO_STRIPE
+    return verdict
+
+
+def _true_sigma(lobe: Lobe, options: StripeOptions) -> np.ndarray:
+    """(M,) float32: sigma of the lobe with the low-pass taken out, px (variances add)."""
+    return np.sqrt(np.maximum(lobe.sigma**2 - np.float32(options.smoothing_px**2), np.float32(0.0)))
+
+
+def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, options: StripeOptions) -> None:
+    """Enter centre, amplitude and width of the chosen lobes."""
+    if not which.any():
+        return
+    lines, lobe = lines[which], lobe.keep(which)
+    sigma = _true_sigma(lobe, options)
+    centre, amplitude = place_centre(options.method, lobe, np.maximum(sigma, np.float32(_LEAST_KERNEL)))
+    found.centre[lines] = lobe.start + centre.astype(np.float64)
+    found.amplitude[lines] = amplitude
+    found.width[lines] = sigma * np.float32(FWHM_PER_SIGMA)
+    found.height[lines] = lobe.height

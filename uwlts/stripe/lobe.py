@@ -1,0 +1,214 @@
+"""A close look at one place on each line: height, width and background of what stands there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from uwlts.stripe.candidates import first_true, last_true
+from uwlts.stripe.result import FWHM_PER_SIGMA
+
+FLANK = 5
+_SLACK = 2
+_ONE = np.ones(1, np.float32)
+_FLANK_ROWS = np.arange(FLANK)[:, None]
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """What stands in M windows of W pixels. Positions count from the window's first pixel.
+
+    Attributes
+    ----------
+    start : (M,) int
+        Position of the window's first pixel on its line.
+    window : (W, M) float32
+        Grey levels; beyond the image border the border pixel repeats.
+    smooth : (W, M) float32
+        The window after the low-pass.
+    middle : (M,) float32
+        Midpoint of the half-height crossings.
+    sigma : (M,) float32
+        Half-height width of `smooth` over 2.355, the sigma of a Gaussian, px.
+    reach : (M,) int
+        Distance from `middle` to the first background pixel, px.
+    base, slope : (M,) float32
+        Background at `middle`, grey levels, and its slope, grey levels per px, from the flanks beyond `reach`.
+    peak : (M,) int
+        Position of the highest pixel of `smooth`.
+    height : (M,) float32
+        Peak of `smooth` above `base`, or above the lowest surroundings where not `closed`.
+    closed : (M,) bool
+        Both half-height crossings lie in the window.
+    crowded : (M,) bool
+        Outside the half-height crossings something reaches the given share of the peak again.
+    """
+
+    start: np.ndarray
+    window: np.ndarray
+    smooth: np.ndarray
+    middle: np.ndarray
+    sigma: np.ndarray
+    reach: np.ndarray
+    base: np.ndarray
+    slope: np.ndarray
+    peak: np.ndarray
+    height: np.ndarray
+    closed: np.ndarray
+    crowded: np.ndarray
+
+    def keep(self, which: np.ndarray) -> Lobe:
+        """The windows chosen by a boolean mask."""
+        if which.all():
+            return self
+        return Lobe(*(value[..., which] for value in vars(self).values()))
+
+    def replaced(self, which: np.ndarray, by: Lobe) -> Lobe:
+        """These windows with those chosen by a boolean mask taken from another `Lobe`."""
+        values = []
+        for own, other in zip(vars(self).values(), vars(by).values(), strict=True):
+            value = own.copy()
+            value[..., which] = other
+            values.append(value)
+        return Lobe(*values)
+
+
+def look(
+    profiles: np.ndarray, lines: np.ndarray, place: np.ndarray, *, half: int, block: int, smoothing: float, share: float, whole: bool
+) -> Lobe:
+    """Measure what stands at or near the `block` pixels that begin at `place`.
+
+    Parameters
+    ----------
+    profiles : (N, L) array
+        Grey levels, position along the line first.
+    lines, start : (M,) int
+        Line and first pixel of each window of 2 * `half` + `block` pixels; `start` may lie outside the image.
+    half, block : int
+        The peak is sought in the middle `block` pixels and half a block on either side.
+    smoothing : float
+        Sigma of the low-pass, px.
+    share : float
+        Share of the peak's height from which a second lobe makes the window crowded.
+    whole : bool
+        Look for a second lobe in the whole window, else only as far as the pixels used reach.
+    """
+    size = 2 * half + block + 2 * _SLACK
+    start = place - half - _SLACK
+    window = _cut(profiles, lines, start, size)
+    smooth = _low_pass(window, smoothing)
+    columns = np.arange(lines.size)
+
+    first = half + _SLACK - block // 2
+    rows = np.arange(size, dtype=np.uint8 if size < 255 else np.uint16)[:, None]
+    sought = smooth[first : first + 2 * block]
+    peak = sought.max(axis=0)
+    peak_row = first + first_true(sought == peak)
+    before, after = smooth[:block].min(axis=0), smooth[-block:].min(axis=0)
+    # Repeated border pixels may belong to the stripe itself, so that only the other side tells the background.
+    before[start < 0] = -np.inf
+    after[start + size > profiles.shape[0]] = -np.inf
+    ground = np.maximum(before, after)
+    level = 0.5 * (peak + ground)
+
+    at = peak_row.astype(rows.dtype)
+    low = smooth < level
+    left = last_true(low & (rows < at))
+    right = first_true(low & (rows > at))
+    closed = (left >= 0) & (right < size)
+    x_left = _crossing(smooth, columns, left, 1, level)
+    x_right = _crossing(smooth, columns, right, -1, level)
+    middle = 0.5 * (x_left + x_right)
+    sigma = (x_right - x_left) / np.float32(FWHM_PER_SIGMA)
+
+    reach = np.minimum(np.ceil(3.0 * sigma), half - FLANK + 1).astype(np.intp)
+    near = np.rint(middle).astype(np.intp)
+    before = _flank(window, columns, near - reach - FLANK + 1)
+    after = _flank(window, columns, near + reach)
+    again = smooth >= ground + share * (peak - ground)
+    again &= (rows < (left + 1).astype(rows.dtype)) | (rows >= right.astype(rows.dtype))
+    if not whole:
+        again &= np.abs(np.arange(size)[:, None] - near) < reach + FLANK
+    slope = (after - before) / (2 * reach + FLANK - 1).astype(np.float32)
+    base = 0.5 * (before + after) + slope * (middle - near).astype(np.float32)
+    return Lobe(
+        start=start,
+        window=window,
+        smooth=smooth,
+        middle=middle,
+        sigma=sigma,
+        reach=reach,
+        base=base,
+        slope=slope,
+        peak=peak_row,
+        height=np.where(closed, peak - base, peak - ground),
+        closed=closed,
+        crowded=again.any(axis=0),
+    )
+
+
+def off_centre(lobe: Lobe, *, block: int) -> tuple[np.ndarray, np.ndarray]:
+    """By how many pixels to move each window so that the lobe's middle is in it, and which need it.
+
+    Returns
+    -------
+    shift : (M,) int
+    needed : (M,) bool
+        A half-height crossing lies outside the window or the middle is too near one end for the flanks.
+    """
+    offset = lobe.middle - np.float32(0.5 * (lobe.window.shape[0] - 1))
+    needed = ~lobe.closed | (np.abs(offset) > 0.5 * block + _SLACK - 1)
+    return np.rint(offset).astype(np.intp), needed
+
+
+def _cut(profiles: np.ndarray, lines: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
+    """(size, M) float32: windows from the profiles, the border pixel repeated beyond the border."""
+    position = np.arange(size, dtype=np.float32)[:, None] + start.astype(np.float32)
+    line = np.repeat(lines.astype(np.float32)[None], size, axis=0)
+    cut = cv2.remap(profiles, line, position, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return cut.astype(np.float32)
+
+
+def _low_pass(window: np.ndarray, sigma: float) -> np.ndarray:
+    kernel = _kernel(sigma)
+    return cv2.sepFilter2D(window, -1, _ONE, kernel, borderType=cv2.BORDER_REPLICATE)
+
+
+@lru_cache(maxsize=16)
+def _kernel(sigma: float) -> np.ndarray:
+    """Gaussian weights to 3.5 sigma, sum 1."""
+    reach = math.ceil(3.5 * sigma)
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return (weight / weight.sum()).astype(np.float32)
+
+
+def noise_gain(sigma: float) -> float:
+    """Standard deviation of white unit noise after the low-pass."""
+    return float(np.sqrt(np.sum(_kernel(sigma) ** 2)))
+
+
+def _crossing(smooth: np.ndarray, columns: np.ndarray, row: np.ndarray, inward: int, level: np.ndarray) -> np.ndarray:
+    """(M,) float32: where the straight line from `row` to its neighbour meets `level`.
+
+    A row just outside the window stands for no crossing and gives a place less than a pixel further in.
+    """
+    width = smooth.shape[1]
+    index = row * width + columns
+    low = smooth.take(index, mode="clip")
+    rise = smooth.take(index + inward * width, mode="clip") - low
+    part = (level - low) / np.maximum(rise, np.float32(1e-6))
+    part = np.minimum(np.maximum(part, np.float32(0.0)), np.float32(1.0))
+    return row.astype(np.float32) + np.float32(inward) * part
+
+
+def _flank(window: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """(M,) float32: mean of five background pixels without the largest and the smallest."""
+    size, width = window.shape
+    index = np.minimum(np.maximum(first, 0), size - FLANK) * width + columns
+    pixels = window.take(index + _FLANK_ROWS * width, mode="clip")
+    trimmed = pixels.sum(axis=0) - pixels.max(axis=0) - pixels.min(axis=0)
+    return trimmed / np.float32(FLANK - 2)

@@ -1,0 +1,153 @@
+"""What a caller chooses about stripe extraction and what comes back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+import numpy as np
+
+from uwlts.errors import RangeError
+
+FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
+
+
+class StripeMethod(StrEnum):
+    """How the centre is placed once the stripe is found."""
+
+    CENTRE_OF_MASS = "centre-of-mass"
+    QUADRATIC = "quadratic"
+    ZERO_CROSSING = "zero-crossing"
+
+
+class PeakRule(StrEnum):
+    """Which of several stripes on one line counts. First and last are in the order of growing pixel index."""
+
+    STRONGEST = "strongest"
+    FIRST = "first"
+    LAST = "last"
+
+
+class StripeStatus(IntEnum):
+    """Why a line has, or has not, a centre."""
+
+    OK = 0
+    NO_STRIPE = 1
+    """Nothing on the line rises above the threshold, or only things too narrow or too wide for a stripe."""
+    AMBIGUOUS = 2
+    """A second stripe of comparable strength (rule ``strongest``), or two stripes within one window."""
+    BORDER = 3
+    """The pixels needed around the centre run over the image border."""
+    SATURATED = 4
+    """The clipped plateau is too wide for the window; moderate clipping is handled and stays OK."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StripeOptions:
+    """Choices for `uwlts.stripe.extract_stripe`.
+
+    Attributes
+    ----------
+    method : StripeMethod
+        How the centre is placed.
+    peak : PeakRule
+        Which of several stripes on a line counts.
+    half_window_px : int
+        Pixels on either side of the centre that may be used: stripe, tails and the background beside them. Stripes
+        up to this full width at half maximum are measured. At least 8.
+    smoothing_px : float
+        Sigma of the Gaussian low-pass across the stripe, px, for detection, width and the quadratic fit. The other
+        two methods place the centre on the unsmoothed profile.
+    smoothing_lines : int
+        Odd number of neighbouring lines averaged beforehand; 1 averages none. More lines lower the noise of smooth
+        surfaces and blur depth edges.
+    threshold_sigmas : float
+        Least height of a stripe in standard deviations of the low-passed background noise.
+    threshold_floor : float
+        Least height of a stripe in grey levels, whatever the noise.
+    min_fwhm_px : float
+        Least full width at half maximum, px; narrower things are hot pixels.
+    ambiguous_ratio : float
+        Under rule ``strongest``, a second stripe at least this share of the strongest makes the line ambiguous.
+        Stripes count as separate where the profile falls below half the height of the stronger between them. 1 or less
+        and more than 0.5.
+
+    Raises
+    ------
+    RangeError
+        If a number lies outside the range stated above.
+    """
+
+    method: StripeMethod = StripeMethod.ZERO_CROSSING
+    peak: PeakRule = PeakRule.STRONGEST
+    half_window_px: int = 16
+    smoothing_px: float = 1.0
+    smoothing_lines: int = 1
+    threshold_sigmas: float = 6.0
+    threshold_floor: float = 3.0
+    min_fwhm_px: float = 1.3
+    ambiguous_ratio: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name, kind in (("method", StripeMethod), ("peak", PeakRule)):
+            value = getattr(self, name)
+            if value not in list(kind):
+                raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in kind)}")
+            object.__setattr__(self, name, kind(value))
+        for name in ("half_window_px", "smoothing_lines"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
+                raise RangeError(f"{name} is {value!r}; expected a whole number")
+        _demand("half_window_px", self.half_window_px, 8, 512)
+        _demand("smoothing_px", self.smoothing_px, 0.5, self.half_window_px / 4)
+        _demand("smoothing_lines", self.smoothing_lines, 1, 101)
+        if self.smoothing_lines % 2 == 0:
+            raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
+        _demand("threshold_sigmas", self.threshold_sigmas, 1.0, 1e6)
+        _demand("threshold_floor", self.threshold_floor, 0.0, 1e9)
+        _demand("min_fwhm_px", self.min_fwhm_px, 0.0, self.half_window_px)
+        _demand("ambiguous_ratio", self.ambiguous_ratio, 0.5, 1.0)
+
+
+def _demand(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise RangeError(f"{name} is {value!r}; expected a number from {low:g} to {high:g}")
+
+
+@dataclass(frozen=True)
+class Stripe:
+    """Stripe centres of one image, L profile lines.
+
+    Attributes
+    ----------
+    centre_px : (L,) float64
+        Position along the line, px; pixel 0's centre is 0. NaN where the status is not OK.
+    amplitude : (L,) float32
+        Height above the local background, grey levels, of the Gaussian of the measured width that fits best; less
+        than the true height where the image is saturated. NaN where the status is not OK.
+    width_px : (L,) float32
+        Full width at half maximum, px, with the smoothing across the stripe taken out. NaN where not OK.
+    status : (L,) uint8
+        A `StripeStatus` per line.
+    stripe_along : str
+        ``"height"``: lines are image rows. ``"width"``: lines are image columns.
+    """
+
+    centre_px: np.ndarray
+    amplitude: np.ndarray
+    width_px: np.ndarray
+    status: np.ndarray
+    stripe_along: str
+
+    @property
+    def lines(self) -> np.ndarray:
+        """(M,) int: indices of the lines with a centre."""
+        return np.flatnonzero(self.status == StripeStatus.OK)
+
+    def pixels(self) -> np.ndarray:
+        """(M, 2) float64: image coordinates (u = column, v = row) of the centres of `lines`, px."""
+        lines = self.lines
+        across = self.centre_px[lines]
+        order = (across, lines) if self.stripe_along == "height" else (lines, across)
+        return np.column_stack(order).astype(np.float64)

@@ -1,0 +1,172 @@
+"""Closed bright or dark blobs of an unevenly lit image, as candidates for the images of circles."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uwlts.errors import ImageError
+
+# Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
+# to three quarters of its side, so factors of three cover 4 px to 650 px without gaps.
+WINDOWS_PX = (32, 96, 288, 864)
+
+# A blob of fewer pixels has no measurable shape (a disc of 4 px diameter covers 12.6).
+MIN_AREA_PX = 10.0
+
+# The levels of pure noise, split at their mean, lie 2 sqrt(2/pi) = 1.6 standard deviations apart.
+CONTRAST_OVER_NOISE = 6.0
+
+# Fraction of the image's grey range below which a contrast is taken for dirt or compression noise.
+CONTRAST_OVER_RANGE = 0.04
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Blobs of one polarity, each with the ellipse that has the blob's moments.
+
+    Attributes
+    ----------
+    centres : (N, 2) float64, px, (u, v)
+    shapes : (N, 2, 2) float64, px, symmetric positive; ``centre + shape @ (cos t, sin t)`` is the ellipse
+    bright : whether the blobs are brighter than their surroundings
+    """
+
+    centres: np.ndarray
+    shapes: np.ndarray
+    bright: bool
+
+
+def checked_grey(image):
+    """Return `image` unchanged if it is an (H, W) array of uint8 or uint16, else raise `ImageError`."""
+    if not isinstance(image, np.ndarray):
+        raise ImageError(f"the image is a {type(image).__name__}; expected a NumPy array (H, W) of uint8 or uint16")
+    if image.ndim != 2:
+        raise ImageError(
+            f"the image has shape {image.shape}; expected one grey channel (H, W): convert colour images first"
+        )
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ImageError(f"the image has type {image.dtype}; expected uint8 or uint16")
+    if min(image.shape) < 16:
+        raise ImageError(f"the image has {image.shape[1]} x {image.shape[0]} pixels; a target needs at least 16 x 16")
+    return image
+
+
+def noise_level(grey):
+    """Standard deviation of the pixel noise of a float32 image (H, W), in grey levels.
+
+    The mask of Immerkaer (Fast noise variance estimation, CVIU 64, 1996, eq. 2) cancels linear shading and has norm 6.
+    Its lower fifth is used instead of its mean because a fine pattern puts an edge into most neighbourhoods.
+    """
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    response = np.abs(cv2.filter2D(grey, cv2.CV_32F, mask)[1:-1:2, 1:-1:2])
+    lower_fifth_of_unit_normal = 0.2533
+    return float(np.quantile(response, 0.2) / (6 * lower_fifth_of_unit_normal))
+
+
+def find_blobs(image):
+    """Find the most numerous family of ellipse-like blobs, whatever its polarity and size.
+
+    Each window of `WINDOWS_PX` gives a threshold half-way between the mean levels of the local bright and dark pixels
+    (one step of Ridler and Calvard's iteration per pass, taken locally, which removes uneven lighting). Holes are
+    filled by keeping outer contours only; blobs at the image border and small ones are left out. The window and
+    polarity with most blobs of about the same size win.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 or uint16
+
+    Returns
+    -------
+    Blobs
+        Possibly empty.
+
+    Raises
+    ------
+    ImageError
+        The image is no grey image of 8 or 16 bit.
+    """
+    grey = checked_grey(image).astype(np.float32)
+    low, high = np.quantile(grey[::4, ::4], (0.001, 0.999))
+    # Half a grey level covers an image without noise, whose only disturbance is its rounding.
+    floor = max(CONTRAST_OVER_NOISE * max(noise_level(grey), 0.5), CONTRAST_OVER_RANGE * (high - low))
+    smooth = cv2.medianBlur(grey, 3)
+    best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), 0
+    for window in WINDOWS_PX:
+        if window > WINDOWS_PX[0] and window > max(grey.shape):
+            break
+        threshold, contrast = _local_levels(smooth, window)
+        clear = contrast > floor
+        for bright in (True, False):
+            side = smooth > threshold if bright else smooth < threshold
+            blobs = _ellipse_like(np.logical_and(side, clear).view(np.uint8), bright=bright)
+            score = _largest_family(np.sqrt(np.linalg.det(blobs.shapes)))
+            if score > best_score:
+                best, best_score = blobs, score
+    return best
+
+
+def _local_levels(smooth, window):
+    """Threshold (H, W) and contrast (H, W) between the local bright and dark levels, in grey levels."""
+    threshold = _local_mean(smooth, window, smooth.shape)
+    mean = _local_mean(smooth, window, None)
+    for _ in range(2):
+        above = (smooth > threshold).astype(np.float32)
+        share = np.clip(_local_mean(above, window, None), 1e-4, 1 - 1e-4)
+        above_sum = _local_mean(above * smooth, window, None)
+        bright, dark = above_sum / share, (mean - above_sum) / (1 - share)
+        threshold = _enlarged((bright + dark) / 2, smooth.shape)
+    return threshold, _enlarged(bright - dark, smooth.shape)
+
+
+def _local_mean(values, window, shape):
+    """Mean over a square window, at a quarter of the resolution, or enlarged to `shape` if that is given."""
+    small = cv2.resize(values, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    mean = cv2.blur(small, (window // 4 + 1, window // 4 + 1), borderType=cv2.BORDER_REFLECT)
+    return mean if shape is None else _enlarged(mean, shape)
+
+
+def _enlarged(values, shape):
+    return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_LINEAR)
+
+
+def _ellipse_like(mask, *, bright):
+    """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments."""
+    height, width = mask.shape
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    centres, shapes = [], []
+    if not contours:
+        return Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), bright)
+    is_outline = hierarchy.reshape(-1, 4)[:, 3] < 0
+    # Half the outline of the largest plausible circle: larger outlines are the background.
+    for contour, outline in zip(contours, is_outline, strict=True):
+        if not outline or not 8 <= len(contour) <= 4 * min(height, width):
+            continue
+        u, v, du, dv = cv2.boundingRect(contour)
+        if u <= 1 or v <= 1 or u + du >= width - 1 or v + dv >= height - 1:
+            continue
+        moments = cv2.moments(contour)
+        area = moments["m00"]
+        # The outline runs through pixel centres: it leaves out half a pixel all around.
+        if area + len(contour) / 2 < MIN_AREA_PX:
+            continue
+        covariance = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
+        determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
+        # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
+        if determinant <= 0 or abs(area / (4 * np.pi * np.sqrt(determinant)) - 1) > 0.12:
+            continue
+        centres.append((moments["m10"] / area, moments["m01"] / area))
+        shapes.append(covariance)
+    if not centres:
+        return Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), bright)
+    values, vectors = np.linalg.eigh(np.array(shapes))
+    semi_axes = 2 * np.sqrt(values) + 0.5
+    return Blobs(np.array(centres), (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
+
+
+def _largest_family(radii):
+    """Number of radii in the best-filled interval of a factor of two."""
+    if len(radii) == 0:
+        return 0
+    ordered = np.sort(np.log2(radii))
+    return int((np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(len(ordered))).max())

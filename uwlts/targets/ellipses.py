@@ -1,0 +1,176 @@
+"""Sub-pixel ellipses through the grey-level edges of blobs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.targets.blobs import noise_level
+from uwlts.targets.edges import PROFILES, REACH_OVER_MINOR_AXIS, rim_directions, sample
+
+SAMPLES = 11
+PASSES = 3
+
+# Reach of an edge profile on either side of the ellipse. Two and a half pixels hold the edge of a usual lens; inside a
+# small blob half the minor semi-axis is all there is before the opposite edge is felt.
+REACH_PX = 2.5
+
+# Largest rms distance of the edge from its ellipse: absolute, as a share of the mean radius, and against the median of
+# all blobs of the image, which all have about the same noise and blur.
+MAX_RESIDUAL_PX = 0.15
+MAX_RESIDUAL_OVER_RADIUS = 0.01
+MAX_RESIDUAL_OVER_MEDIAN = 2.5
+RESIDUAL_FLOOR_PX = 0.03
+
+# Largest departure of one profile's contrast from the smooth course around the blob.
+MAX_CONTRAST_DEPARTURE = 0.35
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Ellipses fitted to the edges of blobs.
+
+    Attributes
+    ----------
+    centres : (N, 2) float64, px, (u, v)
+    shapes : (N, 2, 2) float64, px, symmetric positive; ``centre + shape @ (cos t, sin t)`` is the ellipse
+    residual_px : (N,) float64, rms distance of the edge points from the ellipse
+    contrast : (N,) float64, grey levels, inside minus outside
+    sharpness : (N,) float64, 1/px, slope of the edge over its contrast
+    bright : whether the blobs are brighter than their surroundings
+    """
+
+    centres: np.ndarray
+    shapes: np.ndarray
+    residual_px: np.ndarray
+    contrast: np.ndarray
+    sharpness: np.ndarray
+    bright: bool
+
+    def __len__(self):
+        return len(self.centres)
+
+    def __getitem__(self, select):
+        return Ellipses(
+            self.centres[select],
+            self.shapes[select],
+            self.residual_px[select],
+            self.contrast[select],
+            self.sharpness[select],
+            self.bright,
+        )
+
+
+def fit_ellipses(image, blobs):
+    """Fit ellipses to the edges of blobs and keep those that are ellipses.
+
+    The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
+    ellipse. Both levels follow a constant and first harmonic around the blob, so that shading does not shift the
+    centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
+    least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the plate's edge show a large residual or
+    an uneven contrast and are left out; nothing is downweighted.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 or uint16
+    blobs : Blobs
+
+    Returns
+    -------
+    Ellipses
+        Fitted and accepted, possibly none.
+    """
+    grey = image.astype(np.float32)
+    noise = max(noise_level(grey), 0.5)
+    centres, shapes = blobs.centres, blobs.shapes
+    kept = np.ones(len(centres), bool)
+    for _ in range(PASSES):
+        centres, shapes = _inside(grey.shape, centres[kept], shapes[kept])
+        if len(centres) == 0:
+            break
+        edge = _edges(grey, centres, shapes, bright=blobs.bright, noise=noise)
+        centres, shapes, residual, fitted = _moved(centres, shapes, edge)
+        kept = edge.whole & fitted
+    if len(centres) == 0:
+        empty = np.empty(0)
+        return Ellipses(np.empty((0, 2)), np.empty((0, 2, 2)), empty, empty, empty, blobs.bright)
+    found = Ellipses(centres, shapes, residual, edge.contrast, edge.sharpness, blobs.bright)[kept]
+    radii = np.sqrt(np.linalg.det(found.shapes))
+    round_enough = found.residual_px <= np.maximum(MAX_RESIDUAL_PX, MAX_RESIDUAL_OVER_RADIUS * radii)
+    if round_enough.any():
+        usual = np.median(found.residual_px[round_enough])
+        round_enough &= found.residual_px <= max(RESIDUAL_FLOOR_PX, MAX_RESIDUAL_OVER_MEDIAN * usual)
+    return found[round_enough]
+
+
+@dataclass(frozen=True)
+class _Edges:
+    directions: np.ndarray
+    normals: np.ndarray
+    distance: np.ndarray
+    contrast: np.ndarray
+    sharpness: np.ndarray
+    whole: np.ndarray
+
+
+def _inside(shape, centres, shapes):
+    """The ellipses whose profiles stay within the image."""
+    half_width = np.sqrt((shapes**2).sum(2)) + REACH_PX
+    limit = np.array([shape[1], shape[0]]) - 1.001
+    inside = (centres - half_width >= 0).all(1) & (centres + half_width <= limit).all(1)
+    return centres[inside], shapes[inside]
+
+
+def _edges(grey, centres, shapes, *, bright, noise):
+    directions = rim_directions()
+    rim = centres[:, None] + directions @ shapes
+    normals = directions @ np.linalg.inv(shapes)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    reach = np.minimum(REACH_PX, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(shapes)[:, 0])
+    offsets = np.linspace(-1, 1, SAMPLES)
+    steps = reach[:, None] * offsets
+    profiles = sample(grey, rim[:, :, None] + normals[:, :, None] * steps[:, None, :, None])
+    if not bright:
+        profiles = -profiles
+    inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
+    harmonics = np.stack([np.ones(PROFILES), *directions.T], 1)
+    smoother = harmonics @ np.linalg.pinv(harmonics)
+    inner_level, outer_level = inner @ smoother, outer @ smoother
+    contrast = inner_level - outer_level
+    departure = np.abs(inner - outer - contrast)
+    whole = (contrast > 0).all(1) & (departure <= np.maximum(MAX_CONTRAST_DEPARTURE * contrast, 6 * noise)).all(1)
+    excess = profiles - (inner_level + outer_level)[:, :, None] / 2
+    distance, crossed = _crossing(excess)
+    middle = SAMPLES // 2
+    slope = (profiles[:, :, middle - 2] - profiles[:, :, middle + 2]).mean(1) / (8 * reach / (SAMPLES - 1))
+    mean_contrast = contrast.mean(1)
+    sharpness = slope / np.where(whole, mean_contrast, 1.0)
+    return _Edges(directions, normals, distance * reach[:, None], mean_contrast, sharpness, whole & crossed)
+
+
+def _crossing(excess):
+    """Where profiles (N, P, S) fall through zero nearest their middle, from -1 to 1, and whether all N x P do."""
+    falls = (excess[:, :, :-1] > 0) & (excess[:, :, 1:] <= 0)
+    from_middle = np.abs(np.arange(SAMPLES - 1) - (SAMPLES - 2) / 2)
+    first = np.where(falls, from_middle, np.inf).argmin(2)
+    before = np.take_along_axis(excess, first[:, :, None], 2)[:, :, 0]
+    after = np.take_along_axis(excess, first[:, :, None] + 1, 2)[:, :, 0]
+    crossed = falls.any(2)
+    share = np.where(crossed, before / np.where(crossed, before - after, 1.0), 0.5)
+    return 2 * (first + share) / (SAMPLES - 1) - 1, crossed.all(1)
+
+
+def _moved(centres, shapes, edge):
+    """Least-squares change of centre and shape for the distances along the normals, and the rms residual."""
+    n, e = edge.normals, edge.directions
+    design = np.stack(
+        [n[..., 0], n[..., 1], n[..., 0] * e[:, 0], n[..., 0] * e[:, 1] + n[..., 1] * e[:, 0], n[..., 1] * e[:, 1]], 2
+    )
+    normal = design.swapaxes(1, 2) @ design
+    change = np.linalg.solve(normal, design.swapaxes(1, 2) @ edge.distance[:, :, None])
+    residual = edge.distance - (design @ change)[:, :, 0]
+    change = change[:, :, 0]
+    shapes = shapes + change[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    values = np.linalg.eigvalsh(shapes)
+    fitted = values[:, 0] > 1.0
+    rms = np.sqrt((residual**2).sum(1) / (PROFILES - 5))
+    return centres + change[:, :2], shapes, rms, fitted

@@ -1,0 +1,211 @@
+"""Lattice indices for the images of a regular array of circles, whatever the perspective and the distortion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from uwlts.errors import TargetError
+from uwlts.targets.circles import find_circles
+from uwlts.targets.consistency import agreeing
+from uwlts.targets.ellipses import Ellipses
+
+NEIGHBOURS = 16
+STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+
+# A neighbour is taken where it lies within this share of a step of its predicted place. One step changes by up to a
+# tenth from one circle to the next in strong perspective; half a step would reach the neighbour's neighbour.
+TOLERANCE = 0.25
+
+# Largest ratio of the radii of neighbouring circles.
+MAX_SIZE_RATIO = 1.5
+
+MIN_LABELLED = 4
+MAX_SEEDS = 20
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Circles with their places in a lattice.
+
+    Attributes
+    ----------
+    circles : Ellipses
+        Those with a place, N of them.
+    indices : (N, 2) int64
+        Steps (i, j) from an arbitrary circle; the turn from i to j is the turn from u to v, otherwise the choice of
+        the axes is arbitrary.
+    found : int
+        Number of circles found in the image, with or without a place.
+    """
+
+    circles: Ellipses
+    indices: np.ndarray
+    found: int
+
+
+def detect_lattice(image):
+    """Find the circles of a regular rectangular array without marks and number them.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 or uint16
+
+    Returns
+    -------
+    Lattice
+        The largest connected piece of lattice in the image.
+
+    Raises
+    ------
+    ImageError
+        The image is no grey image of 8 or 16 bit.
+    TargetError
+        Fewer than four circles form a lattice.
+    """
+    circles = find_circles(image)
+    indices, labelled = label_lattice(circles.centres, circles.shapes)
+    if labelled.sum() < MIN_LABELLED:
+        raise TargetError(
+            f"found {len(circles)} circles, of which {labelled.sum()} form a lattice; expected at least "
+            f"{MIN_LABELLED}: check that the target is in view, sharp and evenly lit"
+        )
+    return Lattice(circles[labelled], indices[labelled], len(circles))
+
+
+def label_lattice(centres, shapes):
+    """Number the points of a rectangular lattice by growing from a regular neighbourhood.
+
+    The image of a small circle shows the local affine map, so distances and angles to neighbours are judged in the
+    measure in which the ellipse is a circle: there the lattice is rectangular however oblique the view. From the seed,
+    each next circle is expected one local step further on.
+
+    Parameters
+    ----------
+    centres : (N, 2) float64, px
+    shapes : (N, 2, 2) float64, px
+        As in `Ellipses`.
+
+    Returns
+    -------
+    indices : (N, 2) int64
+        Zero where not labelled.
+    labelled : (N,) bool
+    """
+    indices, labelled = np.zeros((len(centres), 2), np.int64), np.zeros(len(centres), bool)
+    if len(centres) < MIN_LABELLED:
+        return indices, labelled
+    tree = cKDTree(centres)
+    radii = np.sqrt(np.linalg.det(shapes))
+    bases = _bases(centres, shapes, tree)
+    tried = np.zeros(len(centres), bool)
+    for seed in _seeds(centres, radii, bases, tree):
+        if tried[seed]:
+            continue
+        places = _grown(seed, centres, radii, bases[seed], tree)
+        members = np.fromiter(places.values(), int)
+        tried[members] = True
+        if len(places) > labelled.sum():
+            labelled[:] = False
+            labelled[members] = True
+            indices[members] = np.array(list(places))
+        if labelled.sum() >= np.count_nonzero(~tried):
+            break
+    members = np.flatnonzero(labelled)
+    members = members[agreeing(centres[members], indices[members])]
+    labelled[:] = False
+    labelled[members] = True
+    indices[~labelled] = 0
+    return indices, labelled
+
+
+def _bases(centres, shapes, tree):
+    """Steps (N, 2, 2) along i (row 0) and j (row 1) suggested by each circle's nearest neighbours; zero where none."""
+    count = min(NEIGHBOURS + 1, len(centres))
+    _, index = tree.query(centres, k=count)
+    steps = centres[index[:, 1:]] - centres[:, None]
+    seen = steps @ np.linalg.inv(shapes)
+    length = np.linalg.norm(seen, axis=2)
+    order = np.arange(len(centres))
+    first = length.argmin(1)
+    a, seen_a = steps[order, first], seen[order, first]
+    across = np.abs(_cross(seen, seen_a[:, None])) / (length * np.linalg.norm(seen_a, axis=1)[:, None])
+    # Half-way between the rectangle's corner (sine 1) and its diagonal at equal sides (sine 0.71).
+    length = np.where(across > 0.85, length, np.inf)
+    second = length.argmin(1)
+    b = np.where(np.isfinite(length[order, second])[:, None], steps[order, second], 0.0)
+    b *= np.sign(_cross(a, b))[:, None]
+    return np.stack([a, b], 1)
+
+
+def _cross(p, q):
+    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+
+
+def _seeds(centres, radii, bases, tree):
+    """Circles with four alike neighbours where their bases say, best first."""
+    expected = centres[:, None] + np.concatenate([bases, -bases], 1)
+    distance, index = tree.query(expected)
+    step = np.linalg.norm(bases, axis=2)
+    miss = (distance / np.maximum(np.tile(step, 2), 1e-9)).max(1)
+    ratio = np.abs(np.log(radii[index] / radii[:, None])).max(1)
+    # An edge of a narrow plate may have no circle with four neighbours; two at a right angle are then enough.
+    partial = np.sort(distance[:, :2] / np.maximum(step, 1e-9), 1)[:, 1]
+    usable = (step > 0).all(1) & (partial < TOLERANCE)
+    score = np.where(miss < TOLERANCE, miss + ratio, 1.0 + partial + ratio)
+    return np.flatnonzero(usable)[np.argsort(score[usable])][:MAX_SEEDS]
+
+
+def _grown(seed, centres, radii, basis, tree):
+    """Places {(i, j): circle} of the piece of lattice around a seed."""
+    places, where = {(0, 0): seed}, {seed: (0, 0)}
+    steps = {seed: basis}
+    frontier, reach = [seed], 1
+    while frontier:
+        expected, asked = [], []
+        for circle in frontier:
+            steps[circle] = _local_steps(where[circle], places, centres, steps[circle])
+            i, j = where[circle]
+            for di, dj in STEPS:
+                place = (i + reach * di, j + reach * dj)
+                if place not in places:
+                    expected.append(centres[circle] + reach * (di * steps[circle][0] + dj * steps[circle][1]))
+                    asked.append((circle, place, abs(dj)))
+        fresh = []
+        if asked:
+            distance, index = tree.query(np.array(expected))
+            for ask in np.argsort(distance):
+                (circle, place, axis), found = asked[ask], int(index[ask])
+                step = steps[circle][axis]
+                if distance[ask] > TOLERANCE * np.hypot(*step):
+                    continue
+                ratio = radii[found] / radii[circle]
+                if place in places or found in where or not 1 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
+                    continue
+                places[place], where[found] = found, place
+                steps[found] = steps[circle]
+                fresh.append(found)
+        if fresh:
+            frontier, reach = fresh, 1
+        elif reach == 1:
+            # Step over single missing circles once nothing else is left.
+            frontier, reach = list(where), 2
+        else:
+            frontier = []
+    return places
+
+
+def _local_steps(place, places, centres, inherited):
+    """Steps along i and j at a place: half the way between both neighbours, or the way to one, or as inherited."""
+    here = centres[places[place]]
+    steps = inherited.copy()
+    for axis, (di, dj) in enumerate(((1, 0), (0, 1))):
+        after = places.get((place[0] + di, place[1] + dj))
+        before = places.get((place[0] - di, place[1] - dj))
+        if after is not None and before is not None:
+            steps[axis] = (centres[after] - centres[before]) / 2
+        elif after is not None:
+            steps[axis] = centres[after] - here
+        elif before is not None:
+            steps[axis] = here - centres[before]
+    return steps
