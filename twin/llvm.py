@@ -61,9 +61,7 @@ def run_trial_kernel() -> None:
     """
     command = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
     try:
-        trial = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS
-        )
+        trial = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS)
     except subprocess.TimeoutExpired as error:
         raise SetupError(f"Dr.Jit did not finish a trial kernel within {TRIAL_SECONDS} s") from error
     if trial.returncode != 0:

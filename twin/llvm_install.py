@@ -7,13 +7,13 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from twin.llvm_search import VARIABLE, LlvmLibrary, find_llvm, own_folders
 from uwlts.errors import SetupError
 
-# 19 first: it is in most releases, and the one that Dr.Jit 1.5.0 was measured with most.
+# 19 first: the version that Dr.Jit 1.5.0 was measured with.
 DEBIAN_PACKAGES = tuple(f"libllvm{major}" for major in (19, 22, 21, 20, 18, 17))
 DEBIAN_RUNTIME = "libatomic1"
 # A wheel that ships the shared library. Dr.Jit 1.5.0 renders with this version of it.
@@ -23,7 +23,7 @@ COMMAND_SECONDS = 900
 
 def install_llvm(
     *,
-    folders: Iterable[Path] | None = None,
+    folders: Sequence[Path] | None = None,
     target: Path | None = None,
     report: Callable[[str], object] = lambda line: None,
 ) -> LlvmLibrary:
@@ -106,9 +106,7 @@ def _unpack_debian_packages(target: Path, report: Callable[[str], object]) -> No
             _download_and_unpack(Path(scratch), target, options, report)
 
 
-def _download_and_unpack(
-    scratch: Path, target: Path, options: Sequence[str], report: Callable[[str], object]
-) -> None:
+def _download_and_unpack(scratch: Path, target: Path, options: Sequence[str], report: Callable[[str], object]) -> None:
     package = _debian_package(options)
     if package is None:
         raise SetupError(f"apt-get download: there is none of {', '.join(DEBIAN_PACKAGES)}")
@@ -128,8 +126,8 @@ def _unpack_wheel(target: Path, report: Callable[[str], object]) -> None:
     """Without apt-get: the shared library from a wheel, through pip."""
     with tempfile.TemporaryDirectory() as scratch:
         report(f"libLLVM: unpacking the wheel {WHEEL} into {target}")
-        _run([sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps",
-              "--only-binary=:all:", "--dest", scratch, WHEEL])  # fmt: skip
+        pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+        _run([*pip, "download", "--no-deps", "--only-binary=:all:", "--dest", scratch, WHEEL])
         for wheel in Path(scratch).glob("*.whl"):
             with zipfile.ZipFile(wheel) as archive:
                 archive.extractall(Path(scratch, "unpacked"))

@@ -177,10 +177,7 @@ def named_version(path: Path) -> tuple[float, ...]:
 
 def list_candidates(folders: Iterable[Path] | None = None) -> list[Path]:
     """Files named like a libLLVM in the folders, links resolved, each file once."""
-    if folders is None:
-        listed = [*_files_in(search_folders()), *_files_in_loader_cache()]
-    else:
-        listed = _files_in(folders)
+    listed = [*_files_in(search_folders()), *_files_in_loader_cache()] if folders is None else _files_in(folders)
     return list(dict.fromkeys(path.resolve() for path in listed))
 
 

@@ -129,8 +129,8 @@ def _tangent_in_air(
             rise = rise + height * square / root**3
         step = missing / rise
         tangent = tangent - step
-        if not np.any(np.abs(step) > 4e-16 * (1.0 + tangent)):
-            break
+        if not np.any(np.abs(step) > 1e-10 * (1.0 + tangent)):
+            break  # the error left is the square of this step
     square = rarest**-2
     return tangent / np.sqrt(square + (square - 1.0) * tangent**2)
 

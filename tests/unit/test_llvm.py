@@ -1,6 +1,6 @@
 """The choice of a libLLVM for Dr.Jit: what is refused, what is reported, and that a kernel runs with what is chosen.
 
-Real shared libraries stand in for broken ones: a copy of a small library from Dr.Jit's wheel, in which the name of a
+Real shared libraries stand in for broken ones: a copy of a small library from Mitsuba's wheel, in which the name of a
 library it needs is overwritten with one of the same length that no system has.
 """
 
@@ -19,7 +19,7 @@ from twin.llvm import LlvmLibrary, find_llvm, install_llvm, main
 from twin.llvm_search import Unsuitable, examine, judge, list_candidates, named_version
 from uwlts.errors import SetupError
 
-NEEDED, ABSENT = b"libstdc++.so.6\0", b"libabsent.so.6\0"
+NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +38,7 @@ def machine_library():
 @pytest.fixture(scope="module")
 def foreign_library():
     """A small shared library that loads but is no libLLVM."""
-    return Path(importlib.util.find_spec("drjit").origin).with_name("libnanothread.so")
+    return Path(importlib.util.find_spec("mitsuba").origin).with_name("libpugixml.so")
 
 
 def overwrite_name(source, target):
@@ -170,17 +170,17 @@ def test_foreign_library_and_text_file_are_refused(tmp_path, foreign_library):
 
 def test_missing_dependency_is_reported_by_name(tmp_path, foreign_library):
     overwrite_name(foreign_library, tmp_path / "libLLVM.so.19.1")
-    with pytest.raises(SetupError, match=r"libLLVM\.so\.19\.1: it does not load: libabsent\.so\.6"):
+    with pytest.raises(SetupError, match=r"libLLVM\.so\.19\.1: it does not load: libQ\.so\.6"):
         find_llvm([tmp_path])
 
 
 def test_dependency_is_taken_from_the_same_folder(tmp_path, foreign_library):
-    """Once its own name in it is overwritten too, the C++ library serves as the one that is missing."""
-    ctypes.CDLL("libstdc++.so.6")
+    """A copy of the mathematics library, its own name in it overwritten too, serves as the one that is missing."""
+    ctypes.CDLL("libm.so.6")
     maps = Path("/proc/self/maps").read_text().splitlines()
-    original = next(Path(line[line.index("/") :]) for line in maps if "/libstdc++.so.6" in line)
+    original = next(Path(line[line.index("/") :]) for line in maps if line.endswith("/libm.so.6"))
     lacking = overwrite_name(foreign_library, tmp_path / "liblacking.so")
-    supplied = overwrite_name(original, tmp_path / "libabsent.so.6.0.30")
+    supplied = overwrite_name(original, tmp_path / "libQ.so.6.1")
     script = (
         "import sys; sys.path.insert(0, 'twin'); import llvm_probe; companions = []\n"
         f"llvm_probe.load_with_companions({str(lacking)!r}, companions); print(companions)"
@@ -231,7 +231,7 @@ def test_install_gives_the_reason_of_every_way_that_failed(tmp_path, monkeypatch
     with pytest.raises(SetupError) as caught:
         install_llvm(folders=[tmp_path], target=tmp_path / "unpacked")
     message = str(caught.value)
-    expected = ("Tried without success", "apt-get install: ", "apt-get download: ", "pip download", "Found:\n  none")
+    expected = ("Tried without success", "apt-get install: ", "apt-get download: ", " -m pip ", "Found:\n  none")
     assert [part for part in expected if part not in message] == []
 
 

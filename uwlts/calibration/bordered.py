@@ -7,7 +7,7 @@ import numpy as np
 
 from uwlts.errors import CalibrationError
 
-_ROUNDS = 200
+_ROUNDS = 60
 _SMALLEST_STEP = 1e-11
 _SMALLEST_GAIN = 1e-13
 # Columns are scaled to length one: a smaller eigenvalue of the shared parameters' normal matrix is rounding.
@@ -90,7 +90,7 @@ def fit_bordered(
     Raises
     ------
     CalibrationError
-        The start has no meaning, the observations do not determine the parameters, or no end within 200 rounds.
+        The start has no meaning, the observations do not determine the parameters, or no end within 60 rounds.
     """
     shared, own = np.array(shared, dtype=np.float64), [np.array(o, dtype=np.float64) for o in own]
     normal = _assembled(model, shared, own, soft_limit)
@@ -118,38 +118,41 @@ def fit_bordered(
             return _account(shared, own, normal, rounds, "no step lowers the cost further")
         else:
             damping *= 10
-    raise CalibrationError(f"the camera calibration did not settle in {_ROUNDS} rounds: check points and poses")
+    raise CalibrationError(
+        f"the camera calibration did not settle in {_ROUNDS} rounds: either the target images do not determine the "
+        f"camera (tilt the target, or fix some parameters), or they contradict each other"
+    )
 
 
 def _assembled(
     model: Model, shared: np.ndarray, own: list[np.ndarray], soft_limit: float | None
 ) -> _Normal | None:
-    observations, weights, cost = [], [], 0.0
+    count, cost, observations, products = len(shared), 0.0, [], []
     for group, values in enumerate(own):
         observation = model(group, shared, values)
         if observation is None or not np.isfinite(observation.residuals).all():
             return None
+        columns = np.hstack([observation.by_shared, observation.by_own, observation.residuals.reshape(-1, 1)])
         squares = np.sum(observation.residuals**2, axis=1)
         if soft_limit is None:
-            weight, group_cost = np.ones(len(squares)), squares.sum()
+            cost += float(squares.sum())
         else:
             root = np.sqrt(1 + squares / soft_limit**2)
-            weight, group_cost = 1 / root, np.sum(2 * soft_limit**2 * (root - 1))
+            cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
+            columns /= np.repeat(np.sqrt(root), 2)[:, None]
         observations.append(observation)
-        weights.append(np.repeat(weight, 2))
-        cost += float(group_cost)
-    shared_scale = _lengths(sum(np.einsum("i,ij,ij->j", w, o.by_shared, o.by_shared) for o, w in zip(observations, weights, strict=True)))
-    matrix, gradient = np.zeros((len(shared),) * 2), np.zeros(len(shared))
+        products.append(columns.T @ columns)
+    shared_scale = _lengths(sum(np.diag(product)[:count] for product in products))
+    matrix, gradient = np.zeros((count, count)), np.zeros(count)
     border, blocks, gradients, scales = [], [], [], []
-    for observation, weight in zip(observations, weights, strict=True):
-        scale = _lengths(np.einsum("i,ij,ij->j", weight, observation.by_own, observation.by_own))
-        by_shared, by_own = observation.by_shared / shared_scale, observation.by_own / scale
-        weighted, residuals = weight[:, None] * by_own, weight * observation.residuals.ravel()
-        matrix += by_shared.T @ (weight[:, None] * by_shared)
-        gradient += by_shared.T @ residuals
-        border.append(by_shared.T @ weighted)
-        blocks.append(by_own.T @ weighted)
-        gradients.append(by_own.T @ residuals)
+    for product in products:
+        scale = _lengths(np.diag(product)[count:-1])
+        scaled = product / np.outer(both := np.r_[shared_scale, scale, 1.0], both)
+        matrix += scaled[:count, :count]
+        gradient += scaled[:count, -1]
+        border.append(scaled[:count, count:-1])
+        blocks.append(scaled[count:-1, count:-1])
+        gradients.append(scaled[count:-1, -1])
         scales.append(scale)
     return _Normal(cost, observations, matrix, border, blocks, gradient, gradients, shared_scale, scales)
 

@@ -78,9 +78,13 @@ class Intrinsics:
         values = {"f": (fx + fy) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
         return np.array([values.get(name, 0.0) for name in self.names])
 
-    def plain_matrix(self, matrix: np.ndarray) -> np.ndarray:
-        """The nearest camera matrix (3, 3) that the options allow."""
-        return self.matrix(self.from_matrix(matrix))
+    def from_model(self, model: CameraModel) -> np.ndarray:
+        """The estimated parameters (P,) of a camera model."""
+        start = self.from_matrix(model.matrix())
+        for place, name in enumerate(self.names):
+            if name in DISTORTION:
+                start[place] = getattr(model.distortion, name)
+        return start
 
     def model(self, estimated: np.ndarray) -> CameraModel:
         """The camera model."""

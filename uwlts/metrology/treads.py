@@ -67,22 +67,22 @@ def label_treads(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, 
     EvaluationError
         Too few points, or no two such treads; the message says what was found.
     """
-    dimension = points.shape[1] if np.ndim(points) == 2 else 0
-    least = 10 if dimension == 2 else 40
-    points = accepted_points(points, least=2 * least, what="a step", dimensions=(2, 3))
+    points = accepted_points(points, least=20, what="a step", dimensions=(2, 3))
+    least = 10 if points.shape[1] == 2 else 40
     proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
     if proposal is None:
         raise EvaluationError(
             f"no two parallel treads about {height_mm:g} mm apart among {len(points)} points; "
             f"show both treads, or correct the height"
         )
-    normal, level = proposal
+    normal, anchor, offset = proposal
     for _ in range(_ROUNDS):
-        lower, upper = _levels(points @ normal, level, height_mm)
-        normal = _common_normal(points[lower], points[upper], normal)
-        level = float(np.median(points[lower] @ normal))
+        on_anchor, on_other = _levels(points @ normal, anchor, offset)
+        normal = _common_normal(points[on_anchor], points[on_other], normal)
+        anchor = float(np.median(points[on_anchor] @ normal))
+    lower, upper = (on_anchor, on_other) if offset > 0 else (on_other, on_anchor)
     labels = np.zeros(len(points), dtype=np.int8)
-    along = points @ principal_axes(normal[None])[1][1:].T
+    along = points @ np.linalg.svd(normal[None])[2][1:].T
     for tread, on_it in ((Tread.LOWER, lower), (Tread.UPPER, upper)):
         labels[_away_from_edges(along, on_it, edge_mm)] = tread
     _require_treads(heights=points @ normal, labels=labels, height=height_mm, least=least)
@@ -92,7 +92,7 @@ def label_treads(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, 
 def step_height_of_profile(
     points_yz: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
 ) -> StepHeight:
-    """Mean distance of one tread's points to the line through the other's, in one profile (thesis, section 3.2).
+    """Mean distance of one tread's points to the line through the other's, in one profile (thesis, section 3.2.2).
 
     Where the sheet does not cut the step along its normal this is the height over the cosine of the angle between.
 
@@ -150,8 +150,10 @@ def _require_treads(*, heights: np.ndarray, labels: np.ndarray, height: float, l
         raise EvaluationError(f"the treads found are {distance:.2f} mm apart; the step is described with {height:g} mm")
 
 
-def _best_proposal(points: np.ndarray, height: float, rng: np.random.Generator) -> tuple[np.ndarray, float] | None:
-    """Normal towards the sensor and level of the lower tread with most points on both levels."""
+def _best_proposal(
+    points: np.ndarray, height: float, rng: np.random.Generator
+) -> tuple[np.ndarray, float, float] | None:
+    """Normal towards the sensor, level of one tread and signed offset of the other, with most points on both."""
     limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_TREAD * len(points))
     most, best = 0.0, None
     for normal in _proposed_normals(points, rng):
@@ -168,7 +170,7 @@ def _best_proposal(points: np.ndarray, height: float, rng: np.random.Generator) 
             top = int(np.argmax(support))
             if support[top] > most:
                 most = float(support[top])
-                best = (normal, float(heights[top]) if side > 0 else float(heights[top]) - height)
+                best = (normal, float(heights[top]), side * height)
     return best
 
 
@@ -188,13 +190,14 @@ def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     return np.where(normals[:, -1:] > 0, -normals, normals)
 
 
-def _levels(heights: np.ndarray, level: float, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N,) bool on the lower tread, near the level, and on the upper one, where points crowd most above it."""
-    above = np.sort(heights[np.abs(heights - level - height) <= _HEIGHT_TOLERANCE * height])
+def _levels(heights: np.ndarray, anchor: float, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N,) bool on the tread at the anchor's level, and on the one where points crowd most about an offset."""
+    height = abs(offset)
+    about = np.sort(heights[np.abs(heights - anchor - offset) <= _HEIGHT_TOLERANCE * height])
     window = _SEARCH_LIMIT * height
-    crowd = np.searchsorted(above, above + 2 * window, side="right") - np.arange(len(above))
-    upper_level = float(above[np.argmax(crowd)]) + window if len(above) else level + height
-    return _near_level(heights, level, height), _near_level(heights, upper_level, height)
+    crowd = np.searchsorted(about, about + 2 * window, side="right") - np.arange(len(about))
+    other = float(about[np.argmax(crowd)]) + window if len(about) else anchor + offset
+    return _near_level(heights, anchor, height), _near_level(heights, other, height)
 
 
 def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:

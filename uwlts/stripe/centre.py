@@ -14,7 +14,6 @@ import numpy as np
 from uwlts.stripe.lobe import Lobe
 from uwlts.stripe.result import StripeMethod
 
-_SERIES_STEPS = 3
 _MASS_STEPS = 6
 
 
@@ -49,38 +48,36 @@ def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative, at c, of the
     profile f smoothed with g. As wide as the stripe, the kernel is the matched filter: the zero is the least-squares
-    position of a Gaussian, of least variance in white noise. The kernel is evaluated at a real-valued c0 instead of
-    interpolating between pixels, and F around c0 follows from the moments Mk = sum f t^k g there, for g's derivatives
-    are Hermite polynomials times g: with d = (c - c0) / s,
-
-        F = M1 - (M0 - M2) d + (M3 - 3 M1) d^2 / 2 - (6 M2 - M4 - 3 M0) d^3 / 6 + ...
+    position of a Gaussian, of least variance in white noise. The kernel is evaluated at a real-valued c0, the midpoint
+    of the half-height crossings, instead of interpolating between pixels. With Mk = sum f t^k g the slope of F by c / s
+    is M2 - M0, so that Newton's step is r = M1 / (M0 - M2). For a Gaussian f of sigma s, F(c) is proportional to
+    d exp(-d^2 / 4), d being the step that is sought, and r = d / (1 - d^2 / 2): the step is r - r^3 / 2 to fourth order.
 
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
     """
-    zeroth, first, second, third, fourth = _gaussian_moments(lobe, lobe.middle, sigma, 4)
-    start = first - lobe.slope * np.float32(math.sqrt(2.0 * math.pi)) * sigma**2
-    falling = np.maximum(zeroth - second, np.float32(0.1) * np.abs(zeroth))
-    bend = np.float32(0.5) * (third - 3.0 * first)
-    twist = (6.0 * second - fourth - 3.0 * zeroth) / np.float32(6.0)
-    limit = np.float32(0.5)
-    d = start / falling
-    for _ in range(_SERIES_STEPS):
-        d = np.minimum(np.maximum(d, -limit), limit)
-        d = (start + (bend - twist * d) * d * d) / falling
-    d = np.minimum(np.maximum(d, -limit), limit)
-    top = zeroth + d * (first + np.float32(0.5) * d * (second - zeroth))
-    return lobe.middle + sigma * d, top / (np.float32(math.sqrt(math.pi)) * sigma)
+    zeroth, first, second = _gaussian_moments(lobe, lobe.middle, sigma, 2)
+    first -= lobe.slope * np.float32(math.sqrt(2.0 * math.pi)) * sigma**2
+    step = first / np.maximum(zeroth - second, np.float32(0.1) * np.abs(zeroth))
+    step = np.minimum(np.maximum(step, np.float32(-0.5)), np.float32(0.5))
+    step -= np.float32(0.5) * step**3
+    # The sum under the Gaussian at its top, from its value a step away.
+    top = zeroth * (np.float32(1.0) + np.float32(0.25) * step**2)
+    return lobe.middle + sigma * step, top / (np.float32(math.sqrt(math.pi)) * sigma)
 
 
 def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest: int) -> list[np.ndarray]:
     """M0 ... Mk of the profile above `lobe.base` under the Gaussian weight at `centre`; see `_zero_crossing`."""
+    # Rows beyond the weight of every lobe, less than 4e-4 there, are left out.
+    size = lobe.window.shape[0]
+    reach = 4.0 * float(sigma.max())
+    rows = slice(max(0, math.floor(float(centre.min()) - reach)), min(size, math.ceil(float(centre.max()) + reach) + 1))
     narrow = np.float32(1.0) / sigma
-    t = np.arange(lobe.window.shape[0], dtype=np.float32)[:, None] * narrow - centre * narrow
+    t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] * narrow - centre * narrow
     weighted = t * t
     weighted *= np.float32(-0.5)
     # OpenCV's exponential is several times as fast as NumPy's.
     weighted = cv2.exp(weighted)
-    weighted *= lobe.window - lobe.base
+    weighted *= lobe.window[rows] - lobe.base
     moments = [weighted.sum(axis=0)]
     for _ in range(highest):
         weighted *= t

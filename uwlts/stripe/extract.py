@@ -27,6 +27,8 @@ from uwlts.stripe.image import (
 from uwlts.stripe.lobe import FLANK, Lobe, look, noise_gain, off_centre
 from uwlts.stripe.result import FWHM_PER_SIGMA, PeakRule, Stripe, StripeOptions, StripeStatus
 
+_DEFAULTS = StripeOptions()
+
 _LOOKS = 4
 """Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
 
@@ -44,7 +46,7 @@ def extract_stripe(
     image: np.ndarray,
     *,
     stripe_along: str,
-    options: StripeOptions | None = None,
+    options: StripeOptions = _DEFAULTS,
     background: np.ndarray | None = None,
     saturation: float | None = None,
 ) -> Stripe:
@@ -75,7 +77,6 @@ def extract_stripe(
         If the image, the background, `stripe_along` or `saturation` is not as described, or the lines are shorter
         than the search window.
     """
-    options = StripeOptions() if options is None else options
     half, block = options.half_window_px, options.half_window_px // 2
     check_image(image, name="image")
     check_length(image, stripe_along=stripe_along, least=2 * half + 1)
@@ -94,7 +95,8 @@ def extract_stripe(
     if none.any():
         if signal is not image:
             _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
-        found.status[none & (low >= clip).any(axis=0)] = StripeStatus.SATURATED
+        clipped = low >= clip
+        found.status[none & (clipped[1:] & clipped[:-1]).any(axis=0)] = StripeStatus.SATURATED
     return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
 
 
@@ -147,10 +149,10 @@ def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: S
         verdict = _judge(lobe, profiles.shape[0], fine, options)
         stripe = verdict != StripeStatus.NO_STRIPE
         again = found.status[lines] == StripeStatus.OK
-
-        rival = stripe & again & (lobe.height >= options.ambiguous_ratio * found.height[lines])
-        found.discard(lines[rival], StripeStatus.AMBIGUOUS)
         new = stripe & ~again
+        if again.any():
+            rival = stripe & again & (lobe.height >= options.ambiguous_ratio * found.height[lines])
+            found.discard(lines[rival], StripeStatus.AMBIGUOUS)
         found.status[lines[new]] = verdict[new]
         _measure(found, lines, lobe, new & (verdict == StripeStatus.OK), options)
 
@@ -174,12 +176,16 @@ def _next_blocks(
     columns = board if lines.size == board.shape[1] else board[:, lines]
     highest = columns.max(axis=0)
     stands_out = highest >= least
+    if not stands_out.any():
+        nothing = np.empty(0, np.intp)
+        return nothing, nothing, highest[:0]
     if not stands_out.all():
         lines, least, highest = lines[stands_out], least[stands_out], highest[stands_out]
         columns = columns[:, stands_out]
     wanted = columns == highest if rule is PeakRule.STRONGEST else columns >= least
     chosen = first_true(wanted) if rule is not PeakRule.LAST else last_true(wanted)
-    return lines, chosen, columns[chosen, np.arange(lines.size)].astype(np.float32)
+    there = highest if rule is PeakRule.STRONGEST else columns[chosen, np.arange(lines.size)]
+    return lines, chosen, there.astype(np.float32)
 
 
 def _look_centred(
@@ -203,17 +209,19 @@ def _look_centred(
 
 def _judge(lobe: Lobe, count: int, fine: float, options: StripeOptions) -> np.ndarray:
     """(M,) uint8 `StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
-    fwhm = _true_sigma(lobe, options) * np.float32(FWHM_PER_SIGMA)
-    peak = lobe.start + lobe.peak
-    shaped = lobe.closed & (fwhm >= options.min_fwhm_px) & (fwhm <= options.half_window_px)
-    middle = lobe.start + lobe.middle
-    extent = lobe.reach + FLANK - 1
-    beyond = (middle - extent < 0) | (middle + extent > count - 1)
-    cut = ~lobe.closed & ((lobe.start < 0) | (lobe.start + lobe.window.shape[0] > count)) & (peak > 1) & (peak < count - 2)
-    verdict = np.full(peak.size, StripeStatus.NO_STRIPE, np.uint8)
-    verdict[shaped] = StripeStatus.OK
-    verdict[shaped & lobe.crowded] = StripeStatus.AMBIGUOUS
-    verdict[(shaped & beyond) | cut] = StripeStatus.BORDER
+    size = lobe.window.shape[0]
+    sigma = _true_sigma(lobe, options)
+    narrowest, widest = options.min_fwhm_px / FWHM_PER_SIGMA, options.half_window_px / FWHM_PER_SIGMA
+    stripe = lobe.closed & (sigma >= np.float32(narrowest)) & (sigma <= np.float32(widest))
+    verdict = np.where(stripe, np.uint8(StripeStatus.OK), np.uint8(StripeStatus.NO_STRIPE))
+    if lobe.crowded.any():
+        verdict[stripe & lobe.crowded] = StripeStatus.AMBIGUOUS
+    outside = (lobe.start < 0) | (lobe.start + size > count)
+    if outside.any():
+        middle, extent, peak = lobe.start + lobe.middle, lobe.reach + FLANK - 1, lobe.start + lobe.peak
+        verdict[stripe & ((middle - extent < 0) | (middle + extent > count - 1))] = StripeStatus.BORDER
+        # A peak whose far side is not in the image; one on the last pixel itself may be any rise towards the border.
+        verdict[outside & ~lobe.closed & (peak > 1) & (peak < count - 2)] = StripeStatus.BORDER
     verdict[lobe.height < fine] = StripeStatus.NO_STRIPE
     return verdict
 

@@ -15,7 +15,8 @@ from uwlts.stripe.result import FWHM_PER_SIGMA
 FLANK = 5
 _SLACK = 2
 _ONE = np.ones(1, np.float32)
-_FLANK_ROWS = np.arange(FLANK)[:, None]
+_FLANK_ROWS = np.arange(FLANK)[:, None, None]
+_INWARD = np.array([[1], [-1]])
 
 
 @dataclass(frozen=True)
@@ -110,31 +111,33 @@ def look(
     peak_row = first + first_true(sought == peak)
     before, after = smooth[:block].min(axis=0), smooth[-block:].min(axis=0)
     # Repeated border pixels may belong to the stripe itself, so that only the other side tells the background.
-    before[start < 0] = -np.inf
-    after[start + size > profiles.shape[0]] = -np.inf
+    if start.min() < 0:
+        before[start < 0] = -np.inf
+    if start.max() + size > profiles.shape[0]:
+        after[start + size > profiles.shape[0]] = -np.inf
     ground = np.maximum(before, after)
-    level = 0.5 * (peak + ground)
+    level = np.float32(0.5) * (peak + ground)
 
     at = peak_row.astype(rows.dtype)
     low = smooth < level
-    left = last_true(low & (rows < at))
-    right = first_true(low & (rows > at))
+    # The peak lies within `sought`, so that neither side needs all rows.
+    left = last_true(low[: first + 2 * block] & (rows[: first + 2 * block] < at))
+    right = first + first_true(low[first:] & (rows[first:] > at))
     closed = (left >= 0) & (right < size)
-    x_left = _crossing(smooth, columns, left, 1, level)
-    x_right = _crossing(smooth, columns, right, -1, level)
-    middle = 0.5 * (x_left + x_right)
+    x_left, x_right = _crossings(smooth, columns, np.stack([left, right]), level)
+    middle = np.float32(0.5) * (x_left + x_right)
     sigma = (x_right - x_left) / np.float32(FWHM_PER_SIGMA)
 
     reach = np.minimum(np.ceil(3.0 * sigma), half - FLANK + 1).astype(np.intp)
     near = np.rint(middle).astype(np.intp)
-    before = _flank(window, columns, near - reach - FLANK + 1)
-    after = _flank(window, columns, near + reach)
-    again = smooth >= ground + share * (peak - ground)
-    again &= (rows < (left + 1).astype(rows.dtype)) | (rows >= right.astype(rows.dtype))
-    if not whole:
-        again &= np.abs(np.arange(size)[:, None] - near) < reach + FLANK
+    before, after = _flanks(window, columns, np.stack([near - reach - FLANK + 1, near + reach]))
+    crowded = size - low.sum(axis=0, dtype=rows.dtype) != right - left - 1
+    if crowded.any():
+        limits = (left, right) if whole else (left, right, near - reach - FLANK, near + reach + FLANK)
+        floor = (ground + share * (peak - ground))[crowded]
+        crowded[crowded] = _second_lobe(smooth[:, crowded] >= floor, *(limit[crowded] for limit in limits))
     slope = (after - before) / (2 * reach + FLANK - 1).astype(np.float32)
-    base = 0.5 * (before + after) + slope * (middle - near).astype(np.float32)
+    base = np.float32(0.5) * (before + after) + slope * (middle - near).astype(np.float32)
     return Lobe(
         start=start,
         window=window,
@@ -147,7 +150,7 @@ def look(
         peak=peak_row,
         height=np.where(closed, peak - base, peak - ground),
         closed=closed,
-        crowded=again.any(axis=0),
+        crowded=crowded,
     )
 
 
@@ -191,24 +194,32 @@ def noise_gain(sigma: float) -> float:
     return float(np.sqrt(np.sum(_kernel(sigma) ** 2)))
 
 
-def _crossing(smooth: np.ndarray, columns: np.ndarray, row: np.ndarray, inward: int, level: np.ndarray) -> np.ndarray:
-    """(M,) float32: where the straight line from `row` to its neighbour meets `level`.
+def _second_lobe(
+    high: np.ndarray, left: np.ndarray, right: np.ndarray, first: np.ndarray | int = -1, last: np.ndarray | int = 1 << 30
+) -> np.ndarray:
+    """(M,) bool: something in the (W, M) mask between `first` and `last` but not between `left` and `right`."""
+    row = np.arange(high.shape[0])[:, None]
+    return (high & ((row <= left) | (row >= right)) & (row > first) & (row < last)).any(axis=0)
+
+
+def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """(2, M) float32: where the straight lines from two rows below `level` to their inner neighbours meet it.
 
     A row just outside the window stands for no crossing and gives a place less than a pixel further in.
     """
     width = smooth.shape[1]
-    index = row * width + columns
+    index = rows * width + columns
     low = smooth.take(index, mode="clip")
-    rise = smooth.take(index + inward * width, mode="clip") - low
+    rise = smooth.take(index + width * _INWARD, mode="clip") - low
     part = (level - low) / np.maximum(rise, np.float32(1e-6))
     part = np.minimum(np.maximum(part, np.float32(0.0)), np.float32(1.0))
-    return row.astype(np.float32) + np.float32(inward) * part
+    return rows.astype(np.float32) + _INWARD.astype(np.float32) * part
 
 
-def _flank(window: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """(M,) float32: mean of five background pixels without the largest and the smallest."""
+def _flanks(window: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """(2, M) float32: means of two runs of five background pixels, each without its largest and smallest."""
     size, width = window.shape
     index = np.minimum(np.maximum(first, 0), size - FLANK) * width + columns
     pixels = window.take(index + _FLANK_ROWS * width, mode="clip")
     trimmed = pixels.sum(axis=0) - pixels.max(axis=0) - pixels.min(axis=0)
-    return trimmed / np.float32(FLANK - 2)
+    return trimmed * np.float32(1.0 / (FLANK - 2))

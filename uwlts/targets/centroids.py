@@ -78,29 +78,52 @@ def _level_planes(grey, centres, shapes, reaches, wanted):
 
 
 def _centroids(grey, centres, shapes, reaches, planes):
-    inner_reach, outer_reach = reaches
-    half_width = np.sqrt((shapes**2).sum(2)) + outer_reach[:, None]
-    low = np.maximum(np.floor(centres - half_width).astype(int), 0)
-    high = np.minimum(np.ceil(centres + half_width).astype(int), np.array(grey.shape[::-1]) - 1)
-    size = high - low + 1
-    count = size.prod(1)
-    blob = np.repeat(np.arange(len(centres)), count)
-    position = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    row, column = np.divmod(position, size[blob, 0])
-    u, v = low[blob, 0] + column, low[blob, 1] + row
+    widest = shapes + np.eye(2) * reaches[1][:, None, None]
+    blob, v, outer, inner = _row_runs(centres, shapes - np.eye(2) * reaches[0][:, None, None], widest)
+    # Pixels further in than the band, a run per row: their number and the sums of their coordinates.
+    whole = np.maximum(inner[1] - inner[0] + 1, 0)
+    area = np.bincount(blob, whole, len(centres))
+    sum_u = np.bincount(blob, whole * ((inner[0] + inner[1]) / 2 - centres[blob, 0]), len(centres))
+    sum_v = np.bincount(blob, whole * (v - centres[blob, 1]), len(centres))
+    # Pixels of the band: the rest of the outer run, to the left and to the right of the inner one.
+    starts = np.concatenate([outer[0], np.maximum(inner[1] + 1, inner[0])])
+    lengths = np.maximum(np.concatenate([inner[0] - outer[0], outer[1] + 1 - starts[len(blob) :]]), 0)
+    total = int(lengths.sum())
+    u = np.arange(total) - np.repeat(np.cumsum(lengths) - lengths - starts, lengths)
+    v, blob = np.repeat(np.tile(v, 2), lengths), np.repeat(np.tile(blob, 2), lengths)
     du, dv = u - centres[blob, 0], v - centres[blob, 1]
-    inverse = np.linalg.inv(shapes)[blob]
-    x = inverse[:, 0, 0] * du + inverse[:, 0, 1] * dv
-    y = inverse[:, 0, 1] * du + inverse[:, 1, 1] * dv
-    radius = np.hypot(x, y)
-    # First-order distance from the ellipse: (|x| - 1) / |gradient of |x||.
-    steepness = np.hypot(inverse[:, 0, 0] * x + inverse[:, 0, 1] * y, inverse[:, 0, 1] * x + inverse[:, 1, 1] * y)
-    distance = (radius - 1) * radius / np.maximum(steepness, 1e-9)
-    share = np.where(distance < 0, 1.0, 0.0)
-    band = (distance > -inner_reach[blob]) & (distance < outer_reach[blob])
-    of = blob[band]
-    inside, outside = (planes[of, side, 0] + planes[of, side, 1] * du[band] + planes[of, side, 2] * dv[band]
-                       for side in (0, 1))
-    share[band] = (grey[v[band], u[band]] - outside) / (inside - outside)
-    area = np.bincount(blob, share)
-    return centres + np.stack([np.bincount(blob, share * du), np.bincount(blob, share * dv)], 1) / area[:, None]
+    inside, outside = (value[blob] + slope_u[blob] * du + slope_v[blob] * dv for value, slope_u, slope_v in
+                       (planes[:, side].T for side in (0, 1)))
+    share = (grey[v, u] - outside) / (inside - outside)
+    area += np.bincount(blob, share, len(centres))
+    sum_u += np.bincount(blob, share * du, len(centres))
+    sum_v += np.bincount(blob, share * dv, len(centres))
+    return centres + np.stack([sum_u, sum_v], 1) / area[:, None]
+
+
+def _row_runs(centres, inner_shapes, outer_shapes):
+    """Rows of pixels that ellipses cover: blob (R,), v (R,), first and last u within the outer and the inner ellipse.
+
+    A row that misses the inner ellipse has an empty inner run, which starts after the end of the outer one.
+    """
+    half_height = np.linalg.norm(outer_shapes[:, 1], axis=1)
+    top = np.ceil(centres[:, 1] - half_height).astype(int)
+    count = np.floor(centres[:, 1] + half_height).astype(int) - top + 1
+    blob = np.repeat(np.arange(len(centres)), count)
+    v = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - top, count)
+    dv = v - centres[blob, 1]
+    runs = []
+    for shapes in (outer_shapes, inner_shapes):
+        # x' Q x = 1 with Q = shape^-2, solved for u.
+        inverse = np.linalg.inv(shapes)
+        quadratic = (inverse @ inverse)[blob]
+        mixed = quadratic[:, 0, 1] * dv
+        root = mixed**2 - quadratic[:, 0, 0] * (quadratic[:, 1, 1] * dv**2 - 1)
+        half = np.sqrt(np.maximum(root, 0.0)) / quadratic[:, 0, 0]
+        middle = centres[blob, 0] - mixed / quadratic[:, 0, 0]
+        first, last = np.ceil(middle - half).astype(int), np.floor(middle + half).astype(int)
+        runs.append((first, last, (root > 0) & (first <= last)))
+    (first, last, covered), (inner_first, inner_last, inner_covered) = runs
+    empty = last + 1
+    inner = np.where(inner_covered, inner_first, empty), np.where(inner_covered, inner_last, empty - 1)
+    return blob[covered], v[covered], (first[covered], last[covered]), (inner[0][covered], inner[1][covered])

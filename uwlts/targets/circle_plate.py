@@ -8,7 +8,8 @@ from uwlts.targets.description import CircleTarget
 from uwlts.targets.lattice import label_lattice
 from uwlts.targets.view import TargetView
 
-# A sharp dot has the strength 1, a dirty circle or noise rarely more than 0.1; a dot of two pixels under blur keeps 0.4.
+# Above the median of all circles, which is below zero where blur lowers the ring of a small circle. A sharp dot has the
+# strength 1, dirt and noise rarely more than 0.1; a dot of two pixels under blur keeps 0.4.
 MIN_MARK_STRENGTH = 0.3
 
 # Circles outside the described lattice that are taken for stray blobs: this share of all.
@@ -38,7 +39,7 @@ def detect_circle_plate(image, target: CircleTarget) -> TargetView:
     if len(circles) < 4:
         raise TargetError(f"found {found} circles but they form no lattice; check that the target is in view and sharp")
     strength = mark_strength(image, circles, mark_over_circle=target.marker_diameter_mm / target.diameter_mm)
-    origin, turn = _orientation(numbers, strength, target, found)
+    origin, turn = _orientation(numbers, strength - np.median(strength), target, found)
     indices = (numbers - origin) @ turn + np.array(target.origin)
     inside = ((indices >= 0) & (indices < (target.columns, target.rows))).all(1)
     if np.count_nonzero(~inside) > MAX_STRAY * len(indices):

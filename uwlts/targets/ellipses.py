@@ -8,7 +8,7 @@ from uwlts.targets.blobs import noise_level
 from uwlts.targets.edges import PROFILES, REACH_OVER_MINOR_AXIS, rim_directions, sample
 
 SAMPLES = 11
-PASSES = 3
+PASSES = 2
 
 # Reach of an edge profile on either side of the ellipse. Two and a half pixels hold the edge of a usual lens; inside a
 # small blob half the minor semi-axis is all there is before the opposite edge is felt.

@@ -1,0 +1,179 @@
+"""The laser sheet as a plane: stripe points on the target at known poses, the plane through them, and the OCS."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from uwlts.calibration.model import CameraModel, SheetModel
+from uwlts.camera import directions
+from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.metrology.fits import fit_plane, fit_robustly
+
+# Spread of the points along the shorter direction of the sheet over their scatter across it: below, the scatter turns
+# the plane. A single stripe has a ratio of one.
+_LEAST_SPREAD = 20.0
+# Strays are few; where more points leave the plane, there is none.
+_LARGEST_REJECTED = 0.2
+_LARGEST_TURN = np.radians(60)
+
+
+@dataclass(frozen=True, eq=False)
+class StripePoints:
+    """Stripe points on the target: (N, 3) in mm, camera frame, and the number (N,) of the image of each."""
+
+    points_mm: np.ndarray
+    image: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SheetSolution:
+    """A calibrated sheet.
+
+    Attributes
+    ----------
+    model : SheetModel
+    residuals_mm : (N,)
+        Signed distances of all points from the plane.
+    used : (N,) bool
+        The points that were not left out as strays.
+    rms_mm, max_mm : float
+        Over the points used.
+    rejected_share : float
+        Share of the points left out.
+    normal_std_rad : float
+        Largest standard deviation of the normal's direction.
+    turn_rad : float
+        Angle between the normal and the nominal one.
+    """
+
+    model: SheetModel
+    residuals_mm: np.ndarray
+    used: np.ndarray
+    rms_mm: float
+    max_mm: float
+    rejected_share: float
+    normal_std_rad: float
+    turn_rad: float
+
+
+def points_on_target(
+    camera: CameraModel,
+    stripes: Sequence[np.ndarray],
+    target_poses: np.ndarray,
+    *,
+    extent_mm: np.ndarray,
+    margin_mm: float = 0.0,
+) -> StripePoints:
+    """Where the camera rays of stripe pixels meet the target's plane (thesis, section 4.8).
+
+    Parameters
+    ----------
+    camera : CameraModel
+    stripes : sequence of (N, 2)
+        Stripe pixels (u, v) of each image.
+    target_poses : (F, 4, 4)
+        ``T_camera_target`` of each image.
+    extent_mm : (V, 2)
+        Points of the target's plane (x, y) whose convex hull is known to be plate: a stripe outside lies elsewhere.
+    margin_mm : float
+        Widens the hull by so much.
+
+    Raises
+    ------
+    CalibrationError
+        No stripe pixel falls on the plate.
+    """
+    hull = ConvexHull(np.asarray(extent_mm, dtype=np.float64)).equations
+    kept, images = [], []
+    for index, (pixels, pose) in enumerate(zip(stripes, target_poses, strict=True)):
+        rays = directions(camera, pixels)
+        normal, origin = pose[:3, 2], pose[:3, 3]
+        with np.errstate(divide="ignore"):
+            length = normal @ origin / (rays @ normal)
+        ahead = np.isfinite(length) & (length > 0)
+        points = rays[ahead] * length[ahead, None]
+        on_plate = (points - origin) @ pose[:3, :2] @ hull[:, :2].T + hull[:, 2] <= margin_mm
+        kept.append(points[on_plate.all(axis=1)])
+        images.append(np.full(len(kept[-1]), index))
+    if not sum(map(len, kept)):
+        raise CalibrationError(
+            f"none of the stripes in {len(stripes)} images falls on the target: check the target's description and the "
+            f"stage positions"
+        )
+    return StripePoints(np.vstack(kept), np.concatenate(images))
+
+
+def fit_sheet(points_mm: np.ndarray, *, nominal_normal: np.ndarray) -> SheetSolution:
+    """Plane by orthogonal distances, without points farther than five robust standard deviations.
+
+    Parameters
+    ----------
+    points_mm : (N, 3)
+        Camera frame.
+    nominal_normal : (3,)
+        Unit vector; the normal is turned to its side.
+
+    Raises
+    ------
+    CalibrationError
+        The points do not determine a plane, do not lie on one, or its normal is far from the nominal one.
+    """
+    try:
+        robust = fit_robustly(partial(fit_plane, towards=nominal_normal), points_mm)
+    except EvaluationError as error:
+        raise CalibrationError(f"no laser sheet through the stripe points: {error}") from error
+    plane, used = robust.fit, robust.inliers
+    spread = np.sqrt(np.mean(((points_mm[used] - plane.point_mm) @ plane.axes[1]) ** 2))
+    if spread < _LEAST_SPREAD * plane.std_mm:
+        raise CalibrationError(
+            f"the stripe points reach only {spread:.3g} mm along the shorter side of the sheet and scatter by "
+            f"{plane.std_mm:.3g} mm across it: move the target further between the images"
+        )
+    if robust.rejected_share > _LARGEST_REJECTED:
+        raise CalibrationError(
+            f"{100 * robust.rejected_share:.0f} % of the stripe points do not lie on the plane of the others: check the "
+            f"stage positions, and that the stripe falls on the target"
+        )
+    turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
+    if turn > _LARGEST_TURN:
+        raise CalibrationError(
+            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description: check "
+            f"stripe_along and where the laser stands"
+        )
+    return SheetSolution(
+        model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=float(plane.normal @ plane.point_mm)),
+        residuals_mm=robust.distances_mm,
+        used=used,
+        rms_mm=float(np.sqrt(np.mean(plane.residuals_mm**2))),
+        max_mm=float(np.max(np.abs(plane.residuals_mm))),
+        rejected_share=robust.rejected_share,
+        normal_std_rad=float(np.sqrt(np.max(np.diag(plane.covariance)[1:]))),
+        turn_rad=turn,
+    )
+
+
+def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
+    """``T_camera_object`` (4, 4) of the OCS that belongs to a sheet.
+
+    X is the sheet's normal, Z the laser's axis (3,), camera frame, made square to it, Y = Z x X; the origin is where
+    the camera's axis meets the sheet.
+
+    Raises
+    ------
+    CalibrationError
+        The laser's axis runs along the normal, or the camera's axis does not meet the sheet in front of the camera.
+    """
+    x = np.array(sheet.normal)
+    z = laser_axis - (laser_axis @ x) * x
+    if np.linalg.norm(z) < 0.1 * np.linalg.norm(laser_axis):
+        raise CalibrationError("the laser's nominal axis runs across the calibrated sheet: check the description")
+    z = z / np.linalg.norm(z)
+    if not (abs(x[2]) > 1e-9 and sheet.offset_mm / x[2] > 0):
+        raise CalibrationError("the camera's axis does not meet the calibrated sheet in front of the camera")
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    transform[2, 3] = sheet.offset_mm / x[2]
+    return transform

@@ -1,0 +1,247 @@
+"""Distance of the camera's window from images of a step standard in the medium (thesis, sections 3.2.2 and 4.8.1)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import brentq, least_squares
+
+from uwlts.calibration.model import Calibration, WindowModel
+from uwlts.errors import CalibrationError
+from uwlts.metrology.treads import Tread, label_treads, step_height_of_profile
+from uwlts.reconstruction import points_on_sheet
+
+_CURVE_POINTS = 61
+_SEARCHED = (0.2, 2.5)
+# Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
+_LEAST_CHANGE = 10.0
+_ROUNDING_MM = 1e-6
+_AT_BOUND = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class StepImage:
+    """One image of a step standard.
+
+    Attributes
+    ----------
+    pixels : (N, 2)
+        Stripe pixels (u, v).
+    height_mm : float
+        Calibrated height of the step.
+    medium_index : float
+        Refractive index of the medium relative to air.
+    labels : (N,)
+        `Tread` of every pixel, from `label_step`.
+    reference : {"lower", "upper"}
+        The tread to which the line is fitted.
+    """
+
+    pixels: np.ndarray
+    height_mm: float
+    medium_index: float
+    labels: np.ndarray
+    reference: Literal["lower", "upper"] = "lower"
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSolution:
+    """The window at the distance that explains the steps best.
+
+    Attributes
+    ----------
+    model : WindowModel
+    heights_mm, errors_mm, height_std_mm : (S,)
+        Height of the step in every image, its error, and its standard deviation from the scatter of the points.
+    slopes : (S,)
+        Change of each height with the distance.
+    std_mm : float or None
+        Standard deviation of the distance from the height errors left over; None with a single image.
+    scatter_std_mm : float
+        Standard deviation that the scatter of the points alone gives.
+    per_height : float
+        Shift of the distance per shift of the calibrated height, if all images use the same step.
+    image_distances_mm : (S,)
+        Distance that each image alone gives (thesis, Table 4); NaN where none within the bounds does.
+    curve_mm : (C, 2)
+        Tried distances and root mean square height error, NaN where a point cannot be reconstructed.
+    bounds_mm : (2,)
+    """
+
+    model: WindowModel
+    heights_mm: np.ndarray
+    errors_mm: np.ndarray
+    height_std_mm: np.ndarray
+    slopes: np.ndarray
+    std_mm: float | None
+    scatter_std_mm: float
+    per_height: float
+    image_distances_mm: np.ndarray
+    curve_mm: np.ndarray
+    bounds_mm: tuple[float, float]
+
+
+def step_profile(
+    calibration: Calibration, window: WindowModel, pixels: np.ndarray, *, medium_index: float
+) -> np.ndarray:
+    """Points (N, 2) of a profile, Y and Z of the OCS in mm, seen through a window; NaN where a ray has no point."""
+    seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
+    object_from_camera = np.linalg.inv(calibration.object_transform())
+    return seen.points_camera_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
+
+
+def label_step(
+    calibration: Calibration,
+    window: WindowModel,
+    pixels: np.ndarray,
+    *,
+    height_mm: float,
+    medium_index: float,
+    edge_mm: float = 1.0,
+    reference: Literal["lower", "upper"] = "lower",
+) -> StepImage:
+    """Tell the treads apart at the window's nominal distance, where the profile is true to a few percent.
+
+    Raises
+    ------
+    EvaluationError
+        The profile does not show two treads.
+    """
+    points = step_profile(calibration, window, pixels, medium_index=medium_index)
+    found = np.isfinite(points).all(axis=1)
+    labels = np.full(len(points), int(Tread.NEITHER), dtype=np.int8)
+    labels[found] = label_treads(points[found], height_mm=height_mm, edge_mm=edge_mm)
+    return StepImage(pixels, height_mm, medium_index, labels, reference)
+
+
+def solve_window(
+    calibration: Calibration,
+    window: WindowModel,
+    steps: Sequence[StepImage],
+    *,
+    bounds_mm: tuple[float, float] | None = None,
+) -> WindowSolution:
+    """Window distance that minimises the mean square height error over all step images.
+
+    A coarse scan finds the valley, Gauss-Newton within the bounds its bottom.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Camera, sheet and OCS from air; its window is not used.
+    window : WindowModel
+        The window at its nominal distance; everything but the distance stays.
+    steps : sequence of StepImage
+    bounds_mm : (low, high), optional
+        Distances to search; by default 0.2 to 2.5 times the nominal one.
+
+    Raises
+    ------
+    CalibrationError
+        No step image, the best distance lies at a bound, or the heights hardly depend on the distance.
+    """
+    if not steps:
+        raise CalibrationError("the window's distance needs at least one image of a step standard")
+    low, high = bounds_mm or tuple(share * window.distance_mm for share in _SEARCHED)
+    if not 0 < low < high < np.inf:
+        raise CalibrationError(f"the window's distance is searched from {low:g} to {high:g} mm; give 0 < low < high")
+    true = np.array([step.height_mm for step in steps])
+
+    def heights(distance: float) -> np.ndarray:
+        return np.array([_height(calibration, window, step, distance)[0] for step in steps])
+
+    tried = np.linspace(low, high, _CURVE_POINTS)
+    scanned = np.array([heights(distance) for distance in tried])
+    mean_error = np.sqrt(np.mean((scanned - true) ** 2, axis=1))
+    usable = np.isfinite(mean_error)
+    if np.count_nonzero(usable) < 3:
+        raise CalibrationError(
+            f"the step cannot be reconstructed with a window {low:.1f} to {high:.1f} mm from the pinhole: it would lie "
+            f"behind the step"
+        )
+    # The points that can be reconstructed form one range: a window before the nearest point.
+    low, high = tried[usable][0], tried[usable][-1]
+    best = least_squares(
+        lambda d: heights(d[0]) - true, [np.clip(tried[np.nanargmin(mean_error)], *_inside(low, high))],
+        bounds=(low, high), jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale=high - low,
+    )  # fmt: skip
+    distance, slopes = float(best.x[0]), best.jac[:, 0]
+    measured = np.array([_height(calibration, window, step, distance) for step in steps])
+    errors, height_std = measured[:, 0] - true, measured[:, 1]
+    _refuse(distance, low, high, slopes, height_std)
+    squares = float(slopes @ slopes)
+    freedom = len(steps) - 1
+    return WindowSolution(
+        model=window.model_copy(update={"distance_mm": distance}),
+        heights_mm=measured[:, 0],
+        errors_mm=errors,
+        height_std_mm=height_std,
+        slopes=slopes,
+        std_mm=float(np.sqrt(errors @ errors / freedom / squares)) if freedom else None,
+        scatter_std_mm=float(np.linalg.norm(slopes * height_std)) / squares,
+        per_height=float(slopes.sum()) / squares,
+        image_distances_mm=np.array(
+            [
+                _own_distance(calibration, window, step, tried[usable], scanned[usable, index], distance)
+                for index, step in enumerate(steps)
+            ]
+        ),
+        curve_mm=np.column_stack([tried, mean_error]),
+        bounds_mm=(float(low), float(high)),
+    )
+
+
+def _inside(low: float, high: float) -> tuple[float, float]:
+    margin = _AT_BOUND * (high - low)
+    return low + margin, high - margin
+
+
+def _height(
+    calibration: Calibration, window: WindowModel, step: StepImage, distance: float
+) -> tuple[float, float]:
+    """Height of the step and its standard deviation in mm; NaN where a point of a tread has no reconstruction."""
+    at_distance = window.model_copy(update={"distance_mm": float(distance)})
+    on_treads = step.labels != Tread.NEITHER
+    points = step_profile(calibration, at_distance, step.pixels[on_treads], medium_index=step.medium_index)
+    if not np.isfinite(points).all():
+        return np.nan, np.nan
+    height = step_height_of_profile(points, step.labels[on_treads], reference=step.reference)
+    return height.height_mm, height.std_mm
+
+
+def _refuse(distance: float, low: float, high: float, slopes: np.ndarray, height_std: np.ndarray) -> None:
+    change = float(np.sqrt(np.mean(slopes**2))) * (high - low)
+    scatter = float(np.sqrt(np.mean(height_std**2)))
+    if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
+        raise CalibrationError(
+            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} to "
+            f"{high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
+        )
+    inner = _inside(low, high)
+    if not inner[0] < distance < inner[1]:
+        raise CalibrationError(
+            f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
+            f"check the medium's index and the step's height, or widen the bounds"
+        )
+
+
+def _own_distance(
+    calibration: Calibration,
+    window: WindowModel,
+    step: StepImage,
+    tried: np.ndarray,
+    scanned: np.ndarray,
+    near: float,
+) -> float:
+    """Distance at which one image shows the true height, the one next to ``near``; NaN where there is none."""
+    errors = scanned - step.height_mm
+    changes = np.flatnonzero(errors[:-1] * errors[1:] <= 0)
+    if not len(changes):
+        return float("nan")
+    left = changes[np.argmin(np.abs(tried[changes] - near))]
+    return float(
+        brentq(
+            lambda d: _height(calibration, window, step, d)[0] - step.height_mm, tried[left], tried[left + 1], xtol=1e-9
+        )
+    )
