@@ -28,7 +28,7 @@ def simulate(
     sensor: str = "thesis",
     out: Path,
     as_built: str | None = None,
-    placement: str | None = None,
+    placement: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     medium: str | None = None,
     spp: int = 16,
     seed: int = 0,
@@ -48,11 +48,12 @@ def simulate(
     sensor
         Name or path of the sensor description that the capture states.
     out
-        Capture to write, such as capture.h5; the truth goes to capture.truth.h5.
+        Capture to write, such as capture.h5; the truth goes to capture.truth.h5. With several placements the name
+        holds {placement}.
     as_built
         Name or path of the sensor that is really rendered, if it differs from the description.
     placement
-        Named place of the objects, such as near, standoff or far.
+        Named place of the objects, such as near, standoff or far; several are recorded one after the other.
     medium
         Name of one of the sensor's media, in place of the scene's.
     spp
@@ -68,24 +69,31 @@ def simulate(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    changes = {"placement": placement, "medium": medium}
-    description = load_scene(scene, changes={key: value for key, value in changes.items() if value is not None})
+    places: tuple[str | None, ...] = placement or (None,)
+    if len(places) > 1 and "{placement}" not in out.name:
+        raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
+    recordings = []
+    for place in places:
+        changes = {key: value for key, value in (("placement", place), ("medium", medium)) if value is not None}
+        description = load_scene(scene, changes=changes)
+        recordings.append((description, out.with_name(out.name.replace("{placement}", description.placement))))
     nominal = load_sensor(sensor)
     built = load_sensor(as_built) if as_built else None
-    if built and built.camera.model_dump(include={"width_px", "height_px", "stripe_along"}) != nominal.camera.model_dump(
-        include={"width_px", "height_px", "stripe_along"}
-    ):
+    shared = {"width_px", "height_px", "stripe_along"}
+    if built and built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
         raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{sensor}'")
     use_variant(variant)
     from twin.simulate import Options
     from twin.simulate import simulate as record
 
     options = Options(spp=spp, seed=seed, ideal=ideal)
-    with progress_bar(f"{description.title}, {description.placement}") as progress:
-        record(
-            description, nominal, out, as_built=built, options=options, overwrite=overwrite, resume=resume, progress=progress
-        )
-    print(f"wrote {out}")
+    for description, path in recordings:
+        with progress_bar(f"{description.title}, {description.placement}") as progress:
+            record(
+                description, nominal, path, as_built=built, options=options,
+                overwrite=overwrite, resume=resume, progress=progress,
+            )  # fmt: skip
+        print(f"wrote {path}")
 
 
 @app.command

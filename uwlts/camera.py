@@ -23,6 +23,9 @@ _MOST_HALVINGS = 12
 # of the order of one. With a focal length of 10,000 px it is 4e-11 px.
 _ROUNDING = 4e-15
 
+# Tangent of the angle to the axis (89.9 deg) beyond which no lens looks through a flat image.
+_WIDEST = 1000.0
+
 
 def directions(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
     """Unit vectors (N, 3) in the camera frame along which the camera sees the pixels (N, 2), given as (u, v) in px.
@@ -154,14 +157,15 @@ def _largest_square(d: Distortion) -> float:
     The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
     have the same image. With g(r) = 1 + k1 r^2 + k2 r^4 + k3 r^6 the radial terms give it the eigenvalues g and
     (r g)'; the tangential terms lower them by 6 r |(p1, p2)| at most. So the disc ends where the smaller of the two
-    first reaches 6 r |(p1, p2)|, which is the exact edge for a barrel.
+    first reaches 6 r |(p1, p2)|, which is the exact edge for a barrel. Solved for 1 / r, as then the polynomials lead
+    with 1; an edge farther than `_WIDEST` is none.
     """
     tangential = 6.0 * math.hypot(d.p1, d.p2)
-    across = np.roots([d.k3, 0.0, d.k2, 0.0, d.k1, -tangential, 1.0])
-    along = np.roots([7.0 * d.k3, 0.0, 5.0 * d.k2, 0.0, 3.0 * d.k1, -tangential, 1.0])
+    across = np.roots([1.0, -tangential, d.k1, 0.0, d.k2, 0.0, d.k3])
+    along = np.roots([1.0, -tangential, 3.0 * d.k1, 0.0, 5.0 * d.k2, 0.0, 7.0 * d.k3])
     roots = np.concatenate([across, along])
-    ends = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
-    return float(ends.min() ** 2) if len(ends) else math.inf
+    ends = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / _WIDEST)]
+    return float(ends.max() ** -2) if len(ends) else math.inf
 
 
 def _distorted(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

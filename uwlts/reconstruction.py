@@ -9,8 +9,8 @@ from uwlts.camera import directions
 from uwlts.errors import RangeError
 from uwlts.refraction import RaysInMedium, RayStatus, trace_window
 
-# Sine of the angle to the sheet below which a ray counts as parallel to it. A ray that meets the sheet within 10 m at
-# all does so at more than 1e-6.
+# Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
+# angle would meet a sheet 1 mm away after a million kilometres.
 _PARALLEL = 1e-12
 
 

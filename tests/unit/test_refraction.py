@@ -51,9 +51,8 @@ def test_refraction_obeys_snell(x_deg, y_deg, n1, n2, seed):
     np.testing.assert_array_equal(reflected[certain], (n1 * sine > n2)[certain])
     assert np.isnan(refracted[reflected]).all()
     incident, refracted = incident[~reflected], refracted[~reflected]
-    # All vectors have length 1, so each quantity carries a few roundings (1e-16) of terms up to 1.8. Near grazing the
-    # square root of a small difference turns them into at most sqrt(4e-16) = 2e-8 along the normal; a unit vector has
-    # that part squared, and n sin, lying across the normal, does not contain it.
+    # The parts across the normal, scaled by indices up to 1.8, and the square of a unit vector: a few roundings of 2e-16.
+    # The part along the normal may near grazing be wrong by sqrt(4e-16), but enters only squared, or not at all.
     across_in, across_out = (v - np.outer(v @ normal, normal) for v in (incident, refracted))
     np.testing.assert_allclose(n1 * across_in, n2 * across_out, rtol=0, atol=2e-15)
     np.testing.assert_allclose(np.einsum("ij,ij->i", refracted, refracted), 1.0, rtol=0, atol=4e-15)
@@ -131,8 +130,8 @@ def test_traced_rays_are_the_paths_of_least_time(window, medium_index, seed):
     depth = np.random.default_rng(seed).uniform(10.0, 500.0, len(seen))
     points = rays.origins + depth[:, None] * rays.directions
     faces, path = faces_and_indices(window, medium_index)
-    # Lengths up to 1e3 mm with roundings of 1e-16 give 1e-13 mm; the oracle stops at moves of 1e-12 mm and its Newton
-    # steps halve no error but square it. The tolerance leaves a thousandfold for incidence up to 60 deg.
+    # Lengths up to 1e3 mm with roundings of 1e-16 give 1e-13 mm, and divided by the cosine squared of 60 deg 1e-12 mm;
+    # the oracle stops at moves of 1e-11 mm, of which the square is left. The tolerance leaves a thousandfold.
     crossings = fermat.least_time_crossings(np.zeros(3), points, faces, path)
     np.testing.assert_allclose(rays.origins, crossings[:, -1], rtol=0, atol=1e-9)
     # The first leg is 5 mm or longer: 1e-12 mm over 5 mm.

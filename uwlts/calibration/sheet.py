@@ -84,8 +84,12 @@ def points_on_target(
     Raises
     ------
     CalibrationError
-        No stripe pixel falls on the plate.
+        No stripe pixel falls on the plate, or a pose is not finite.
+    RangeError
+        A pixel is not finite.
     """
+    if not np.isfinite(target_poses).all():
+        raise CalibrationError("a pose of the target is not finite")
     hull = ConvexHull(np.asarray(extent_mm, dtype=np.float64)).equations
     kept, images = [], []
     for index, (pixels, pose) in enumerate(zip(stripes, target_poses, strict=True)):

@@ -12,7 +12,7 @@ from uwlts.errors import CalibrationError
 from uwlts.metrology.treads import Tread, label_treads, step_height_of_profile
 from uwlts.reconstruction import points_on_sheet
 
-_CURVE_POINTS = 61
+_CURVE_POINTS = 41
 _SEARCHED = (0.2, 2.5)
 # Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
 _LEAST_CHANGE = 10.0
@@ -139,7 +139,10 @@ def solve_window(
     Raises
     ------
     CalibrationError
-        No step image, the best distance lies at a bound, or the heights hardly depend on the distance.
+        No step image, a height that is not positive, the best distance lies at a bound, or the heights hardly depend
+        on the distance.
+    RangeError
+        A pixel or the medium's index is not finite.
     """
     if not steps:
         raise CalibrationError("the window's distance needs at least one image of a step standard")
@@ -147,6 +150,8 @@ def solve_window(
     if not 0 < low < high < np.inf:
         raise CalibrationError(f"the window's distance is searched from {low:g} to {high:g} mm; give 0 < low < high")
     true = np.array([step.height_mm for step in steps])
+    if not (np.isfinite(true) & (true > 0)).all():
+        raise CalibrationError(f"the heights of the steps must be positive lengths in mm, not {true.tolist()}")
 
     def heights(distance: float) -> np.ndarray:
         return np.array([_height(calibration, window, step, distance)[0] for step in steps])

@@ -43,7 +43,7 @@ class RobustFit(Generic[FitT]):
     distances_mm : (N,)
         Distances of all points, inliers or not, from the fitted shape.
     limit_mm : float
-        Points farther from the shape were left out.
+        Points whose distance differs by more from the median distance (nearly zero) were left out.
     rounds : int
         Number of fits.
     """
@@ -66,10 +66,10 @@ class RobustFit(Generic[FitT]):
 
 
 def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = DEFAULT_K) -> RobustFit[FitT]:
-    """Fit, leave out the points farther than k robust standard deviations from the shape, and fit again.
+    """Fit, leave out the points that lie off by more than k robust standard deviations, and fit again.
 
-    The robust standard deviation is 1.4826 times the median absolute deviation of the distances of all points. A
-    point that was left out comes back when a later fit passes within the limit; after 20 rounds points only leave,
+    A point is off by the difference of its signed distance from the median distance of all points; the robust
+    standard deviation is 1.4826 times the median of these differences' sizes (the median absolute deviation). A point that was left out comes back when a later fit passes within the limit; after 20 rounds points only leave,
     so that the rounds end. The rule is for a few stray points on one surface, not for telling surfaces apart.
 
     Parameters
@@ -94,9 +94,10 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
         shape = fit(points[inliers])
         rounds += 1
         distances = shape.distances_mm(points)
-        spread = MAD_TO_STD * float(np.median(np.abs(distances - np.median(distances))))
-        limit = max(k * spread, smallest)
-        within = np.abs(distances) <= limit
+        # About the median: strays on one side pull the first shape away from most points.
+        off = np.abs(distances - np.median(distances))
+        limit = max(k * MAD_TO_STD * float(np.median(off)), smallest)
+        within = off <= limit
         if rounds > _RETURNING_ROUNDS:
             within &= inliers
         if np.array_equal(within, inliers):

@@ -164,9 +164,9 @@ def _in_order(found: list[FoundSphere], artefact: SphereStandard) -> list[FoundS
         [
             max(
                 np.abs(diameters[order] - artefact.diameters_mm).max(),
-                np.abs(
-                    np.linalg.norm(np.diff(centres[order], axis=0), axis=1) - np.array(artefact.spacings_mm)
-                ).max(initial=0.0),
+                np.abs(np.linalg.norm(np.diff(centres[order], axis=0), axis=1) - np.array(artefact.spacings_mm)).max(
+                    initial=0.0
+                ),
             )
             for order in orders
         ]
@@ -192,7 +192,9 @@ def _within_cap(
     return members, fit_robustly(fit_sphere, points[members])
 
 
-def _spacing(first: tuple[SphereFit, SphereFit], second: tuple[SphereFit, SphereFit], calibrated: float) -> SpacingResult:
+def _spacing(
+    first: tuple[SphereFit, SphereFit], second: tuple[SphereFit, SphereFit], calibrated: float
+) -> SpacingResult:
     (free_1, known_1), (free_2, known_2) = first, second
     between = free_2.centre_mm - free_1.centre_mm
     spacing = float(np.linalg.norm(between))

@@ -122,7 +122,10 @@ def _proposed_centres(points: np.ndarray, radius: float, rng: np.random.Generato
     balls = cKDTree(points).query_ball_point(points[seeds], radius)
     picks = rng.random((_SEEDS, 2))
     triples = np.array(
-        [(seed, *(ball[int(pick * len(ball))] for pick in pair)) for seed, ball, pair in zip(seeds, balls, picks, strict=True)]
+        [
+            (seed, *(ball[int(pick * len(ball))] for pick in pair))
+            for seed, ball, pair in zip(seeds, balls, picks, strict=True)
+        ]
     )
     first, second, third = points[triples[:, 0]], points[triples[:, 1]], points[triples[:, 2]]
     # Circumcentre of a triangle with the sides a, b from its first corner: ((|a|2 b - |b|2 a) x (a x b)) / 2 |a x b|2.

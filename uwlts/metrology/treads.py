@@ -180,9 +180,7 @@ def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     corners = points[rng.integers(len(points), size=(_PROPOSALS, dimension))]
     side = corners[:, 1] - corners[:, 0]
     normals = (
-        np.column_stack([-side[:, 1], side[:, 0]])
-        if dimension == 2
-        else np.cross(side, corners[:, 2] - corners[:, 0])
+        np.column_stack([-side[:, 1], side[:, 0]]) if dimension == 2 else np.cross(side, corners[:, 2] - corners[:, 0])
     )
     length = np.linalg.norm(normals, axis=1)
     proper = length > 1e-6 * length.max()

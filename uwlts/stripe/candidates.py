@@ -14,7 +14,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-_NOISE_SAMPLES = 2048
+_NOISE_SAMPLES = 1024
 
 _MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
 """Median of the larger of two smaller-of-two of unit Gaussian noise: each stays below x with 1 - (1 - P(x))^2."""
@@ -66,13 +66,15 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
     """
     inner = contrast[2:-2]
     sample = inner.ravel()[:: max(1, inner.size // _NOISE_SAMPLES)]
-    middle = np.partition(sample, sample.size // 2)[sample.size // 2]
-    median = float(middle)
     if np.issubdtype(contrast.dtype, np.integer):
         # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.
-        below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
-        median += (sample.size / 2 - below) / equal - 0.5
-    return max(median, 0.0) / _unit_contrast(block)
+        counts = np.bincount(sample)
+        upto = np.cumsum(counts)
+        level = int(np.searchsorted(upto, sample.size / 2))
+        median = level + 0.5 - (upto[level] - sample.size / 2) / counts[level]
+    else:
+        median = np.median(sample)
+    return max(float(median), 0.0) / _unit_contrast(block)
 
 
 def coarse_threshold(noise: float, *, block: int, floor: float) -> float:
@@ -93,14 +95,15 @@ def first_true(mask: np.ndarray) -> np.ndarray:
     """(M,) int: row of the first True in each column of an (R, M) mask; R where there is none."""
     # A product and a maximum run over adjacent memory, several times as fast as argmax along the first axis.
     size = mask.shape[0]
-    return size - (mask * np.arange(size, 0, -1, dtype=_row_type(size))[:, None]).max(axis=0).astype(np.intp)
+    return size - (mask.view(np.uint8) * _row_numbers(size)[::-1]).max(axis=0).astype(np.intp)
 
 
 def last_true(mask: np.ndarray) -> np.ndarray:
     """(M,) int: row of the last True in each column of an (R, M) mask; -1 where there is none."""
-    size = mask.shape[0]
-    return (mask * np.arange(1, size + 1, dtype=_row_type(size))[:, None]).max(axis=0).astype(np.intp) - 1
+    return (mask.view(np.uint8) * _row_numbers(mask.shape[0])).max(axis=0).astype(np.intp) - 1
 
 
-def _row_type(size: int) -> type:
-    return np.uint8 if size < 256 else np.uint16
+@lru_cache(maxsize=16)
+def _row_numbers(size: int) -> np.ndarray:
+    """(size, 1): 1 ... size in the smallest type that holds them."""
+    return np.arange(1, size + 1, dtype=np.uint8 if size < 256 else np.uint16)[:, None]

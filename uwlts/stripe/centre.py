@@ -56,10 +56,10 @@ def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarra
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
     """
     zeroth, first, second = _gaussian_moments(lobe, lobe.middle, sigma, 2)
-    first -= lobe.slope * np.float32(math.sqrt(2.0 * math.pi)) * sigma**2
+    first -= lobe.slope * np.float32(math.sqrt(2.0 * math.pi)) * sigma * sigma
     step = first / np.maximum(zeroth - second, np.float32(0.1) * np.abs(zeroth))
     step = np.minimum(np.maximum(step, np.float32(-0.5)), np.float32(0.5))
-    step -= np.float32(0.5) * step**3
+    step -= np.float32(0.5) * step * step * step
     # The sum under the Gaussian at its top, from its value a step away.
     top = zeroth * (np.float32(1.0) + np.float32(0.25) * step**2)
     return lobe.middle + sigma * step, top / (np.float32(math.sqrt(math.pi)) * sigma)
@@ -71,8 +71,8 @@ def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest
     size = lobe.window.shape[0]
     reach = 4.0 * float(sigma.max())
     rows = slice(max(0, math.floor(float(centre.min()) - reach)), min(size, math.ceil(float(centre.max()) + reach) + 1))
-    narrow = np.float32(1.0) / sigma
-    t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] * narrow - centre * narrow
+    t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] - centre
+    t *= np.float32(1.0) / sigma
     weighted = t * t
     weighted *= np.float32(-0.5)
     # OpenCV's exponential is several times as fast as NumPy's.

@@ -38,6 +38,9 @@ _COARSE_SLACK = 0.75
 _SEARCHED_BLOCKS = np.array([[-2], [-1], [0], [1], [2]])
 """Blocks that one window covers."""
 
+# NumPy compares with its own integers several times as fast as with an enumeration.
+_OK, _NO_STRIPE, _AMBIGUOUS, _BORDER, _SATURATED = (np.uint8(status) for status in StripeStatus)
+
 _LEAST_KERNEL = 0.6
 """Sigma of the narrowest weight, px; a narrower one would see too few pixels."""
 
@@ -91,12 +94,12 @@ def extract_stripe(
     noise = noise_from_contrast(contrast, block)
     found = _search(profiles, contrast, noise, options)
 
-    none = found.status == StripeStatus.NO_STRIPE
+    none = found.status == _NO_STRIPE
     if none.any():
         if signal is not image:
             _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
         clipped = low >= clip
-        found.status[none & (clipped[1:] & clipped[:-1]).any(axis=0)] = StripeStatus.SATURATED
+        found.status[none & (clipped[1:] & clipped[:-1]).any(axis=0)] = _SATURATED
     return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
 
 
@@ -112,16 +115,10 @@ class _Lines:
 
     @classmethod
     def empty(cls, count: int) -> _Lines:
-        nothing = np.full(count, np.nan, np.float32)
-        return cls(
-            centre=np.full(count, np.nan),
-            amplitude=nothing,
-            width=nothing.copy(),
-            status=np.full(count, StripeStatus.NO_STRIPE, np.uint8),
-            height=np.zeros(count, np.float32),
-        )
+        amplitude, width, height = np.full((3, count), np.nan, np.float32)
+        return cls(np.full(count, np.nan), amplitude, width, np.full(count, _NO_STRIPE), height)
 
-    def discard(self, lines: np.ndarray, status: StripeStatus) -> None:
+    def discard(self, lines: np.ndarray, status: np.uint8) -> None:
         self.status[lines] = status
         for values in (self.centre, self.amplitude, self.width):
             values[lines] = np.nan
@@ -142,50 +139,50 @@ def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: S
     least = np.full(lines.size, coarse)
 
     for _ in range(_LOOKS):
-        lines, chosen, contrast_there = _next_blocks(board, lines, least[lines], options.peak)
+        lines, least, chosen, there = _next_blocks(board, lines, least, options.peak)
         if lines.size == 0:
             break
         lobe = _look_centred(profiles, lines, (chosen - 2) * block, fine, options)
         verdict = _judge(lobe, profiles.shape[0], fine, options)
-        stripe = verdict != StripeStatus.NO_STRIPE
-        again = found.status[lines] == StripeStatus.OK
+        stripe = verdict != _NO_STRIPE
+        again = found.status[lines] == _OK
         new = stripe & ~again
         if again.any():
             rival = stripe & again & (lobe.height >= options.ambiguous_ratio * found.height[lines])
-            found.discard(lines[rival], StripeStatus.AMBIGUOUS)
+            found.discard(lines[rival], _AMBIGUOUS)
         found.status[lines[new]] = verdict[new]
-        _measure(found, lines, lobe, new & (verdict == StripeStatus.OK), options)
+        _measure(found, lines, lobe, new & (verdict == _OK), options)
 
         # The window has been searched for rivals already; of what is no stripe only the block itself is done with.
-        board[chosen, lines] = 0
+        if not stripe.all():
+            board[chosen[~stripe], lines[~stripe]] = 0
         board.ravel()[(chosen[stripe] + _SEARCHED_BLOCKS) * board.shape[1] + lines[stripe]] = 0
-        share = np.float32(options.ambiguous_ratio * _COARSE_SLACK)
-        least[lines[new]] = np.maximum(coarse, share * contrast_there[new])
+        least = np.where(new, np.maximum(coarse, there * (options.ambiguous_ratio * _COARSE_SLACK)), least)
         status = found.status[lines]
-        unsettled = status == StripeStatus.NO_STRIPE
+        unsettled = status == _NO_STRIPE
         if options.peak is PeakRule.STRONGEST:
-            unsettled |= status == StripeStatus.OK
-        lines = lines[unsettled]
+            unsettled |= status == _OK
+        lines, least = lines[unsettled], least[unsettled]
     return found
 
 
 def _next_blocks(
     board: np.ndarray, lines: np.ndarray, least: np.ndarray, rule: PeakRule
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The lines on which a block reaches `least`, the block the rule names and its contrast."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The lines on which a block reaches `least`, their `least`, the block the rule names and its contrast."""
     columns = board if lines.size == board.shape[1] else board[:, lines]
     highest = columns.max(axis=0)
     stands_out = highest >= least
     if not stands_out.any():
         nothing = np.empty(0, np.intp)
-        return nothing, nothing, highest[:0]
+        return nothing, least[:0], nothing, highest[:0]
     if not stands_out.all():
         lines, least, highest = lines[stands_out], least[stands_out], highest[stands_out]
         columns = columns[:, stands_out]
     wanted = columns == highest if rule is PeakRule.STRONGEST else columns >= least
     chosen = first_true(wanted) if rule is not PeakRule.LAST else last_true(wanted)
     there = highest if rule is PeakRule.STRONGEST else columns[chosen, np.arange(lines.size)]
-    return lines, chosen, there.astype(np.float32)
+    return lines, least, chosen, there.astype(np.float32)
 
 
 def _look_centred(
@@ -200,7 +197,7 @@ def _look_centred(
         "whole": options.peak is PeakRule.STRONGEST,
     }
     lobe = look(profiles, lines, place, **settings)
-    shift, needed = off_centre(lobe, block=settings["block"])
+    shift, needed = off_centre(lobe)
     needed &= lobe.height >= fine
     if needed.any():
         lobe = lobe.replaced(needed, look(profiles, lines[needed], (place + shift)[needed], **settings))
@@ -210,25 +207,19 @@ def _look_centred(
 def _judge(lobe: Lobe, count: int, fine: float, options: StripeOptions) -> np.ndarray:
     """(M,) uint8 `StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
     size = lobe.window.shape[0]
-    sigma = _true_sigma(lobe, options)
     narrowest, widest = options.min_fwhm_px / FWHM_PER_SIGMA, options.half_window_px / FWHM_PER_SIGMA
-    stripe = lobe.closed & (sigma >= np.float32(narrowest)) & (sigma <= np.float32(widest))
-    verdict = np.where(stripe, np.uint8(StripeStatus.OK), np.uint8(StripeStatus.NO_STRIPE))
+    stripe = lobe.closed & (lobe.sigma >= np.float32(narrowest)) & (lobe.sigma <= np.float32(widest))
+    verdict = np.where(stripe, _OK, _NO_STRIPE)
     if lobe.crowded.any():
-        verdict[stripe & lobe.crowded] = StripeStatus.AMBIGUOUS
+        verdict[stripe & lobe.crowded] = _AMBIGUOUS
     outside = (lobe.start < 0) | (lobe.start + size > count)
     if outside.any():
         middle, extent, peak = lobe.start + lobe.middle, lobe.reach + FLANK - 1, lobe.start + lobe.peak
-        verdict[stripe & ((middle - extent < 0) | (middle + extent > count - 1))] = StripeStatus.BORDER
+        verdict[stripe & ((middle - extent < 0) | (middle + extent > count - 1))] = _BORDER
         # A peak whose far side is not in the image; one on the last pixel itself may be any rise towards the border.
-        verdict[outside & ~lobe.closed & (peak > 1) & (peak < count - 2)] = StripeStatus.BORDER
-    verdict[lobe.height < fine] = StripeStatus.NO_STRIPE
+        verdict[outside & ~lobe.closed & (peak > 1) & (peak < count - 2)] = _BORDER
+    verdict[lobe.height < fine] = _NO_STRIPE
     return verdict
-
-
-def _true_sigma(lobe: Lobe, options: StripeOptions) -> np.ndarray:
-    """(M,) float32: sigma of the lobe with the low-pass taken out, px (variances add)."""
-    return np.sqrt(np.maximum(lobe.sigma**2 - np.float32(options.smoothing_px**2), np.float32(0.0)))
 
 
 def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, options: StripeOptions) -> None:
@@ -236,9 +227,8 @@ def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, op
     if not which.any():
         return
     lines, lobe = lines[which], lobe.keep(which)
-    sigma = _true_sigma(lobe, options)
-    centre, amplitude = place_centre(options.method, lobe, np.maximum(sigma, np.float32(_LEAST_KERNEL)))
+    centre, amplitude = place_centre(options.method, lobe, np.maximum(lobe.sigma, np.float32(_LEAST_KERNEL)))
     found.centre[lines] = lobe.start + centre.astype(np.float64)
     found.amplitude[lines] = amplitude
-    found.width[lines] = sigma * np.float32(FWHM_PER_SIGMA)
+    found.width[lines] = lobe.sigma * np.float32(FWHM_PER_SIGMA)
     found.height[lines] = lobe.height

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwlts.errors import ImageError
 
-_TYPES = (np.uint8, np.uint16, np.float32)
+_LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 
 
 def check_image(image: np.ndarray, *, name: str) -> None:
@@ -21,7 +21,7 @@ def check_image(image: np.ndarray, *, name: str) -> None:
     """
     if not isinstance(image, np.ndarray):
         raise ImageError(f"the {name} is a {type(image).__name__}; expected a NumPy array")
-    if image.dtype not in _TYPES:
+    if image.dtype not in _LARGEST:
         raise ImageError(f"the {name} has type {image.dtype}; convert it to uint8, uint16 or float32")
     if image.ndim != 2:
         raise ImageError(f"the {name} has shape {image.shape}; expected (height, width): choose one channel")
@@ -47,7 +47,7 @@ def check_length(image: np.ndarray, *, stripe_along: str, least: int) -> None:
 def saturation_of(image: np.ndarray, saturation: float | None) -> float:
     """Grey value at which pixels clip: as given, else the type's largest (none for float32)."""
     if saturation is None:
-        return float(np.iinfo(image.dtype).max) if image.dtype != np.float32 else math.inf
+        return _LARGEST[image.dtype]
     if not math.isfinite(saturation) or saturation <= 0:
         raise ImageError(f"saturation is {saturation!r}; expected the positive grey value at which pixels clip")
     return float(saturation)

@@ -13,9 +13,7 @@ from uwlts.stripe.candidates import first_true, last_true
 from uwlts.stripe.result import FWHM_PER_SIGMA
 
 FLANK = 5
-_SLACK = 2
 _ONE = np.ones(1, np.float32)
-_FLANK_ROWS = np.arange(FLANK)[:, None, None]
 _INWARD = np.array([[1], [-1]])
 
 
@@ -34,7 +32,7 @@ class Lobe:
     middle : (M,) float32
         Midpoint of the half-height crossings.
     sigma : (M,) float32
-        Half-height width of `smooth` over 2.355, the sigma of a Gaussian, px.
+        Half-height width over 2.355, the sigma of a Gaussian, px, with the low-pass taken out (variances add).
     reach : (M,) int
         Distance from `middle` to the first background pixel, px.
     base, slope : (M,) float32
@@ -98,13 +96,15 @@ def look(
     whole : bool
         Look for a second lobe in the whole window, else only as far as the pixels used reach.
     """
-    size = 2 * half + block + 2 * _SLACK
-    start = place - half - _SLACK
-    window = _cut(profiles, lines, start, size)
-    smooth = _low_pass(window, smoothing)
+    size = 2 * half + block
+    start = place - half
+    cut = _cut(profiles, lines, start, size)
+    kernel = _kernel(smoothing)
+    smooth = cv2.sepFilter2D(cut, cv2.CV_32F, _ONE, kernel, borderType=cv2.BORDER_REPLICATE)
+    window = cut.astype(np.float32)
     columns = np.arange(lines.size)
 
-    first = half + _SLACK - block // 2
+    first = half - block // 2
     rows = np.arange(size, dtype=np.uint8 if size < 255 else np.uint16)[:, None]
     sought = smooth[first : first + 2 * block]
     peak = sought.max(axis=0)
@@ -126,17 +126,18 @@ def look(
     closed = (left >= 0) & (right < size)
     x_left, x_right = _crossings(smooth, columns, np.stack([left, right]), level)
     middle = np.float32(0.5) * (x_left + x_right)
-    sigma = (x_right - x_left) / np.float32(FWHM_PER_SIGMA)
+    smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
+    sigma = np.sqrt(np.maximum(smooth_sigma * smooth_sigma - np.float32(smoothing * smoothing), np.float32(0.0)))
 
-    reach = np.minimum(np.ceil(3.0 * sigma), half - FLANK + 1).astype(np.intp)
+    reach = np.minimum(np.ceil(np.float32(3.0) * smooth_sigma), half - FLANK).astype(np.intp)
     near = np.rint(middle).astype(np.intp)
-    before, after = _flanks(window, columns, np.stack([near - reach - FLANK + 1, near + reach]))
+    before, after = _flanks(smooth, columns, np.stack([near - reach - FLANK + 1, near + reach - 1]))
     crowded = size - low.sum(axis=0, dtype=rows.dtype) != right - left - 1
     if crowded.any():
         limits = (left, right) if whole else (left, right, near - reach - FLANK, near + reach + FLANK)
         floor = (ground + share * (peak - ground))[crowded]
         crowded[crowded] = _second_lobe(smooth[:, crowded] >= floor, *(limit[crowded] for limit in limits))
-    slope = (after - before) / (2 * reach + FLANK - 1).astype(np.float32)
+    slope = (after - before) / (2 * reach + FLANK - 2).astype(np.float32)
     base = np.float32(0.5) * (before + after) + slope * (middle - near).astype(np.float32)
     return Lobe(
         start=start,
@@ -154,31 +155,25 @@ def look(
     )
 
 
-def off_centre(lobe: Lobe, *, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """By how many pixels to move each window so that the lobe's middle is in it, and which need it.
+def off_centre(lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
+    """By how many pixels to move each window so that the lobe's middle is in its own, and which need it.
 
     Returns
     -------
     shift : (M,) int
     needed : (M,) bool
-        A half-height crossing lies outside the window or the middle is too near one end for the flanks.
+        A half-height crossing or a flank lies outside the window.
     """
     offset = lobe.middle - np.float32(0.5 * (lobe.window.shape[0] - 1))
-    needed = ~lobe.closed | (np.abs(offset) > 0.5 * block + _SLACK - 1)
-    return np.rint(offset).astype(np.intp), needed
+    needed = np.abs(offset) + lobe.reach > 0.5 * (lobe.window.shape[0] - 1) - FLANK + 0.5
+    return np.rint(offset).astype(np.intp), needed | ~lobe.closed
 
 
 def _cut(profiles: np.ndarray, lines: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
-    """(size, M) float32: windows from the profiles, the border pixel repeated beyond the border."""
+    """(size, M) array of the profiles' type: windows from them, the border pixel repeated beyond the border."""
     position = np.arange(size, dtype=np.float32)[:, None] + start.astype(np.float32)
     line = np.repeat(lines.astype(np.float32)[None], size, axis=0)
-    cut = cv2.remap(profiles, line, position, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    return cut.astype(np.float32)
-
-
-def _low_pass(window: np.ndarray, sigma: float) -> np.ndarray:
-    kernel = _kernel(sigma)
-    return cv2.sepFilter2D(window, -1, _ONE, kernel, borderType=cv2.BORDER_REPLICATE)
+    return cv2.remap(profiles, line, position, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=16)
@@ -189,6 +184,7 @@ def _kernel(sigma: float) -> np.ndarray:
     return (weight / weight.sum()).astype(np.float32)
 
 
+@lru_cache(maxsize=16)
 def noise_gain(sigma: float) -> float:
     """Standard deviation of white unit noise after the low-pass."""
     return float(np.sqrt(np.sum(_kernel(sigma) ** 2)))
@@ -216,10 +212,11 @@ def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level:
     return rows.astype(np.float32) + _INWARD.astype(np.float32) * part
 
 
-def _flanks(window: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """(2, M) float32: means of two runs of five background pixels, each without its largest and smallest."""
-    size, width = window.shape
+def _flanks(smooth: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """(2, M) float32: background in two runs of five pixels.
+
+    The lower of two low-passed values three pixels apart, so that a hot pixel in the run does not raise it.
+    """
+    size, width = smooth.shape
     index = np.minimum(np.maximum(first, 0), size - FLANK) * width + columns
-    pixels = window.take(index + _FLANK_ROWS * width, mode="clip")
-    trimmed = pixels.sum(axis=0) - pixels.max(axis=0) - pixels.min(axis=0)
-    return trimmed * np.float32(1.0 / (FLANK - 2))
+    return np.minimum(smooth.take(index + width, mode="clip"), smooth.take(index + (FLANK - 1) * width, mode="clip"))

@@ -11,7 +11,7 @@ MIN_NEIGHBOURS = 3
 MAX_OVER_SPREAD = 8.0
 
 # What a quadratic leaves of perspective and distortion over two steps, as a share of one step.
-MODEL_ERROR = 0.01
+MODEL_ERROR = 0.002
 
 
 def agreeing(points, indices):

@@ -22,7 +22,7 @@ MAX_RESIDUAL_OVER_MEDIAN = 2.5
 RESIDUAL_FLOOR_PX = 0.03
 
 # Largest departure of one profile's contrast from the smooth course around the blob.
-MAX_CONTRAST_DEPARTURE = 0.35
+MAX_CONTRAST_DEPARTURE = 0.2
 
 
 @dataclass(frozen=True)

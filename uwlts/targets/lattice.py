@@ -158,29 +158,30 @@ def _seeds(centres, radii, bases, tree):
 
 def _grown(seed, centres, radii, basis, tree):
     """Places {(i, j): circle} of the piece of lattice around a seed."""
+    # Complex numbers u + 1j v: the loop handles single points, for which arrays are slow.
+    points, sizes = (centres @ (1, 1j)).tolist(), radii.tolist()
     places, where = {(0, 0): seed}, {seed: (0, 0)}
-    steps = {seed: basis}
+    steps = {seed: tuple((basis @ (1, 1j)).tolist())}
     frontier, reach = [seed], 1
     while frontier:
         expected, asked = [], []
         for circle in frontier:
-            steps[circle] = _local_steps(where[circle], places, centres, steps[circle])
+            steps[circle] = _local_steps(where[circle], places, points, steps[circle])
             i, j = where[circle]
             for di, dj in STEPS:
                 place = (i + reach * di, j + reach * dj)
                 if place not in places:
-                    expected.append(centres[circle] + reach * (di * steps[circle][0] + dj * steps[circle][1]))
+                    expected.append(points[circle] + reach * (di * steps[circle][0] + dj * steps[circle][1]))
                     asked.append((circle, place, abs(dj)))
         fresh = []
         if asked:
-            distance, index = tree.query(np.array(expected))
-            for ask in np.argsort(distance):
+            expected = np.array(expected)
+            distance, index = tree.query(np.column_stack([expected.real, expected.imag]))
+            for ask in np.argsort(distance, kind="stable").tolist():
                 (circle, place, axis), found = asked[ask], int(index[ask])
-                step = steps[circle][axis]
-                if distance[ask] > TOLERANCE * np.hypot(*step):
+                if place in places or found in where or distance[ask] > TOLERANCE * abs(steps[circle][axis]):
                     continue
-                ratio = radii[found] / radii[circle]
-                if place in places or found in where or not 1 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
+                if not 1 / MAX_SIZE_RATIO < sizes[found] / sizes[circle] < MAX_SIZE_RATIO:
                     continue
                 places[place], where[found] = found, place
                 steps[found] = steps[circle]
@@ -195,17 +196,16 @@ def _grown(seed, centres, radii, basis, tree):
     return places
 
 
-def _local_steps(place, places, centres, inherited):
+def _local_steps(place, places, points, inherited):
     """Steps along i and j at a place: half the way between both neighbours, or the way to one, or as inherited."""
-    here = centres[places[place]]
-    steps = inherited.copy()
-    for axis, (di, dj) in enumerate(((1, 0), (0, 1))):
-        after = places.get((place[0] + di, place[1] + dj))
-        before = places.get((place[0] - di, place[1] - dj))
-        if after is not None and before is not None:
-            steps[axis] = (centres[after] - centres[before]) / 2
-        elif after is not None:
-            steps[axis] = centres[after] - here
-        elif before is not None:
-            steps[axis] = here - centres[before]
-    return steps
+    i, j = place
+    here = points[places[place]]
+    steps = list(inherited)
+    for axis, (after, before) in enumerate((((i + 1, j), (i - 1, j)), ((i, j + 1), (i, j - 1)))):
+        if after in places and before in places:
+            steps[axis] = (points[places[after]] - points[places[before]]) / 2
+        elif after in places:
+            steps[axis] = points[places[after]] - here
+        elif before in places:
+            steps[axis] = here - points[places[before]]
+    return tuple(steps)

@@ -1,0 +1,166 @@
+"""From captures to what a calibration needs: target points, stripes on the target, stripes on the step standard."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import ValidationError
+
+from uwlts.calibration.target_image import TargetImage
+from uwlts.capture import Capture
+from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
+from uwlts.metrology.artefact_descriptions import StepStandard
+from uwlts.stripe import StripeOptions, extract_stripe
+from uwlts.targets import Target, detect_target, parse_target
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of the step, the number of images done and the number of all."""
+
+_SAME_POSITION_MM = 1e-6
+_FEWEST_LINES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class AirEvidence:
+    """What the captures in air show.
+
+    Attributes
+    ----------
+    target : Target
+    images : list of TargetImage
+        Images in which the target was found, one placement per capture.
+    frames : list of (capture, frame)
+        Where each of them comes from.
+    stripes : list of (N, 2)
+        Stripe pixels on the target at the position of each image; empty where there are none.
+    warnings : list of str
+        Images left out, and why.
+    """
+
+    target: Target
+    images: list[TargetImage]
+    frames: list[tuple[int, int]]
+    stripes: list[np.ndarray]
+    warnings: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class StepEvidence:
+    """A stripe (N, 2) on a step standard, with the standard, the medium's index and where it comes from."""
+
+    pixels: np.ndarray
+    standard: StepStandard
+    medium_index: float
+    source: str
+
+
+def air_evidence(
+    captures: Sequence[Capture], *, stripe: StripeOptions | None = None, progress: Progress | None = None
+) -> AirEvidence:
+    """Find the target in the images with the laser off and the stripe in those with the laser on, at the same positions.
+
+    Raises
+    ------
+    CalibrationError
+        The captures show no target, or different ones.
+    DescriptionError
+        A target's description cannot be read.
+    """
+    targets = [parse_target(capture.header.target) for capture in captures if capture.header.target is not None]
+    if len(targets) < len(captures) or not captures:
+        raise CalibrationError("a capture for the calibration in air must tell its target: its header has none")
+    if any(target != targets[0] for target in targets):
+        raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
+    total, done = sum(map(len, captures)), 0
+    images, frames, stripes, warnings = [], [], [], []
+    for number, capture in enumerate(captures):
+        first = len(images)
+        for frame, image in capture.frames(laser_on=False):
+            try:
+                view = detect_target(image, targets[0])
+                images.append(TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), number))
+                frames.append((number, frame))
+                stripes.append([])
+            except (TargetError, CalibrationError) as error:
+                warnings.append(f"{capture.path.name}, frame {frame}: left out, {error}")
+            done = _report(progress, "target", done, total)
+        positions = np.array([image.stage_mm for image in images[first:]])
+        for frame, image in capture.frames(laser_on=True):
+            here = np.flatnonzero(np.abs(positions - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
+            if len(here):
+                _add_stripe(stripes[first + int(here[0])], capture, frame, image, stripe, warnings)
+            else:
+                warnings.append(
+                    f"{capture.path.name}, frame {frame}: stripe left out, no target was found at "
+                    f"{capture.stage_mm[frame]:g} mm"
+                )
+            done = _report(progress, "target", done, total)
+    joined = [np.vstack(pieces) if pieces else np.empty((0, 2)) for pieces in stripes]
+    return AirEvidence(targets[0], images, frames, joined, warnings)
+
+
+def step_evidence(
+    captures: Sequence[Capture],
+    *,
+    medium_index: float | None = None,
+    stripe: StripeOptions | None = None,
+    progress: Progress | None = None,
+) -> tuple[list[StepEvidence], list[str]]:
+    """Stripes on the step standard in all images with the laser on, and warnings about images left out.
+
+    Parameters
+    ----------
+    medium_index : float, optional
+        Replaces the index of the captures' medium at the laser's wavelength.
+
+    Raises
+    ------
+    DescriptionError
+        A capture does not say which step standard it shows.
+    """
+    total, done = sum(int(np.count_nonzero(capture.laser_on)) for capture in captures), 0
+    found, warnings = [], []
+    for capture in captures:
+        try:
+            standard = StepStandard.model_validate(capture.header.artefact)
+        except ValidationError as error:
+            details = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'artefact'}: {p['msg']}" for p in error.errors())
+            raise DescriptionError(f"{capture.path.name} does not tell its step standard: {details}") from error
+        wavelength = capture.header.sensor.laser.wavelength_nm
+        index = capture.header.medium.refractive_index(wavelength) if medium_index is None else medium_index
+        for frame, image in capture.frames(laser_on=True):
+            pieces: list[np.ndarray] = []
+            _add_stripe(pieces, capture, frame, image, stripe, warnings)
+            if pieces:
+                found.append(StepEvidence(pieces[0], standard, index, f"{capture.path.name}, frame {frame}"))
+            done = _report(progress, "step", done, total)
+    return found, warnings
+
+
+def _add_stripe(
+    pieces: list[np.ndarray],
+    capture: Capture,
+    frame: int,
+    image: np.ndarray,
+    options: StripeOptions | None,
+    warnings: list[str],
+) -> None:
+    along, clip = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
+    try:
+        pixels = extract_stripe(image, stripe_along=along, options=options, saturation=clip).pixels()
+    except ImageError as error:
+        warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {error}")
+        return
+    if len(pixels) < _FEWEST_LINES:
+        warnings.append(
+            f"{capture.path.name}, frame {frame}: stripe left out, found on {len(pixels)} lines only, at least "
+            f"{_FEWEST_LINES} are of use"
+        )
+    else:
+        pieces.append(pixels)
+
+
+def _report(progress: Progress | None, name: str, done: int, total: int) -> int:
+    if progress is not None:
+        progress(name, done + 1, total)
+    return done + 1

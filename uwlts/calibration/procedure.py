@@ -1,0 +1,294 @@
+"""The whole calibration: camera and sheet from captures in air, window distance from a step standard in the medium."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from uwlts.calibration.camera_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.circle_bias import UnbiasedSolution, solve_without_bias
+from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, step_evidence
+from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.model import Calibration, WindowModel
+from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
+from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
+from uwlts.calibration.summary import camera_figures, sheet_figures, window_figures
+from uwlts.calibration.target_image import TargetImage
+from uwlts.calibration.window import WindowSolution, label_step, solve_window
+from uwlts.capture import Capture
+from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.placement import camera_from_object, laser_pose
+from uwlts.sensor import Sensor
+from uwlts.stripe import StripeOptions
+from uwlts.targets import CircleTarget, Target
+
+_LARGEST_USUAL_TURN = np.radians(5)
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """How the calibration is made.
+
+    Attributes
+    ----------
+    refractions : {1, 2}
+        2: a glass plate of known thickness and index; the images in air are taken without the window. 1: a single
+        interface; the images in air are taken with the window in place, whose effect goes into the distortion.
+    poses : {"stage-normal", "stage", "free"}
+        As for `solve_camera`.
+    camera : CameraOptions
+    stripe : StripeOptions, optional
+    correct_circles : bool
+        Take out the offset between a circle's image and the image of its centre.
+    margin_mm : float, optional
+        How far the plate reaches beyond its outermost points; half their spacing unless given.
+    medium_index : float, optional
+        Replaces the index of the medium of the step images.
+    bounds_mm : (low, high), optional
+        Window distances to search.
+    """
+
+    refractions: Literal[1, 2] = 2
+    poses: Poses = "stage-normal"
+    camera: CameraOptions = CameraOptions()
+    stripe: StripeOptions | None = None
+    correct_circles: bool = True
+    margin_mm: float | None = None
+    medium_index: float | None = None
+    bounds_mm: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A calibration with everything a report shows of its making.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    air : AirEvidence
+    camera : CameraSolution
+    bias_px : list of (N, 2) or None
+        Offsets taken out of the circles' centres.
+    stripe_points : StripePoints
+    sheet : SheetSolution
+    steps : list of StepEvidence
+        Those used for the window, in the order of its figures.
+    window : WindowSolution or None
+    warnings : list of str
+    """
+
+    calibration: Calibration
+    air: AirEvidence
+    camera: CameraSolution
+    bias_px: list[np.ndarray] | None
+    stripe_points: StripePoints
+    sheet: SheetSolution
+    steps: list[StepEvidence]
+    window: WindowSolution | None
+    warnings: list[str]
+
+
+def calibrate(
+    air: Sequence[Capture],
+    steps: Sequence[Capture] = (),
+    *,
+    options: CalibrationOptions | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Calibrate a sensor from its captures; without step captures for use in air only.
+
+    Parameters
+    ----------
+    air : sequence of Capture
+        A target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
+        the target, those with the laser on, at the same stage positions, the stripe on it.
+    steps : sequence of Capture
+        A step standard in the medium of use.
+    options : CalibrationOptions
+    progress : callable, optional
+
+    Raises
+    ------
+    CalibrationError
+        The evidence does not determine the calibration or contradicts it.
+    DescriptionError
+        A capture does not describe its target or its step standard.
+    """
+    options = CalibrationOptions() if options is None else options
+    sensor = _common_sensor([*air, *steps])
+    evidence = air_evidence(air, stripe=options.stripe, progress=progress)
+    if not evidence.images:
+        raise CalibrationError(f"the target was found in no image; {'; '.join(evidence.warnings[:3])}")
+    warnings = [*evidence.warnings, *_window_warnings(air, steps, options)]
+    camera, unbiased = _camera(evidence, sensor, air, options)
+    margin = lattice_spacing(evidence.target) / 2 if options.margin_mm is None else options.margin_mm
+    stripe_points = points_on_target(
+        camera.model, evidence.stripes, camera.target_poses, extent_mm=plate_extent(evidence.target), margin_mm=margin
+    )
+    pose = laser_pose(sensor)
+    sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
+    warnings += _turn_warnings(camera, sheet, sensor, air)
+    calibration = Calibration(
+        sensor_name=sensor.name,
+        stripe_along=sensor.camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
+        camera=camera.model,
+        window=None,
+        sheet=sheet.model,
+        camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
+    )
+    used, window = [], None
+    if steps:
+        used, window, left_out = _window(calibration, sensor, steps, options, progress)
+        warnings += left_out
+    figures: dict[str, Any] = {
+        "camera": camera_figures(camera, unbiased),
+        "sheet": sheet_figures(sheet, stripe_points),
+    }
+    if window is not None:
+        figures["window"] = window_figures(window, [step.source for step in used])
+    calibration = calibration.model_copy(
+        update={
+            "window": None if window is None else window.model,
+            "residuals": figures,
+            "provenance": _provenance(air, steps, options, warnings),
+        }
+    )
+    bias = None if unbiased is None else unbiased.bias_px
+    return CalibrationResult(
+        calibration, evidence, camera, bias, stripe_points, sheet, used, window, warnings
+    )
+
+
+def _common_sensor(captures: Sequence[Capture]) -> Sensor:
+    if not captures:
+        raise CalibrationError("no capture in air is given: a calibration starts with one of a target")
+    sensor = captures[0].header.sensor
+
+    def optics(capture: Capture) -> tuple[Any, ...]:
+        camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
+        return camera.width_px, camera.height_px, camera.stripe_along, laser.wavelength_nm
+
+    for capture in captures[1:]:
+        if optics(capture) != optics(captures[0]):
+            raise CalibrationError(
+                f"{capture.path.name} comes from another sensor than {captures[0].path.name}: image size, stripe_along "
+                f"and wavelength are {optics(capture)} against {optics(captures[0])}"
+            )
+    return sensor
+
+
+def _camera(
+    evidence: AirEvidence, sensor: Sensor, air: Sequence[Capture], options: CalibrationOptions
+) -> tuple[CameraSolution, UnbiasedSolution | None]:
+    approaching = options.poses == "free" or _approaching(air)
+
+    def solve(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
+        return solve_camera(
+            images, width_px=sensor.camera.width_px, height_px=sensor.camera.height_px, poses=options.poses,
+            approaching=approaching, options=options.camera, start=start,
+        )  # fmt: skip
+
+    target: Target = evidence.target
+    if not (options.correct_circles and isinstance(target, CircleTarget)):
+        return solve(evidence.images, None), None
+    unbiased = solve_without_bias(evidence.images, solve, diameter_mm=target.diameter_mm)
+    return unbiased.solution, unbiased
+
+
+def _approaching(air: Sequence[Capture]) -> bool:
+    """Whether the stage moves the sensor towards the target, which stands square to the OCS's Z before the sensor."""
+    along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
+    if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:
+        raise CalibrationError(
+            "the stage must move the sensor along the laser's axis (OCS Z), the same way in all captures; "
+            f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in sorted(along))}: use "
+            "poses='free' with a tilted target"
+        )
+    return min(along) > 0
+
+
+def _window(
+    calibration: Calibration,
+    sensor: Sensor,
+    captures: Sequence[Capture],
+    options: CalibrationOptions,
+    progress: Progress | None,
+) -> tuple[list[StepEvidence], WindowSolution, list[str]]:
+    plate = captures[0].header.sensor.camera.window
+    normal = tuple(plate.normal().tolist())
+    if options.refractions == 2:
+        glass = plate.index(sensor.laser.wavelength_nm)
+        window = WindowModel(
+            refractions=2, distance_mm=plate.distance_mm, normal=normal, thickness_mm=plate.thickness_mm,
+            glass_index=glass,
+        )  # fmt: skip
+    else:
+        window = WindowModel(refractions=1, distance_mm=plate.distance_mm, normal=normal)
+    found, warnings = step_evidence(
+        captures, medium_index=options.medium_index, stripe=options.stripe, progress=progress
+    )
+    used, images = [], []
+    for step in found:
+        try:
+            images.append(
+                label_step(
+                    calibration, window, step.pixels, height_mm=step.standard.height_mm, medium_index=step.medium_index,
+                    edge_mm=step.standard.edge_mm, reference=step.standard.reference,
+                )  # fmt: skip
+            )
+            used.append(step)
+        except EvaluationError as error:
+            warnings.append(f"{step.source}: left out, {error}")
+    if not images:
+        raise CalibrationError(f"no step image can be used for the window's distance; {'; '.join(warnings[:3])}")
+    return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
+
+
+def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
+    if not all(capture.header.sensor.camera.window.mounted for capture in steps):
+        raise CalibrationError("a step capture says its camera has no window: there is no distance to find")
+    if not steps:
+        return []
+    mounted = [capture.header.sensor.camera.window.mounted for capture in air]
+    if options.refractions == 2 and any(mounted):
+        return [
+            "the window stood before the camera in air, so its shift of the rays went into distortion and focal length; "
+            "with two refractions take the images in air without it, or use refractions=1"
+        ]
+    if options.refractions == 1 and not all(mounted):
+        return ["the window was removed in air and is one interface in the medium: its thickness appears nowhere"]
+    return []
+
+
+def _turn_warnings(
+    camera: CameraSolution, sheet: SheetSolution, sensor: Sensor, air: Sequence[Capture]
+) -> list[str]:
+    warnings = []
+    if sheet.turn_rad > _LARGEST_USUAL_TURN:
+        warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")
+    if camera.stage_direction is not None:
+        nominal = camera_from_object(sensor)[:3, :3] @ np.array(air[0].header.stage_direction)
+        cosine = camera.stage_direction @ nominal / np.linalg.norm(nominal)
+        turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        if turn > np.degrees(_LARGEST_USUAL_TURN):
+            warnings.append(f"the stage's direction is {turn:.1f} deg away from the capture's stage_direction")
+    return warnings
+
+
+def _provenance(
+    air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions, warnings: list[str]
+) -> dict[str, Any]:
+    return {
+        "source": "calibration from captures",
+        "air_captures": [{"file": capture.path.name, "name": capture.header.name} for capture in air],
+        "step_captures": [
+            {"file": capture.path.name, "name": capture.header.name, "medium": capture.header.medium_name}
+            for capture in steps
+        ],
+        "refractions": options.refractions,
+        "poses": options.poses,
+        "medium_index": options.medium_index,
+        "warnings": warnings,
+    }

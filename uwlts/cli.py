@@ -1,0 +1,253 @@
+"""The ``uwlts`` command: the sensor's software, from captures to judged point clouds."""
+
+import sys
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+import uwlts
+from uwlts.console import progress_bar, run
+from uwlts.errors import CaptureError, DescriptionError
+
+app = App(
+    name="uwlts",
+    help="Software of an underwater laser triangulation sensor.",
+    version=uwlts.__version__,
+    help_format="plaintext",
+)
+
+Flag = Annotated[bool, Parameter(negative="")]
+Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True)]
+Method = Literal["centre-of-mass", "quadratic", "zero-crossing"]
+
+
+@app.command
+def info(path: str) -> None:
+    """Say what a file holds: a capture, cloud, calibration, evaluation, or a sensor description (by name or path).
+
+    Example: uwlts info capture.h5
+
+    Parameters
+    ----------
+    path
+        File, or name of a shipped sensor such as thesis.
+    """
+    from uwlts.inventory import describe
+
+    print(describe(path))
+
+
+@app.command
+def calibrate(
+    *,
+    air: Files,
+    step: Files = (),
+    out: Path,
+    refractions: Literal[1, 2] = 2,
+    poses: Literal["stage-normal", "stage", "free"] = "stage-normal",
+    distortion: tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...] = ("k1", "k2"),
+    index: float | None = None,
+    method: Method | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Calibrate camera and sheet from target images in air, and the window's distance from step images in water.
+
+    Example: uwlts calibrate --air target.h5 --step step-near.h5 step-far.h5 --out calibration.json
+
+    Parameters
+    ----------
+    air
+        Captures of the target in air: at every stage position one image under the lamp and one with the laser.
+    step
+        Captures of the step standard in the medium of use; without them the calibration is for air only.
+    out
+        Calibration file to write.
+    refractions
+        2: glass plate of known thickness, air images taken without the window. 1: one interface, air images taken
+        through the window.
+    poses
+        stage-normal: one plate pose, moved by the stage along the plate's normal (the thesis). stage: the same with a
+        free direction. free: every image has a pose of its own.
+    distortion
+        Distortion coefficients to estimate; the others stay 0.
+    index
+        Refractive index of the medium, in place of the one that follows from the captures.
+    method
+        How the stripe's centre is found.
+    overwrite
+        Replace an existing file.
+    """
+    from contextlib import ExitStack
+
+    from uwlts.calibration.model import write_calibration
+    from uwlts.calibration.intrinsics import CameraOptions
+    from uwlts.calibration.procedure import CalibrationOptions
+    from uwlts.calibration.procedure import calibrate as solve
+    from uwlts.capture import Capture
+    from uwlts.inventory import calibration_lines
+    from uwlts.stripe import StripeOptions
+
+    options = CalibrationOptions(
+        refractions=refractions, poses=poses, camera=CameraOptions(distortion=distortion), medium_index=index,
+        stripe=StripeOptions(method=method) if method else StripeOptions(),
+    )  # fmt: skip
+    with ExitStack() as stack, progress_bar("calibrating") as progress:
+        air_captures = [stack.enter_context(Capture(path)) for path in air]
+        step_captures = [stack.enter_context(Capture(path)) for path in step]
+        result = solve(
+            air_captures, step_captures, options=options, progress=lambda stage, done, total: progress(done, total)
+        )
+    write_calibration(out, result.calibration, overwrite=overwrite)
+    print("\n".join(calibration_lines(result.calibration)))
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(f"wrote {out}")
+
+
+@app.command
+def reconstruct(
+    capture: Path,
+    *,
+    calibration: Path,
+    out: Path,
+    index: float | None = None,
+    method: Method | None = None,
+    peak: Literal["strongest", "first", "last"] = "strongest",
+    overwrite: Flag = False,
+) -> None:
+    """Turn a capture into a point cloud.
+
+    Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply
+
+    Parameters
+    ----------
+    capture
+        Capture of a scan.
+    calibration
+        Calibration of the sensor.
+    out
+        Cloud to write (PLY with intensity, frame and line of every point).
+    index
+        Refractive index of the medium, in place of the one that follows from the capture.
+    method
+        How the stripe's centre is found.
+    peak
+        Which of several stripes on a line counts.
+    overwrite
+        Replace an existing file.
+    """
+    from uwlts.calibration.model import read_calibration
+    from uwlts.capture import Capture
+    from uwlts.cloud import write_cloud
+    from uwlts.scan import reconstruct_capture
+    from uwlts.stripe import StripeOptions
+
+    options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
+    with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
+        scan = reconstruct_capture(opened, read_calibration(calibration), options=options, index=index, progress=progress)
+    write_cloud(out, scan.cloud, overwrite=overwrite)
+    lines = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in scan.lines_by_status.items() if count)
+    print(f"profile lines: {lines}")
+    lost = {name: count for name, count in scan.rays_by_status.items() if count and name != "ok"}
+    if lost:
+        print(f"rays that meet no point of the sheet: {', '.join(f'{n} {name}' for name, n in lost.items())}")
+    print(f"wrote {out} with {len(scan.cloud)} points")
+
+
+@app.command
+def evaluate(
+    cloud: Path,
+    *,
+    out: Path,
+    artefact: Path | None = None,
+    truth: Path | None = None,
+    coloured: Path | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Judge a cloud by its artefact's calibrated values, and point by point by a truth file.
+
+    Example: uwlts evaluate spheres.ply --truth spheres.truth.h5 --out spheres.evaluation.json
+
+    Parameters
+    ----------
+    cloud
+        Point cloud.
+    out
+        Evaluation to write (JSON).
+    artefact
+        TOML file with the artefact's kind and calibrated values, in place of what the capture says.
+    truth
+        Ground truth of the capture, if it was rendered.
+    coloured
+        Also write the cloud with the deviation of every point to this file.
+    overwrite
+        Replace existing files.
+    """
+    from uwlts.cloud import read_cloud, write_cloud
+    from uwlts.evaluate import judge, parse_artefact, write_evaluation
+    from uwlts.inventory import evaluation_lines
+    from uwlts.truth import read_truth
+
+    points = read_cloud(cloud)
+    table = _read_toml(artefact) if artefact else points.metadata.get("artefact")
+    judgement = judge(
+        points,
+        artefact=parse_artefact(table) if table else None,
+        truth=read_truth(truth)[1] if truth else None,
+        source=cloud.name,
+    )
+    write_evaluation(out, judgement, overwrite=overwrite)
+    if coloured:
+        write_cloud(coloured, judgement.cloud, overwrite=overwrite)
+    print("\n".join(evaluation_lines(judgement.content)))
+    print(f"wrote {out}")
+
+
+@app.command
+def report(folder: Path, *, reference: str | None = None, out: Path | None = None, overwrite: Flag = False) -> None:
+    """Gather a campaign's files into one page with pictures, a summary and a table on the terminal.
+
+    The folder holds captures NAME.h5, coloured clouds NAME.ply, evaluations NAME.evaluation.json and calibrations.
+
+    Example: uwlts report runs/demo --reference thesis
+
+    Parameters
+    ----------
+    folder
+        Folder of the campaign.
+    reference
+        Published values to set beside the measured ones: name (thesis) or path of a TOML file.
+    out
+        Page to write; FOLDER/report.html unless given.
+    overwrite
+        Replace an existing report, summary and pictures.
+    """
+    from uwlts.report import gather_campaign, load_reference, print_table, summary_table, write_report, write_summary
+
+    campaign = gather_campaign(folder)
+    published = load_reference(reference) if reference else None
+    page = out or folder / "report.html"
+    write_summary(page.with_name("summary.json"), campaign, published, overwrite=overwrite)
+    write_report(page, campaign, published, overwrite=overwrite)
+    print_table(summary_table(campaign, published))
+    print(f"wrote {page} and {page.with_name('summary.json')}")
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(app))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""Judges a cloud: against its artefact's calibrated values and, where a truth file lies beside it, point by point."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from uwlts.cloud import PointCloud
+from uwlts.errors import CaptureError, EvaluationError
+from uwlts.files import written_aside
+from uwlts.metrology.artefacts import Artefact, evaluate_cloud
+from uwlts.metrology.truth import compare_with_truth
+from uwlts.truth import Truth
+
+FORMAT = "uwlts-evaluation"
+VERSION = 1
+TOLERANCE_MM = 0.010
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What an evaluation says: plain JSON for the file, and the cloud with the deviation of every point."""
+
+    content: dict[str, Any]
+    cloud: PointCloud
+
+
+def parse_artefact(table: dict[str, Any]) -> Artefact:
+    """An artefact's description; EvaluationError naming what is wrong with it."""
+    try:
+        return TypeAdapter(Artefact).validate_python(table)
+    except ValidationError as error:
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
+        raise EvaluationError(f"the artefact's description is not valid: {details}") from error
+
+
+def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, source: str) -> Judgement:
+    """Evaluate a cloud. Its points are coloured by their deviation from the artefact's fit, else from the truth.
+
+    Raises
+    ------
+    EvaluationError
+        There is neither an artefact nor a truth, or the cloud does not show the artefact.
+    """
+    if artefact is None and truth is None:
+        raise EvaluationError(
+            "nothing to judge by: the capture names no artefact (give --artefact) and there is no truth file (--truth)"
+        )
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "cloud": source, **cloud.metadata}
+    content |= {"artefact": None, "evaluation": None, "truth": None}
+    deviation = np.full(len(cloud), np.nan)
+    if truth is not None:
+        compared = compare_with_truth(
+            cloud.points_mm, cloud.frame, cloud.line,
+            point_mm=truth.point_mm, normal=truth.normal, status=truth.status, tolerance_mm=TOLERANCE_MM,
+        )  # fmt: skip
+        content["truth"] = compared.as_dict()
+        deviation = compared.distance_mm
+    if artefact is not None:
+        evaluation = evaluate_cloud(cloud, artefact)
+        content |= {"artefact": artefact.model_dump(mode="json"), "evaluation": evaluation.as_dict()}
+        deviation = evaluation.deviation_mm
+    return Judgement(content, replace(cloud, deviation_mm=deviation))
+
+
+def write_evaluation(path: str | Path, judgement: Judgement, *, overwrite: bool = False) -> None:
+    """Write an evaluation as indented JSON, whole or not at all; OutputError where that fails."""
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(json.dumps(judgement.content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_evaluation(path: str | Path) -> dict[str, Any]:
+    """Content of an evaluation file; CaptureError where it is missing, foreign, newer or damaged."""
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read the evaluation {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise CaptureError(f"{path} is not an evaluation, or is truncated: {error}") from error
+    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+        raise CaptureError(f"{path} is JSON but not an evaluation that this program reads (version {VERSION})")
+    return content

@@ -1,0 +1,154 @@
+"""Says in words what a file holds: capture, truth, cloud, calibration, evaluation or sensor description."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwlts.calibration.model import Calibration, read_calibration
+from uwlts.calibration.model import FORMAT as CALIBRATION_FORMAT
+from uwlts.capture import Capture
+from uwlts.cloud import PointCloud, read_cloud
+from uwlts.errors import CaptureError, DescriptionError
+from uwlts.evaluate import FORMAT as EVALUATION_FORMAT
+from uwlts.evaluate import read_evaluation
+from uwlts.library import load_sensor
+from uwlts.placement import check_design, view_of_sheet
+from uwlts.sensor import Camera, Sensor
+
+
+def describe(name_or_path: str) -> str:
+    """Text about a file, or about a sensor that ships with the package.
+
+    Raises
+    ------
+    CaptureError, DescriptionError
+        The file is missing, foreign or damaged.
+    """
+    path = Path(name_or_path)
+    suffixes = [s for s in path.suffixes if s != ".part"]
+    if suffixes[-1:] == [".h5"]:
+        with Capture(path) as capture:
+            return "\n".join(capture_lines(capture))
+    if suffixes[-1:] == [".ply"]:
+        return "\n".join(cloud_lines(read_cloud(path)))
+    if suffixes[-1:] == [".json"]:
+        return "\n".join(_json_lines(path))
+    if suffixes and suffixes[-1] != ".toml":
+        raise DescriptionError(f"{path}: expected a .h5, .ply, .json or .toml file, or the name of a sensor")
+    return "\n".join(sensor_lines(load_sensor(name_or_path)))
+
+
+def _json_lines(path: Path) -> list[str]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8")).get("format")
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, AttributeError) as error:
+        raise CaptureError(f"{path} is not a file of this program, or is truncated") from error
+    if found == CALIBRATION_FORMAT:
+        return calibration_lines(read_calibration(path))
+    if found == EVALUATION_FORMAT:
+        return evaluation_lines(read_evaluation(path))
+    raise CaptureError(f"{path} is neither a calibration nor an evaluation: format is {found!r}")
+
+
+def capture_lines(capture: Capture) -> list[str]:
+    """What a capture holds."""
+    header, camera = capture.header, capture.header.sensor.camera
+    laser = int(capture.laser_on.sum())
+    lines = [
+        f"capture of the sensor '{header.sensor.name}' in {header.medium_name} ({_medium(header.medium, header.sensor)})",
+        f"{len(capture)} frames of {camera.width_px} x {camera.height_px} pixels, {laser} with the laser on"
+        + ("" if capture.finished else "; the recording was interrupted"),
+    ]
+    if len(capture):
+        exposures = ", ".join(f"{value:.3g}" for value in np.unique(capture.exposure_ms))
+        lines.append(
+            f"stage from {capture.stage_mm.min():.3f} to {capture.stage_mm.max():.3f} mm along OCS "
+            f"{tuple(round(x, 4) for x in header.stage_direction)}; exposure {exposures} ms"
+        )
+    for name, thing in (("target", header.target), ("artefact", header.artefact)):
+        if thing:
+            lines.append(f"{name}: {', '.join(f'{key} {value}' for key, value in thing.items())}")
+    lines.append(f"recorded by: {', '.join(f'{key} {value}' for key, value in header.provenance.items()) or 'unknown'}")
+    return lines
+
+
+def cloud_lines(cloud: PointCloud) -> list[str]:
+    """What a cloud holds."""
+    low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
+    lines = [f"cloud of {len(cloud)} points from {len(np.unique(cloud.frame))} frames"]
+    lines += [f"{axis}: {a:.3f} to {b:.3f} mm" for axis, a, b in zip("XYZ", low, high, strict=True)]
+    if cloud.deviation_mm is not None and np.isfinite(cloud.deviation_mm).any():
+        lines.append(f"deviation: standard deviation {np.nanstd(cloud.deviation_mm):.4f} mm")
+    return lines + [f"{key}: {value}" for key, value in cloud.metadata.items()]
+
+
+def calibration_lines(calibration: Calibration) -> list[str]:
+    """What a calibration says, with its residuals."""
+    camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
+    d = camera.distortion
+    lines = [
+        f"calibration of the sensor '{calibration.sensor_name}' ({calibration.provenance.get('source', 'unknown source')})",
+        f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
+        f"k1 {d.k1:.5f}, k2 {d.k2:.5f}, p1 {d.p1:.5f}, p2 {d.p2:.5f}, k3 {d.k3:.5f}",
+        f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
+    ]
+    if window is None:
+        lines.append("window: none; for use in air only")
+    else:
+        glass = f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""
+        lines.append(f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}")
+    figures = {"camera": ("rms_px", "px"), "sheet": ("rms_mm", "mm"), "window": ("std_mm", "mm standard uncertainty of d")}
+    for step, (name, unit) in figures.items():
+        value = calibration.residuals.get(step, {}).get(name)
+        if value is not None:
+            lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
+    return lines
+
+
+def evaluation_lines(content: dict[str, Any]) -> list[str]:
+    """What an evaluation says."""
+    lines = [f"evaluation of {content['cloud']}"]
+    if evaluation := content["evaluation"]:
+        lines += [f"  {name}: {value:+.4f} mm" for name, value in evaluation["figures_mm"].items()]
+        lines.append(f"  points: {evaluation['points_used']} used, {evaluation['points_rejected']} rejected")
+    if truth := content["truth"]:
+        lines.append(
+            f"  against truth: rms {truth['rms_mm']:.4f} mm, 99 % within {truth['p99_mm']:.4f} mm, "
+            f"{100 * truth['share_within_tolerance']:.1f} % within {truth['tolerance_mm']:g} mm; "
+            f"{truth['missed']} stripe points missed, {truth['false_points']} false"
+        )
+    return lines
+
+
+def sensor_lines(sensor: Sensor) -> list[str]:
+    """What a sensor can do in each of its media; the line length for both ways to turn the camera."""
+    laser = sensor.laser
+    lines = [f"sensor '{sensor.name}': {sensor.notes}", f"image {sensor.camera.width_px} x {sensor.camera.height_px}"]
+    if laser.baseline_mm is not None:
+        lines.append(f"baseline {laser.baseline_mm:g} mm, triangulation angle {laser.triangulation_angle_deg:g} deg")
+    for name, medium in sensor.media.items():
+        view = check_design(sensor, medium)
+        lines.append(
+            f"{name} ({_medium(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in view "
+            f"from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
+        )
+        for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
+            turned = sensor.model_copy(update={"camera": _turned(sensor.camera, along)})
+            length = view_of_sheet(turned, medium).line_length_mm
+            chosen = " (this sensor)" if along == sensor.camera.stripe_along else ""
+            lines.append(f"  line length at the stand-off, stripe along the {side} side: {length:.1f} mm{chosen}")
+    return lines
+
+
+def _turned(camera: Camera, along: str) -> Camera:
+    return camera.model_copy(update={"stripe_along": along})
+
+
+def _medium(medium: Any, sensor: Sensor) -> str:
+    index = medium.refractive_index(sensor.laser.wavelength_nm)
+    water = f", {medium.temperature_c:g} degC, {medium.salinity_g_kg:g} g/kg" if medium.kind in ("fresh", "sea") else ""
+    return f"{medium.kind}, n {index:.5f}{water}"
