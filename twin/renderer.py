@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.arrays import to_jit
 from twin.camera import LensRays
 from twin.objects import build_objects
 from twin.scene import Scene
@@ -83,6 +84,7 @@ class Renderer:
         )
         self._to_object = np.linalg.inv(camera_from_object(sensor))
         self._extinction = medium.absorption_per_mm(self.wavelength_nm) + medium.scattering_per_mm(self.wavelength_nm)
+        self._scatters = medium.scattering_per_mm(self.wavelength_nm) > 0
         self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
 
     def bundle(self, x: mi.Float, y: mi.Float) -> Bundle:
@@ -100,7 +102,7 @@ class Renderer:
             camera = self.sensor.camera
             columns, rows = -(-camera.width_px // spacing) + 1, -(-camera.height_px // spacing) + 1
             x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
-            bundle = self.bundle(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)))
+            bundle = self.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
             dr.eval(bundle.origin, bundle.direction, bundle.weight)
             self._grids[spacing] = bundle, (rows, columns)
         return self._grids[spacing]
@@ -112,49 +114,70 @@ class Renderer:
         """
         pose = SensorPose(scene_from_object)
         if light == "laser":
-            image, fine = self.laser_nodes(pose)
+            image, rows, columns = self._laser_nodes(pose)
         else:
-            image, fine = self._lamp_nodes(pose)
-        rows, columns = np.nonzero(fine)
+            image, rows, columns = self._lamp_nodes(pose)
         if len(rows):
-            image[rows, columns] = self._fine(light, pose, rows, columns, spp=spp, seed=seed)
+            fine = self._fine(light, pose, rows, columns, spp=spp, seed=seed)
+            # The stripe lies before the haze, which the nodes have rendered; a lamp image is replaced.
+            image[rows, columns] = fine + image[rows, columns] if light == "laser" else fine
         return image
 
-    def laser_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Haze (H, W) in W/mm2 from the nodes, and the mask (H, W) of pixels close to the lit stripe."""
+    def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the pixels close to the lit stripe."""
         bundle, shape = self._grid(NODE_SPACING_PX)
-        ray = pose.ray(bundle.origin, bundle.direction)
-        hit = self.objects.ray_intersect_preliminary(ray)
+        _, across = self._nodes_on_surface(pose, bundle)
+        return self._pixels_of(_near_sheet(across.numpy().reshape(shape)))
+
+    def _nodes_on_surface(self, pose: SensorPose, bundle: Bundle) -> tuple[mi.Bool, mi.Float]:
+        """Whether rays meet a surface, and the sheet's distance across there in standard deviations."""
+        hit = self.objects.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
         valid = hit.is_valid() & (bundle.weight > 0)
         light = self.sheet.at(bundle.origin + bundle.direction * dr.select(valid, hit.t, 1.0))
-        across = dr.select(valid, light.distance_mm / light.sigma_mm, dr.inf)
-        haze = bundle.weight * self._haze(pose, bundle, valid, hit.t, light.distance_mm)
-        dr.eval(across, haze)
-        corners = _corners(across.numpy().reshape(shape))
-        with np.errstate(invalid="ignore"):
-            near = (np.abs(corners).min(axis=0) < LIT_SIGMAS) | (corners.min(axis=0) * corners.max(axis=0) < 0)
-        return self._spread(_corners(haze.numpy().reshape(shape)).mean(axis=0)), self._spread(near)
+        return valid, dr.select(valid, light.distance_mm / light.sigma_mm, dr.inf)
 
-    def _lamp_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Lamp image (H, W) in W/mm2 from the pixels' corners, and the mask of pixels in which it changes."""
+    def _laser_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Haze (H, W) in W/mm2 from the nodes, and rows and columns of the pixels close to the lit stripe."""
+        bundle, shape = self._grid(NODE_SPACING_PX)
+        valid, across = self._nodes_on_surface(pose, bundle)
+        if self._scatters:
+            haze = bundle.weight * self._haze(pose, bundle, valid, across)
+            dr.eval(across, haze)
+            image = self._spread(_corner_mean(haze.numpy().reshape(shape)))
+        else:
+            image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        return image, *self._pixels_of(_near_sheet(across.numpy().reshape(shape)))
+
+    def _pixels_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the pixels in the marked grid cells."""
+        row, column = np.nonzero(cells)
+        inside = np.arange(NODE_SPACING_PX)
+        rows = (row[:, None, None] * NODE_SPACING_PX + inside[:, None] + 0 * inside).ravel()
+        columns = (column[:, None, None] * NODE_SPACING_PX + 0 * inside[:, None] + inside).ravel()
+        camera = self.sensor.camera
+        kept = (rows < camera.height_px) & (columns < camera.width_px)
+        return rows[kept], columns[kept]
+
+    def _lamp_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lamp image (H, W) in W/mm2 from the pixels' corners, and rows and columns of the pixels in which it changes."""
         bundle, shape = self._grid(1)
-        corners = _corners(self._lamp(pose, bundle).numpy().reshape(shape))
-        change = corners.max(axis=0) - corners.min(axis=0)
-        return corners.mean(axis=0), change > CHANGE_SHARE * corners.max()
+        nodes = self._lamp(pose, bundle).numpy().reshape(shape)
+        low, high = _corner_extremes(nodes)
+        return _corner_mean(nodes), *np.nonzero(high - low > CHANGE_SHARE * nodes.max())
 
     def _spread(self, cells: np.ndarray) -> np.ndarray:
         """Values of grid cells given to their pixels, (H, W)."""
         camera = self.sensor.camera
         full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
-        return full[: camera.height_px, : camera.width_px]
+        return np.ascontiguousarray(full[: camera.height_px, : camera.width_px])
 
     def _fine(
         self, light: str, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, *, spp: int, seed: int
     ) -> np.ndarray:
         """Mean irradiance (P,) in W/mm2 over the area of pixels."""
         count = len(rows)
-        x, y = mi.Float(columns.astype(np.float32)), mi.Float(rows.astype(np.float32))
-        number = mi.UInt32((rows * self.sensor.camera.width_px + columns).astype(np.uint32))
+        x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
+        number = to_jit(mi.UInt32, rows * self.sensor.camera.width_px + columns)
         opaque_seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         index = dr.arange(mi.UInt32, count * spp)
         pixel, sample = index // spp, mi.Float(index % spp)
@@ -170,7 +193,7 @@ class Renderer:
         return dr.block_sum(values, spp).numpy() / spp
 
     def laser(self, pose: SensorPose, bundle: Bundle) -> mi.Float:
-        """Irradiance of laser light per ray, in W/mm2: the lit surface seen through the water, and the haze before it."""
+        """Irradiance of laser light per ray, in W/mm2: the lit surface seen through the water, without the haze."""
         ray = pose.ray(bundle.origin, bundle.direction)
         si = self.objects.ray_intersect(ray)
         valid = si.is_valid() & (bundle.weight > 0)
@@ -180,7 +203,7 @@ class Renderer:
         lit = valid & (light.irradiance > 0) & ~self._shadowed(si.p, towards, light.exit_mm, valid)
         reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(towards), lit)[0]
         radiance = dr.select(lit, reflected * light.irradiance * dr.exp(-self._extinction * si.t), 0.0)
-        return bundle.weight * (radiance + self._haze(pose, bundle, valid, si.t, light.distance_mm))
+        return bundle.weight * radiance
 
     def _shadowed(self, p: mi.Point3f, towards: mi.Vector3f, exit_mm: mi.Float, active: mi.Bool) -> mi.Bool:
         """Whether an object stands between points of the scene and the laser's window."""
@@ -188,19 +211,18 @@ class Renderer:
         ray.maxt = exit_mm - 2e-2
         return self.objects.ray_test(ray, active)
 
-    def _haze(
-        self, pose: SensorPose, bundle: Bundle, on_surface: mi.Bool, depth: mi.Float, across: mi.Float
-    ) -> mi.Float | float:
-        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr; no more than one crossing."""
-        if self.medium.scattering_per_mm(self.wavelength_nm) == 0:
-            return 0.0 * bundle.weight
+    def _haze(self, pose: SensorPose, bundle: Bundle, on_surface: mi.Bool, across: mi.Float) -> mi.Float:
+        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
+
+        ``across`` is the sheet's distance at the ray's end on a surface, in standard deviations.
+        """
         t = -bundle.origin.x / bundle.direction.x
-        for _ in range(2):
-            light = self.sheet.at(bundle.origin + bundle.direction * t)
-            t -= light.distance_mm / dr.dot(bundle.direction, light.normal)
+        light = self.sheet.at(bundle.origin + bundle.direction * t)
+        t -= light.distance_mm / dr.dot(bundle.direction, light.normal)
+        light = self.sheet.at(bundle.origin + bundle.direction * t)
         end = dr.select(on_surface, across * dr.sign(bundle.direction.x), dr.inf)
         scattered = single_scattering(
-            self.medium, light, wavelength_nm=self.wavelength_nm, direction=bundle.direction, surface_distance_mm=end
+            self.medium, light, wavelength_nm=self.wavelength_nm, direction=bundle.direction, surface_sigmas=end
         )
         ray = pose.ray(bundle.origin + bundle.direction * t, -light.direction)
         blocked = self._shadowed(ray.o, ray.d, light.exit_mm, scattered > 0)
@@ -220,6 +242,20 @@ class Renderer:
         return dr.select(facing, bundle.weight * albedo * lamp * dr.exp(-self._extinction * si.t), 0.0)
 
 
-def _corners(nodes: np.ndarray) -> np.ndarray:
-    """The four corners (4, rows - 1, columns - 1) of every grid cell."""
-    return np.stack([nodes[:-1, :-1], nodes[:-1, 1:], nodes[1:, :-1], nodes[1:, 1:]])
+def _corner_mean(nodes: np.ndarray) -> np.ndarray:
+    """Mean (rows - 1, columns - 1) of the four corners of every grid cell."""
+    beside = nodes[:, :-1] + nodes[:, 1:]
+    return 0.25 * (beside[:-1] + beside[1:])
+
+
+def _corner_extremes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest (rows - 1, columns - 1) of the four corners of every grid cell."""
+    low, high = np.minimum(nodes[:, :-1], nodes[:, 1:]), np.maximum(nodes[:, :-1], nodes[:, 1:])
+    return np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
+
+
+def _near_sheet(across: np.ndarray) -> np.ndarray:
+    """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes."""
+    nearest, _ = _corner_extremes(np.abs(across))
+    low, high = _corner_extremes(across)
+    return (nearest < LIT_SIGMAS) | ((low < 0) & (high > 0) & np.isfinite(high))

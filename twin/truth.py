@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.arrays import to_jit, to_numpy
 from twin.renderer import Renderer, SensorPose
 from uwlts.placement import camera_from_object
 from uwlts.truth import TruthStatus
@@ -40,9 +41,9 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth
     """True stripe of a frame, by false position on Mitsuba's own hit points along every profile line."""
     camera = renderer.sensor.camera
     pose = SensorPose(scene_from_object)
-    _, lit = renderer.laser_nodes(pose)
     along_width = camera.stripe_along == "width"
-    line, cell = np.nonzero(lit.T if along_width else lit)
+    rows, columns = renderer.lit_pixels(pose)
+    line, cell = (columns, rows) if along_width else (rows, columns)
     truth = no_stripe(camera.lines())
     if len(line) == 0:
         return truth
@@ -56,7 +57,7 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth
         light = renderer.sheet.at(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
         return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
 
-    at, middle = mi.Float(line.astype(np.float32)), mi.Float(cell.astype(np.float32))
+    at, middle = to_jit(mi.Float, line), to_jit(mi.Float, cell)
     below, above = distance(middle - 0.5, at), distance(middle + 0.5, at)
     dr.eval(below, above)
     below, above = below.numpy(), above.numpy()
@@ -65,15 +66,17 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth
     line, cell, below, above = line[bracketed], cell[bracketed], below[bracketed], above[bracketed]
     if len(line) == 0:
         return truth
-    at, low = mi.Float(line.astype(np.float32)), mi.Float(cell.astype(np.float32) - 0.5)
-    high, below, above = low + 1.0, mi.Float(below), mi.Float(above)
+    at, low, high = to_jit(mi.Float, line), to_jit(mi.Float, cell - 0.5), to_jit(mi.Float, cell + 0.5)
+    below, above = to_jit(mi.Float, below), to_jit(mi.Float, above)
     for _ in range(_FALSE_POSITIONS):
         centre = low + (high - low) * below / (below - above)
         found = distance(centre, at)
         same_side = (found <= 0) == (below <= 0)
         low, below = dr.select(same_side, centre, low), dr.select(same_side, found, below)
         high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
+        dr.eval(low, high, below, above)  # one small kernel five times instead of a large one
     centre = low + (high - low) * below / (below - above)
+    dr.eval(centre)
     bundle = renderer.bundle(*position(centre, at))
     brightness = renderer.laser(pose, bundle)
     si = renderer.objects.ray_intersect(pose.ray(bundle.origin, bundle.direction))
@@ -85,8 +88,8 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth
     chosen = line[dimmest_first]
     np.add.at(truth.crossings, chosen, 1)
     truth.centre_px[chosen] = centre.numpy()[dimmest_first]
-    truth.point_mm[chosen] = si.p.numpy().T[dimmest_first]
-    truth.normal[chosen] = si.n.numpy().T[dimmest_first]
+    truth.point_mm[chosen] = to_numpy(si.p)[dimmest_first]
+    truth.normal[chosen] = to_numpy(si.n)[dimmest_first]
     truth.status[chosen] = TruthStatus.VISIBLE
     return truth
 
@@ -95,7 +98,7 @@ def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
     """Camera-frame z in mm (H, W), float32, of the surface that every pixel's centre sees; NaN where there is none."""
     camera = renderer.sensor.camera
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
-    bundle = renderer.bundle(mi.Float(x.ravel()), mi.Float(y.ravel()))
+    bundle = renderer.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
     hit = renderer.objects.ray_intersect_preliminary(SensorPose(scene_from_object).ray(bundle.origin, bundle.direction))
     point = mi.Transform4f(mi.Matrix4f(camera_from_object(renderer.sensor))) @ (bundle.origin + bundle.direction * hit.t)
     depth = dr.select(hit.is_valid() & (bundle.weight > 0), point.z, dr.nan)

@@ -27,16 +27,16 @@ def phase(medium: Medium, cosine: mi.Float) -> mi.Float:
 
 
 def single_scattering(
-    medium: Medium, light: SheetLight, *, wavelength_nm: float, direction: mi.Vector3f, surface_distance_mm: mi.Float
+    medium: Medium, light: SheetLight, *, wavelength_nm: float, direction: mi.Vector3f, surface_sigmas: mi.Float
 ) -> mi.Float:
     """Radiance that the sheet scatters once into a camera ray where the ray crosses it, in W/mm2/sr.
 
-    ``light`` is the sheet at the crossing, where the distance across is about zero; ``surface_distance_mm`` the
-    signed distance across at the ray's end on a surface, which cuts the Gaussian off. The line integral of a Gaussian
+    ``light`` is the sheet at the crossing, where the distance across is about zero; ``surface_sigmas`` the distance
+    across, in standard deviations and along the ray, of its end on a surface, which cuts the Gaussian off. The line integral of a Gaussian
     across along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos| times the share of the Gaussian passed.
     """
     b = medium.scattering_per_mm(wavelength_nm)
     cosine = dr.maximum(dr.abs(dr.dot(direction, light.normal)), 1e-3)
     peak = light.irradiance * light.sigma_mm * math.sqrt(2 * math.pi)
-    share = 0.5 * (1 + dr.erf(surface_distance_mm / (light.sigma_mm * math.sqrt(2.0))))
+    share = 0.5 * (1 + dr.erf(surface_sigmas / math.sqrt(2.0)))
     return b * phase(medium, -dr.dot(light.direction, direction)) * peak / cosine * share

@@ -1,4 +1,4 @@
-"""The flat windows as real dielectric faces in a Mitsuba scene, and rays sent through them.
+"""The flat windows as Mitsuba's own discs with dielectric surfaces, and rays sent through them.
 
 A ray takes the refracted way at every face; Fresnel's transmittance, the change of radiance with the index squared and
 the glass's absorption go into its weight instead of being sampled. New rays start a little further along their own new
@@ -39,7 +39,7 @@ class LightPath:
 
 
 class WindowFaces:
-    """Both faces of a window, built into a Mitsuba scene of their own.
+    """Both faces of a window. Rays meet them in a known order, so each is asked alone, without a scene around it.
 
     Parameters
     ----------
@@ -61,16 +61,13 @@ class WindowFaces:
         normal = rotation @ window.normal()
         inner = origin_mm + window.distance_mm * rotation[:, 2]
         outer = inner + window.thickness_mm * normal
-        faces = {}
-        for name, centre, outside, inside in (("inner", inner, 1.0, glass), ("outer", outer, glass, index)):
+        self._faces = []
+        for centre, outside, inside in ((inner, 1.0, glass), (outer, glass, index)):
             to_world = np.eye(4)
             to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (window.aperture_diameter_mm / 2, window.aperture_diameter_mm / 2, 1)
             to_world[:3, 3] = centre
-            faces[name] = {
-                "type": "disk", "to_world": mi.ScalarTransform4f(to_world),
-                "bsdf": {"type": "dielectric", "int_ior": inside, "ext_ior": outside},
-            }  # fmt: skip
-        self._scene = mi.load_dict({"type": "scene"} | faces)
+            bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
+            self._faces.append(mi.load_dict({"type": "disk", "to_world": mi.ScalarTransform4f(to_world), "bsdf": bsdf}))
 
     def through(self, origin: mi.Point3f, direction: mi.Vector3f, *, mode: mi.TransportMode) -> LightPath:
         """Send rays from the module's side through both faces.
@@ -85,12 +82,12 @@ class WindowFaces:
         context = mi.BSDFContext(mode)
         context.component = 1
         ray = mi.Ray3f(origin, direction)
-        for face in range(2):
-            si = self._scene.ray_intersect(ray, valid)
+        for face in self._faces:
+            si = face.ray_intersect(ray, active=valid)
             valid &= si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0)
-            sample, transmitted = si.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
+            sample, transmitted = face.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
             weight *= dr.select(valid, transmitted[0], 0.0)
-            if face == 1 and self._absorption > 0:
+            if face is self._faces[1] and self._absorption > 0:
                 weight *= dr.exp(-self._absorption * si.t)
             onward = si.to_world(sample.wo)
             ray = mi.Ray3f(si.p + onward * STEP_MM, onward)

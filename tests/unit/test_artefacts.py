@@ -1,4 +1,4 @@
-"""Artefacts are found among other surfaces and measured as they were made; wrong content is refused with what was found.
+"""Artefacts are found among other surfaces and measured as they were made; wrong content is refused.
 
 Clouds are drawn from ideal shapes with known noise. The true figures are those of the noise that was drawn.
 """
@@ -297,7 +297,7 @@ def test_labels_serve_slightly_changed_points():
 
 
 def test_a_step_as_low_as_ten_times_the_noise_is_found():
-    points, tread = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, strays=0)
+    points, _ = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, strays=0)
     labels = label_treads(points, height_mm=1.0)
     assert np.count_nonzero(labels) > 600
     height = step_height_of_profile(points, labels)
@@ -329,7 +329,9 @@ def step_scan(turn_deg: float) -> PointCloud:
         )
         # Turning about Y shears the profiles along Z.
         points.append(
-            np.column_stack([np.full(len(profile), number), profile + [0, number * np.tan(np.radians(turn_deg))]])
+            np.column_stack(
+                [np.full(len(profile), number), profile + np.array([0, number * np.tan(np.radians(turn_deg))])]
+            )
         )
         frames.append(np.full(len(profile), number))
     return cloud_of(np.vstack(points), np.concatenate(frames))
@@ -394,7 +396,8 @@ def test_descriptions_are_told_apart_by_kind(table, kind):
 
 
 @pytest.mark.parametrize("diameters, spacings, message", [
-    ((50.0, 50.0), (), "1 spacings"), ((50.0, 50.0), (40.0,), "overlap"), ((), (), "at least 1"), ((-1.0,), (), "greater"),
+    ((50.0, 50.0), (), "1 spacings"), ((50.0, 50.0), (40.0,), "overlap"),
+    ((), (), "at least 1"), ((-1.0,), (), "greater"),
 ])  # fmt: skip
 def test_impossible_sphere_standards_are_refused(diameters, spacings, message):
     with pytest.raises(ValidationError, match=message):

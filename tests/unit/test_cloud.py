@@ -62,7 +62,7 @@ JSON = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=40)
 @given(metadata=st.dictionaries(st.text(), JSON, max_size=5), blanks=st.integers(0, 1000))
 def test_any_metadata_comes_back_through_short_ascii_lines(tmp_path_factory, metadata, blanks):
     # The run of blanks puts every kind of character at the end of a comment.

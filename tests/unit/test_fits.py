@@ -42,7 +42,7 @@ def flat(rng, count: int) -> np.ndarray:
 # its points by about 1 / (1 - cos 10 deg) = 66 along its axis, a patch of 30 deg by 30, and 1e-9 mm leaves a margin.
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=50)
 @given(pose=poses, radius=st.floats(2, 300), half_angle=st.floats(0.18, 3.0), seed=st.integers(0, 1000))
 def test_exact_spheres_are_recovered_from_any_cap(pose, radius, half_angle, seed):
     rotation, shift = pose
@@ -53,7 +53,7 @@ def test_exact_spheres_are_recovered_from_any_cap(pose, radius, half_angle, seed
         assert np.abs(fit.residuals_mm).max() < 1e-10
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=12)
 @given(pose=poses, radius=st.floats(10, 300), arc=st.floats(0.5, 6.0), seed=st.integers(0, 1000))
 def test_exact_cylinders_are_recovered_from_any_patch(pose, radius, arc, seed):
     rotation, shift = pose
@@ -84,8 +84,8 @@ def test_exact_planes_and_lines_are_recovered(pose, seed):
     assert line.distances_mm((shift + 3 * rotation[:, 1])[None])[0] == pytest.approx(3, abs=1e-11)
     in_profile = fit_line(shift[:2] + along * [0.6, 0.8], towards=[0.6, 0.8])
     np.testing.assert_allclose(in_profile.direction, [0.6, 0.8], rtol=0, atol=1e-12)
-    assert in_profile.distances_mm(shift[:2] + [[-1.6, 1.2]])[0] == pytest.approx(2, abs=1e-11)
-    assert in_profile.distances_mm(shift[:2] + [[1.6, -1.2]])[0] == pytest.approx(-2, abs=1e-11)
+    assert in_profile.distances_mm(shift[:2] + np.array([[-1.6, 1.2]]))[0] == pytest.approx(2, abs=1e-11)
+    assert in_profile.distances_mm(shift[:2] + np.array([[1.6, -1.2]]))[0] == pytest.approx(-2, abs=1e-11)
 
 
 def test_residuals_are_positive_outside():
@@ -143,20 +143,21 @@ def centred(points):
     return points - points.mean(axis=0)
 
 
+ball, tube = partial(cap, radius=25.06), partial(patch, radius=150, arc=1.22, length=40)
 CASES = {
-    "sphere, 20 % of its surface": (partial(cap, radius=25.06, half_angle=0.93), sphere_parameters, [0, 0, 0, 25.06], None),
-    "sphere, 3 % of its surface": (partial(cap, radius=25.06, half_angle=0.35), sphere_parameters, [0, 0, 0, 25.06], None),
+    "sphere, 20 % of its surface": (partial(ball, half_angle=0.93), sphere_parameters, [0, 0, 0, 25.06], None),
+    "sphere, 3 % of its surface": (partial(ball, half_angle=0.35), sphere_parameters, [0, 0, 0, 25.06], None),
     "sphere, known radius": (
-        partial(cap, radius=25.06, half_angle=0.35), partial(sphere_parameters, radius_mm=25.06), [0, 0, 0], None,
+        partial(ball, half_angle=0.35), partial(sphere_parameters, radius_mm=25.06), [0, 0, 0], None,
     ),
-    "pipe, 70 deg": (partial(patch, radius=150, arc=1.22, length=40), cylinder_parameters, [0, 0, 0, 0, 150], in_world),
+    "pipe, 70 deg": (tube, cylinder_parameters, [0, 0, 0, 0, 150], in_world),
     "pipe, known radius": (
-        partial(patch, radius=150, arc=1.22, length=40), partial(cylinder_parameters, radius_mm=150), [0, 0, 0, 0], in_world,
+        tube, partial(cylinder_parameters, radius_mm=150), [0, 0, 0, 0], in_world,
     ),
     "plane": (lambda rng, count: centred(flat(rng, count)), plane_parameters, [0, 0, 0], plane_in_world),
     "profile": (lambda rng, count: centred(flat(rng, count))[:, [1, 2]], shifted_line, [0, 0], None),
 }  # fmt: skip
-REPEATS = 250
+REPEATS = 200
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -172,7 +173,7 @@ def test_repeats_scatter_about_the_truth_as_the_covariance_says(name):
         assert fit.std_mm == pytest.approx(SIGMA, rel=0.2)  # 400 points: 3.6 % standard deviation
     errors, stated = np.array(errors), np.mean(covariances, axis=0)
     size = len(truth)
-    # Mean of 250: 4.5 standard errors are passed once in 1e5. The least-squares sphere and cylinder have a bias of
+    # Mean of 200: 4.5 standard errors are passed once in 1e5. The least-squares sphere and cylinder have a bias of
     # second order in the noise; a tenth of a standard deviation is allowed for it.
     limit = (4.5 / np.sqrt(REPEATS) + 0.1) * np.sqrt(np.diag(stated))
     assert (np.abs(errors.mean(axis=0)) < limit).all()
@@ -180,8 +181,8 @@ def test_repeats_scatter_about_the_truth_as_the_covariance_says(name):
     # covariances scatter with the estimate of the noise, 2 x 3.6 %, whose mean over the repeats is accurate.
     squared = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(stated), errors)
     assert squared.mean() == pytest.approx(size, abs=4.5 * np.sqrt(2 * size / REPEATS) + 0.05 * size)
-    # Each variance by itself: relative standard deviation sqrt(2 / 250) = 9 %.
-    np.testing.assert_allclose(errors.var(axis=0) / np.diag(stated), 1, atol=0.45)
+    # Each variance by itself: relative standard deviation sqrt(2 / 200) = 10 %.
+    np.testing.assert_allclose(errors.var(axis=0) / np.diag(stated), 1, atol=0.5)
 
 
 @pytest.mark.parametrize("size", [1e-4, 1e-2])
@@ -203,7 +204,7 @@ def test_no_neighbouring_shape_has_a_smaller_sum_of_squares(size):
 def test_pipe_patches_in_any_pose_find_the_axis_without_a_start():
     rng = np.random.default_rng(2)
     checked = 0
-    for seed in range(40):
+    for seed in range(20):
         rotation = Rotation.random(random_state=seed).as_matrix()
         points = patch(rng, 1500, radius=150, arc=np.radians(rng.uniform(60, 80)), length=40)
         fit = fit_cylinder(points @ rotation.T + rng.uniform(-300, 300, 3) + rng.normal(0, SIGMA, points.shape))
@@ -211,7 +212,7 @@ def test_pipe_patches_in_any_pose_find_the_axis_without_a_start():
         assert abs(fit.radius_mm - 150) < 6 * np.sqrt(fit.covariance[4, 4])
         assert np.hypot(*(fit.across @ rotation[:, 0])) < 6 * np.sqrt(fit.covariance[2, 2] + fit.covariance[3, 3])
         checked += 1
-    assert checked == 40
+    assert checked == 20
 
 
 def test_the_known_radius_does_not_end_on_the_wrong_side_of_a_noisy_cap():
@@ -261,7 +262,7 @@ def test_a_noisy_plane_is_no_sphere_and_no_cylinder(fit):
     refused = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        with pytest.raises(EvaluationError, match="do not determine|does not converge"):
+        with pytest.raises(EvaluationError, match=r"do not determine|does not converge"):
             fit(flat(rng, 800) + rng.normal(0, SIGMA, (800, 3)))
         refused += 1
     assert refused == 8
@@ -305,7 +306,7 @@ def test_clean_points_are_all_kept_noisy_or_exact():
     points = cap(rng, 20000, radius=25, half_angle=1.0)
     # 20000 normal residuals: 0.01 expected beyond 5 standard deviations.
     assert fit_robustly(fit_sphere, points + rng.normal(0, SIGMA, points.shape)).rejected == 0
-    assert fit_robustly(fit_sphere, points + [0, 0, 500]).rejected == 0
+    assert fit_robustly(fit_sphere, points + np.array([0, 0, 500])).rejected == 0
 
 
 def test_the_limit_follows_k():

@@ -85,15 +85,15 @@ def test_strays_are_left_out_and_counted():
 
 
 def test_only_stripes_on_the_plate_count():
-    full = stripe_points()
-    half = stripe_points(extent=EXTENT[EXTENT[:, 1] <= 0], margin_mm=0.0)
-    wider = stripe_points(extent=EXTENT[EXTENT[:, 1] <= 0], margin_mm=10.0)
+    full = stripe_points(margin_mm=10.0)
+    half = stripe_points(extent=EXTENT[EXTENT[:, 0] <= 0], margin_mm=0.0)
+    wider = stripe_points(extent=EXTENT[EXTENT[:, 0] <= 0], margin_mm=10.0)
     assert 0.3 < len(half.points_mm) / len(full.points_mm) < 0.7
     assert len(half.points_mm) < len(wider.points_mm) < len(full.points_mm)
     _, poses, _ = stage_images(SENSOR, positions=POSITIONS)
     local = np.einsum("nij,ni->nj", poses[half.image, :3, :3], half.points_mm - poses[half.image, :3, 3])
-    assert local[:, 1].max() <= 1e-9
-    assert local[:, 1].max() > -0.5
+    assert local[:, 0].max() <= 1e-9
+    assert local[:, 0].max() > -0.5
     np.testing.assert_allclose(local[:, 2], 0, atol=1e-9)
     with pytest.raises(CalibrationError, match="none of the stripes"):
         stripe_points(extent=EXTENT + 1000.0)
@@ -103,6 +103,7 @@ def test_undetermined_sheets_are_refused():
     rng = np.random.default_rng(3)
     for noise in (0.0, 0.15):
         single = stripe_points(positions=np.array([50.0]), noise_px=noise, rng=rng).points_mm
+        # Noise moves the points within the target's plane, which they would all lie on.
         with pytest.raises(CalibrationError, match="one line|reach only"):
             fit_sheet(single, nominal_normal=LASER.normal)
     points = stripe_points().points_mm
@@ -121,7 +122,7 @@ def test_pixels_and_poses_must_be_finite():
     with pytest.raises(RangeError, match="finite"):
         points_on_target(CAMERA, [s * np.nan for s in stripes], poses, extent_mm=EXTENT)
     with pytest.raises(CalibrationError, match="pose"):
-        points_on_target(CAMERA, stripes, poses * np.inf, extent_mm=EXTENT)
+        points_on_target(CAMERA, stripes, np.full_like(poses, np.nan), extent_mm=EXTENT)
 
 
 def test_the_object_frame_belongs_to_the_sheet():

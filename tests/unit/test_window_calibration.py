@@ -1,11 +1,15 @@
 """The window's distance from step images: exact against Fermat's principle, honest scatter, refusals."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 
 from tests.unit.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
 from uwlts.calibration.model import WindowModel, nominal_calibration
-from uwlts.calibration.window import label_step, solve_window, step_profile as reconstructed
+from uwlts.calibration.window import label_step, solve_window
+from uwlts.calibration.window import step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.metrology.treads import Tread
 
@@ -15,6 +19,11 @@ DISTANCE = SENSOR.camera.window.distance_mm
 NORMAL = tuple(SENSOR.camera.window.normal())
 PLATE = WindowModel(refractions=2, distance_mm=62.8, normal=NORMAL, thickness_mm=5.93, glass_index=1.52)
 INTERFACE = WindowModel(refractions=1, distance_mm=62.8, normal=NORMAL)
+
+
+@cache
+def clean_steps(window):
+    return steps(window)
 
 
 def steps(window, profiles=None, *, noise_px=0.0, rng=None, index=WATER, height_mm=STEP_MM):
@@ -28,7 +37,7 @@ def steps(window, profiles=None, *, noise_px=0.0, rng=None, index=WATER, height_
 
 @pytest.mark.parametrize("window", [PLATE, INTERFACE])
 def test_exact_steps_give_the_exact_distance(window):
-    solution = solve_window(AIR, window, steps(window))
+    solution = solve_window(AIR, window, clean_steps(window))
     # Rays are rounded at 1e-13, heights at 1e-12 mm, and 1 mm of distance changes a height by 0.02 mm.
     assert solution.model.distance_mm == pytest.approx(DISTANCE, abs=1e-6)
     assert solution.model == window.model_copy(update={"distance_mm": solution.model.distance_mm})
@@ -41,7 +50,7 @@ def test_exact_steps_give_the_exact_distance(window):
 
 
 def test_labels_keep_to_their_treads():
-    for step, profile in zip(steps(PLATE), nine_steps(), strict=True):
+    for step, profile in zip(clean_steps(PLATE), nine_steps(), strict=True):
         assert min(np.count_nonzero(step.labels == tread) for tread in (Tread.LOWER, Tread.UPPER)) > 100
         points = reconstructed(
             AIR, PLATE.model_copy(update={"distance_mm": DISTANCE}), step.pixels, medium_index=step.medium_index
@@ -54,23 +63,23 @@ def test_labels_keep_to_their_treads():
 
 def test_nine_noisy_steps_scatter_as_reported():
     rng, found, reported, scatter = np.random.default_rng(4), [], [], []
-    profiles = nine_steps()
-    for _ in range(16):
-        solution = solve_window(AIR, PLATE, steps(PLATE, profiles, noise_px=0.15, rng=rng))
+    exact = steps(PLATE, nine_steps(count=427))
+    for _ in range(10):
+        noisy = [replace(s, pixels=s.pixels + rng.normal(0, (0.0, 0.15), s.pixels.shape)) for s in exact]
+        solution = solve_window(AIR, PLATE, noisy)
         found.append(solution.model.distance_mm - DISTANCE)
         reported.append(solution.std_mm)
         scatter.append(solution.scatter_std_mm)
-    # The standard deviation of 16 draws is good to 18 %: 3 std. So is that from 9 residuals, averaged over the draws.
+    # The standard deviation of 10 draws is good to 22 %, that from 9 residuals and 10 draws to 8 %; 3 std.
     rms, mean_reported = np.sqrt(np.mean(np.square(found))), np.sqrt(np.mean(np.square(reported)))
-    assert rms == pytest.approx(np.mean(scatter), rel=0.55)
-    assert mean_reported == pytest.approx(np.mean(scatter), rel=0.55)
-    assert 0.01 < rms < 0.1
+    print(f"window distance from nine steps of 427 lines at 0.15 px: std {rms:.3f} mm")
+    assert rms == pytest.approx(np.mean(scatter), rel=0.67)
+    assert mean_reported == pytest.approx(np.mean(scatter), rel=0.24)
 
 
 def test_a_wrong_height_shifts_the_distance_as_told():
-    right = steps(PLATE)
-    solution = solve_window(AIR, PLATE, right)
-    wrong = solve_window(AIR, PLATE, steps(PLATE, height_mm=STEP_MM + 0.02))
+    solution = solve_window(AIR, PLATE, clean_steps(PLATE))
+    wrong = solve_window(AIR, PLATE, [replace(step, height_mm=STEP_MM + 0.02) for step in clean_steps(PLATE)])
     # The thesis's height uncertainty of 0.02 mm: nearly 1 mm of window distance, all but linear.
     shift = wrong.model.distance_mm - solution.model.distance_mm
     assert shift == pytest.approx(0.02 * solution.per_height, rel=0.02)
@@ -106,7 +115,7 @@ def test_a_step_lost_in_noise_is_refused():
 
 
 def test_the_bound_is_no_answer():
-    images = steps(PLATE)
+    images = clean_steps(PLATE)
     for bounds in ((50.0, 90.0), (20.0, 45.0)):
         with pytest.raises(CalibrationError, match="at the bound"):
             solve_window(AIR, PLATE, images, bounds_mm=bounds)
@@ -118,14 +127,14 @@ def test_the_bound_is_no_answer():
 
 
 def test_a_window_behind_the_step_is_not_tried():
-    solution = solve_window(AIR, PLATE, steps(PLATE), bounds_mm=(10.0, 600.0))
+    solution = solve_window(AIR, PLATE, clean_steps(PLATE), bounds_mm=(10.0, 600.0))
     assert np.isnan(solution.curve_mm[-1, 1])
     assert solution.bounds_mm[1] < 400
     assert solution.model.distance_mm == pytest.approx(DISTANCE, abs=1e-6)
 
 
 def test_an_image_that_fits_no_distance_has_none():
-    images = steps(PLATE)
+    images = clean_steps(PLATE)
     odd = label_step(AIR, PLATE, images[4].pixels, height_mm=STEP_MM + 4, medium_index=WATER)
     solution = solve_window(AIR, PLATE, [*images, *images, odd])
     assert np.isnan(solution.image_distances_mm[-1])
@@ -141,4 +150,4 @@ def test_unusable_steps_are_refused():
     with pytest.raises(RangeError, match="finite"):
         label_step(AIR, PLATE, good.pixels * np.nan, height_mm=STEP_MM, medium_index=WATER)
     with pytest.raises(CalibrationError, match="positive lengths"):
-        solve_window(AIR, PLATE, [type(good)(good.pixels, np.nan, WATER, good.labels)])
+        solve_window(AIR, PLATE, [replace(good, height_mm=np.nan)])

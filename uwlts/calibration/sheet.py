@@ -12,9 +12,11 @@ from uwlts.camera import directions
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.metrology.fits import fit_plane, fit_robustly
 
-# Spread of the points along the shorter direction of the sheet over their scatter across it: below, the scatter turns
-# the plane. A single stripe has a ratio of one.
+# Spread of the points along the shorter direction of the sheet over their scatter across it, and over their spread
+# along the longer one: below, the scatter turns the plane. A single stripe scatters within the target's plane, which
+# would pass for the sheet.
 _LEAST_SPREAD = 20.0
+_LEAST_SHAPE = 0.01
 # Strays are few; where more points leave the plane, there is none.
 _LARGEST_REJECTED = 0.2
 _LARGEST_TURN = np.radians(60)
@@ -130,11 +132,12 @@ def fit_sheet(points_mm: np.ndarray, *, nominal_normal: np.ndarray) -> SheetSolu
     except EvaluationError as error:
         raise CalibrationError(f"no laser sheet through the stripe points: {error}") from error
     plane, used = robust.fit, robust.inliers
-    spread = np.sqrt(np.mean(((points_mm[used] - plane.point_mm) @ plane.axes[1]) ** 2))
-    if spread < _LEAST_SPREAD * plane.std_mm:
+    longer, shorter = np.sqrt(np.mean(((points_mm[used] - plane.point_mm) @ plane.axes.T) ** 2, axis=0))
+    if shorter < max(_LEAST_SPREAD * plane.std_mm, _LEAST_SHAPE * longer):
         raise CalibrationError(
-            f"the stripe points reach only {spread:.3g} mm along the shorter side of the sheet and scatter by "
-            f"{plane.std_mm:.3g} mm across it: move the target further between the images"
+            f"the stripe points reach only {shorter:.3g} mm (rms) along the shorter side of the sheet, against "
+            f"{longer:.3g} mm along the longer one and a scatter of {plane.std_mm:.3g} mm: move the target further "
+            f"between the images"
         )
     if robust.rejected_share > _LARGEST_REJECTED:
         raise CalibrationError(

@@ -12,7 +12,7 @@ from uwlts.errors import CalibrationError
 from uwlts.metrology.treads import Tread, label_treads, step_height_of_profile
 from uwlts.reconstruction import points_on_sheet
 
-_CURVE_POINTS = 41
+_CURVE_POINTS = 31
 _SEARCHED = (0.2, 2.5)
 # Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
 _LEAST_CHANGE = 10.0
@@ -154,7 +154,7 @@ def solve_window(
         raise CalibrationError(f"the heights of the steps must be positive lengths in mm, not {true.tolist()}")
 
     def heights(distance: float) -> np.ndarray:
-        return np.array([_height(calibration, window, step, distance)[0] for step in steps])
+        return _heights(calibration, window, steps, distance)[:, 0]
 
     tried = np.linspace(low, high, _CURVE_POINTS)
     scanned = np.array([heights(distance) for distance in tried])
@@ -169,17 +169,17 @@ def solve_window(
     low, high = tried[usable][0], tried[usable][-1]
     best = least_squares(
         lambda d: heights(d[0]) - true, [np.clip(tried[np.nanargmin(mean_error)], *_inside(low, high))],
-        bounds=(low, high), jac="3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14, x_scale=high - low,
+        bounds=(low, high), xtol=1e-12, ftol=1e-12, gtol=1e-14, x_scale=high - low,
     )  # fmt: skip
     distance, slopes = float(best.x[0]), best.jac[:, 0]
-    measured = np.array([_height(calibration, window, step, distance) for step in steps])
-    errors, height_std = measured[:, 0] - true, measured[:, 1]
-    _refuse(distance, low, high, slopes, height_std)
+    measured, height_std = _heights(calibration, window, steps, distance).T
+    errors = measured - true
+    _refuse(distance, low, high, np.ptp(scanned[usable], axis=0), height_std)
     squares = float(slopes @ slopes)
     freedom = len(steps) - 1
     return WindowSolution(
         model=window.model_copy(update={"distance_mm": distance}),
-        heights_mm=measured[:, 0],
+        heights_mm=measured,
         errors_mm=errors,
         height_std_mm=height_std,
         slopes=slopes,
@@ -202,21 +202,31 @@ def _inside(low: float, high: float) -> tuple[float, float]:
     return low + margin, high - margin
 
 
-def _height(
-    calibration: Calibration, window: WindowModel, step: StepImage, distance: float
-) -> tuple[float, float]:
-    """Height of the step and its standard deviation in mm; NaN where a point of a tread has no reconstruction."""
+def _heights(
+    calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float
+) -> np.ndarray:
+    """Height of the step in every image and its standard deviation, mm: (S, 2).
+
+    NaN where a point of a tread has no reconstruction.
+    """
     at_distance = window.model_copy(update={"distance_mm": float(distance)})
-    on_treads = step.labels != Tread.NEITHER
-    points = step_profile(calibration, at_distance, step.pixels[on_treads], medium_index=step.medium_index)
-    if not np.isfinite(points).all():
-        return np.nan, np.nan
-    height = step_height_of_profile(points, step.labels[on_treads], reference=step.reference)
-    return height.height_mm, height.std_mm
+    heights = np.full((len(steps), 2), np.nan)
+    for index in {step.medium_index for step in steps}:
+        here = [number for number, step in enumerate(steps) if step.medium_index == index]
+        treads = [steps[number].labels != Tread.NEITHER for number in here]
+        pixels = np.vstack([steps[number].pixels[on_it] for number, on_it in zip(here, treads, strict=True)])
+        points = step_profile(calibration, at_distance, pixels, medium_index=index)
+        ends = np.cumsum([np.count_nonzero(on_it) for on_it in treads])
+        for number, on_it, profile in zip(here, treads, np.split(points, ends[:-1]), strict=True):
+            if np.isfinite(profile).all():
+                step = steps[number]
+                height = step_height_of_profile(profile, step.labels[on_it], reference=step.reference)
+                heights[number] = height.height_mm, height.std_mm
+    return heights
 
 
-def _refuse(distance: float, low: float, high: float, slopes: np.ndarray, height_std: np.ndarray) -> None:
-    change = float(np.sqrt(np.mean(slopes**2))) * (high - low)
+def _refuse(distance: float, low: float, high: float, changes: np.ndarray, height_std: np.ndarray) -> None:
+    change = float(np.sqrt(np.mean(changes**2)))
     scatter = float(np.sqrt(np.mean(height_std**2)))
     if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
         raise CalibrationError(
@@ -245,8 +255,8 @@ def _own_distance(
     if not len(changes):
         return float("nan")
     left = changes[np.argmin(np.abs(tried[changes] - near))]
-    return float(
-        brentq(
-            lambda d: _height(calibration, window, step, d)[0] - step.height_mm, tried[left], tried[left + 1], xtol=1e-9
-        )
-    )
+
+    def error(distance: float) -> float:
+        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.height_mm
+
+    return float(brentq(error, tried[left], tried[left + 1], xtol=1e-7))

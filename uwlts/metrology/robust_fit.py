@@ -68,9 +68,10 @@ class RobustFit(Generic[FitT]):
 def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = DEFAULT_K) -> RobustFit[FitT]:
     """Fit, leave out the points that lie off by more than k robust standard deviations, and fit again.
 
-    A point is off by the difference of its signed distance from the median distance of all points; the robust
-    standard deviation is 1.4826 times the median of these differences' sizes (the median absolute deviation). A point that was left out comes back when a later fit passes within the limit; after 20 rounds points only leave,
-    so that the rounds end. The rule is for a few stray points on one surface, not for telling surfaces apart.
+    A point is off by the difference of its distance from the median distance of all points; the robust standard
+    deviation is 1.4826 times the median size of these differences (the median absolute deviation). A point that was
+    left out comes back when a later fit passes within the limit; after 20 rounds points only leave, so that the rounds
+    end. The rule is for a few stray points on one surface, not for telling surfaces apart.
 
     Parameters
     ----------

@@ -67,8 +67,8 @@ def find_sphere(
     points found there have the known radius within a tenth by themselves.
 
     Points belong to the sphere when they lie within three limits of it (a limit is five robust standard deviations,
-    at most a tenth of the radius), except where two points and more than 10 % of those within a patch of about 0.12 radius lie
-    beyond one limit: there another surface, a wall or a stem, crosses the sphere.
+    at most a tenth of the radius), except where two points and more than 10 % of those within a patch of about 0.12
+    radius lie beyond one limit: there another surface, a wall or a stem, crosses the sphere.
 
     Parameters
     ----------

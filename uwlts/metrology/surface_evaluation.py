@@ -116,7 +116,7 @@ def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> 
     robust = fit_robustly(fit, points)
     if robust.rejected_share > _MOST_REJECTED:
         raise EvaluationError(
-            f"{robust.rejected} of {len(points)} points lie farther than {robust.limit_mm:.3g} mm from the best {kind}; "
+            f"{robust.rejected} of {len(points)} points lie more than {robust.limit_mm:.3g} mm off the best {kind}; "
             f"the cloud holds other surfaces, cut them off"
         )
     return robust

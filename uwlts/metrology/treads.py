@@ -115,7 +115,7 @@ def step_height_of_profile(
 def step_height_of_scan(
     points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
 ) -> StepHeight:
-    """Mean distance of one tread's points (N, 3), mm, to the plane through the other's; see `step_height_of_profile`."""
+    """The same in a whole scan (N, 3), mm: mean distance to the plane through the other tread's points."""
     return _step_height(points, labels, reference, fit_plane)
 
 

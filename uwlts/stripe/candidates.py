@@ -64,8 +64,7 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
     The median contrast of all blocks, most of which hold no stripe, divided by its value for unit Gaussian noise. A
     background cut off at black is met better this way than by the deviation of single pixels.
     """
-    inner = contrast[2:-2]
-    sample = inner.ravel()[:: max(1, inner.size // _NOISE_SAMPLES)]
+    sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)]
     if np.issubdtype(contrast.dtype, np.integer):
         # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.
         counts = np.bincount(sample)

@@ -12,39 +12,39 @@ import cv2
 import numpy as np
 
 from uwlts.stripe.lobe import Lobe
-from uwlts.stripe.result import StripeMethod
+from uwlts.stripe.result import FWHM_PER_SIGMA, StripeMethod
 
-_MASS_STEPS = 6
+_ITERATIONS = 6
+
+_LEAST_KERNEL = np.float32(1.0)
+"""Sigma of the narrowest weight, px. A narrower one rests on too few pixels: for a stripe of sigma 0.7 px the centre
+would err by 0.015 px with the pixel phase instead of 0.005."""
 
 
-def place_centre(method: StripeMethod, lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def place_centre(method: StripeMethod, lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
     """Centre and amplitude of each lobe.
-
-    Parameters
-    ----------
-    method : StripeMethod
-        Which of the methods below.
-    lobe : Lobe
-        M windows.
-    sigma : (M,) float32
-        Sigma of the stripe itself, px, the low-pass taken out.
 
     Returns
     -------
     centre : (M,) float32
         Position from the window's first pixel, px.
     amplitude : (M,) float32
-        Height of the best-fitting Gaussian of that sigma at the centre, grey levels.
+        Height of the best-fitting Gaussian of the lobe's sigma at the centre, grey levels.
     """
+    kernel = np.maximum(lobe.sigma, _LEAST_KERNEL)
     if method is StripeMethod.ZERO_CROSSING:
-        return _zero_crossing(lobe, sigma)
-    centre = _centre_of_mass(lobe) if method is StripeMethod.CENTRE_OF_MASS else _quadratic(lobe)
-    (zeroth,) = _gaussian_moments(lobe, centre, sigma, 0)
-    return centre, zeroth / (np.float32(math.sqrt(math.pi)) * sigma)
+        centre, under = _zero_crossing(lobe, kernel)
+    else:
+        centre = _centre_of_mass(lobe) if method is StripeMethod.CENTRE_OF_MASS else _quadratic(lobe)
+        (under,) = _gaussian_moments(lobe, centre, kernel, 0)
+    # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
+    sigma = np.maximum(lobe.sigma, np.float32(0.3))
+    joint = np.sqrt(sigma * sigma + kernel * kernel)
+    return centre, under * joint / (np.float32(math.sqrt(2.0 * math.pi)) * sigma * kernel)
 
 
 def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe.
+    """Zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe, and M0 there.
 
     With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative, at c, of the
     profile f smoothed with g. As wide as the stripe, the kernel is the matched filter: the zero is the least-squares
@@ -62,7 +62,7 @@ def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarra
     step -= np.float32(0.5) * step * step * step
     # The sum under the Gaussian at its top, from its value a step away.
     top = zeroth * (np.float32(1.0) + np.float32(0.25) * step**2)
-    return lobe.middle + sigma * step, top / (np.float32(math.sqrt(math.pi)) * sigma)
+    return lobe.middle + sigma * step, top
 
 
 def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest: int) -> list[np.ndarray]:
@@ -88,38 +88,50 @@ def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest
 def _centre_of_mass(lobe: Lobe) -> np.ndarray:
     """Centre of mass in a window symmetric about itself.
 
-    The window's half-width is the distance to the background flank. Pixels cut by its ends count in part and the
-    window follows the centre until both agree, so that nothing is cut off more on one side than on the other.
+    The window reaches 2.25 sigma to either side, pixels cut by its ends count in part, and it follows the centre until
+    both agree, so that nothing is cut off more on one side than on the other. A wider window would collect noise.
     """
-    x = np.arange(lobe.window.shape[0], dtype=np.float32)[:, None]
-    signal = lobe.window - (lobe.base + lobe.slope * (x - lobe.middle))
-    half = lobe.reach.astype(np.float32) + np.float32(0.5)
+    x, signal = _above_background(lobe, lobe.window)
+    half = np.float32(2.25) * np.maximum(lobe.sigma, _LEAST_KERNEL)
     centre = lobe.middle
-    for _ in range(_MASS_STEPS):
+    for _ in range(_ITERATIONS):
         u = x - centre
-        share = signal * np.clip(half + np.float32(0.5) - np.abs(u), 0.0, 1.0)
-        step = np.einsum("ij,ij->j", share, u) / np.maximum(share.sum(axis=0), np.float32(0.1) * lobe.height)
+        share = signal * _part_inside(u, half)
+        step = (share * u).sum(axis=0) / np.maximum(share.sum(axis=0), np.float32(0.1) * lobe.height)
         centre = centre + np.clip(step, -half, half)
     return centre
 
 
 def _quadratic(lobe: Lobe) -> np.ndarray:
-    """Vertex of the parabola fitted to the low-passed profile around its peak.
+    """Vertex of the parabola fitted by least squares to the low-passed profile around its peak.
 
-    Least squares over the whole pixels x = -q ... q around the midpoint of the half-height crossings, q being about
-    half of the full width at half maximum: f = a0 + a1 x + a2 x^2 has a1 = S(x f) / S(x^2) and
-    a2 = S((x^2 - m) f) / S((x^2 - m)^2) with m the mean of x^2; the vertex lies at -a1 / (2 a2).
+    The fit takes the pixels within the half-height width, those cut by its ends in part, and is repeated about its own
+    vertex, for a Gaussian is no parabola and pixels that reach further on one side would pull. With Sk = sum w u^k and
+    Tk = sum w f u^k, the normal equations of f = a0 + a1 u + a2 u^2 are solved for a1 and a2; the vertex is
+    -a1 / (2 a2).
     """
-    rows = np.arange(lobe.smooth.shape[0])[:, None]
-    near = np.rint(lobe.middle).astype(np.intp)
-    q = np.maximum(1, np.rint(1.1 * lobe.sigma)).astype(np.intp)
-    x = rows - near
-    inside = np.abs(x) <= q
-    count = 2 * q + 1
-    squares = q * (q + 1) * (2 * q + 1) / 3.0
-    fourths = squares * (3 * q * (q + 1) - 1) / 5.0
-    signal = np.where(inside, lobe.smooth - (lobe.base + lobe.slope * (rows - lobe.middle)), 0.0)
-    first, second = (signal * x).sum(axis=0), (signal * (x * x - squares / count)).sum(axis=0)
-    a1, a2 = first / squares, second / (fourths - squares**2 / count)
-    step = -a1 / np.minimum(2.0 * a2, -1e-9)
-    return (near + np.clip(step, -q, q)).astype(np.float32)
+    x, signal = _above_background(lobe, lobe.smooth)
+    half = np.float32(0.5 * FWHM_PER_SIGMA) * np.maximum(lobe.sigma, _LEAST_KERNEL)
+    centre = lobe.middle
+    for _ in range(_ITERATIONS):
+        u = x - centre
+        w = _part_inside(u, half)
+        s0, s1, s2, s3, s4 = ((w * u**k).sum(axis=0) for k in range(5))
+        t0, t1, t2 = ((w * signal * u**k).sum(axis=0) for k in range(3))
+        # Cramer's rule for a1 and a2; their common denominator drops out of the vertex.
+        a1 = t1 * (s0 * s4 - s2 * s2) - t0 * (s1 * s4 - s2 * s3) - t2 * (s0 * s3 - s1 * s2)
+        a2 = t2 * (s0 * s2 - s1 * s1) - t1 * (s0 * s3 - s1 * s2) + t0 * (s1 * s3 - s2 * s2)
+        step = -a1 / np.minimum(np.float32(2.0) * a2, np.float32(-1e-6) * np.abs(a1) - np.float32(1e-20))
+        centre = centre + np.clip(step, -half, half)
+    return centre
+
+
+def _above_background(lobe: Lobe, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(W, 1) row numbers and (W, M) values above the line through the two flanks."""
+    x = np.arange(values.shape[0], dtype=np.float32)[:, None]
+    return x, values - (lobe.base + lobe.slope * (x - lobe.middle))
+
+
+def _part_inside(u: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Share of each pixel, u from the centre, that lies within `half` of it."""
+    return np.clip(half + np.float32(0.5) - np.abs(u), 0.0, 1.0)

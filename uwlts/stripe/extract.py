@@ -41,9 +41,6 @@ _SEARCHED_BLOCKS = np.array([[-2], [-1], [0], [1], [2]])
 # NumPy compares with its own integers several times as fast as with an enumeration.
 _OK, _NO_STRIPE, _AMBIGUOUS, _BORDER, _SATURATED = (np.uint8(status) for status in StripeStatus)
 
-_LEAST_KERNEL = 0.6
-"""Sigma of the narrowest weight, px; a narrower one would see too few pixels."""
-
 
 def extract_stripe(
     image: np.ndarray,
@@ -78,11 +75,11 @@ def extract_stripe(
     ------
     ImageError
         If the image, the background, `stripe_along` or `saturation` is not as described, or the lines are shorter
-        than the search window.
+        than two search windows, too short to tell stripe from background.
     """
     half, block = options.half_window_px, options.half_window_px // 2
     check_image(image, name="image")
-    check_length(image, stripe_along=stripe_along, least=2 * half + 1)
+    check_length(image, stripe_along=stripe_along, least=4 * half)
     clip = saturation_of(image, saturation)
 
     signal = image if background is None else subtract_background(image, background)
@@ -98,8 +95,7 @@ def extract_stripe(
     if none.any():
         if signal is not image:
             _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
-        clipped = low >= clip
-        found.status[none & (clipped[1:] & clipped[:-1]).any(axis=0)] = _SATURATED
+        found.status[none & (low >= clip).any(axis=0)] = _SATURATED
     return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
 
 
@@ -135,11 +131,12 @@ def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: S
     found = _Lines.empty(board.shape[1])
     coarse = coarse_threshold(noise, block=block, floor=options.threshold_floor)
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
+    share = options.ambiguous_ratio * _COARSE_SLACK
     lines = np.arange(board.shape[1])
     least = np.full(lines.size, coarse)
 
     for _ in range(_LOOKS):
-        lines, least, chosen, there = _next_blocks(board, lines, least, options.peak)
+        lines, least, chosen, there = _next_blocks(board, lines, least, options.peak, share)
         if lines.size == 0:
             break
         lobe = _look_centred(profiles, lines, (chosen - 2) * block, fine, options)
@@ -157,7 +154,7 @@ def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: S
         if not stripe.all():
             board[chosen[~stripe], lines[~stripe]] = 0
         board.ravel()[(chosen[stripe] + _SEARCHED_BLOCKS) * board.shape[1] + lines[stripe]] = 0
-        least = np.where(new, np.maximum(coarse, there * (options.ambiguous_ratio * _COARSE_SLACK)), least)
+        least = np.where(new, np.maximum(coarse, there * share), least)
         status = found.status[lines]
         unsettled = status == _NO_STRIPE
         if options.peak is PeakRule.STRONGEST:
@@ -167,9 +164,12 @@ def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: S
 
 
 def _next_blocks(
-    board: np.ndarray, lines: np.ndarray, least: np.ndarray, rule: PeakRule
+    board: np.ndarray, lines: np.ndarray, least: np.ndarray, rule: PeakRule, share: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The lines on which a block reaches `least`, their `least`, the block the rule names and its contrast."""
+    """The lines on which a block reaches `least`, their `least`, the block the rule names and its contrast.
+
+    First and last are taken among the blocks with at least `share` of the highest contrast on their line.
+    """
     columns = board if lines.size == board.shape[1] else board[:, lines]
     highest = columns.max(axis=0)
     stands_out = highest >= least
@@ -179,7 +179,7 @@ def _next_blocks(
     if not stands_out.all():
         lines, least, highest = lines[stands_out], least[stands_out], highest[stands_out]
         columns = columns[:, stands_out]
-    wanted = columns == highest if rule is PeakRule.STRONGEST else columns >= least
+    wanted = columns == highest if rule is PeakRule.STRONGEST else columns >= np.maximum(least, share * highest)
     chosen = first_true(wanted) if rule is not PeakRule.LAST else last_true(wanted)
     there = highest if rule is PeakRule.STRONGEST else columns[chosen, np.arange(lines.size)]
     return lines, least, chosen, there.astype(np.float32)
@@ -227,7 +227,7 @@ def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, op
     if not which.any():
         return
     lines, lobe = lines[which], lobe.keep(which)
-    centre, amplitude = place_centre(options.method, lobe, np.maximum(lobe.sigma, np.float32(_LEAST_KERNEL)))
+    centre, amplitude = place_centre(options.method, lobe)
     found.centre[lines] = lobe.start + centre.astype(np.float64)
     found.amplitude[lines] = amplitude
     found.width[lines] = lobe.sigma * np.float32(FWHM_PER_SIGMA)

@@ -11,6 +11,9 @@ from uwlts.errors import ImageError
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 
+_LONGEST_SIDE = 32766
+"""OpenCV's remap addresses pixels with 16 bits."""
+
 
 def check_image(image: np.ndarray, *, name: str) -> None:
     """Refuse what is not a two-dimensional, finite uint8, uint16 or float32 array.
@@ -33,9 +36,11 @@ def check_image(image: np.ndarray, *, name: str) -> None:
 
 
 def check_length(image: np.ndarray, *, stripe_along: str, least: int) -> None:
-    """Refuse an unknown orientation and lines shorter than the search needs, with an `ImageError`."""
+    """Refuse an unknown orientation, lines shorter than the search needs and images OpenCV cannot address, with an `ImageError`."""
     if stripe_along not in ("height", "width"):
         raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
+    if max(image.shape) > _LONGEST_SIDE:
+        raise ImageError(f"the image is {image.shape}; each side may have at most {_LONGEST_SIDE} pixels: crop it")
     length = image.shape[1] if stripe_along == "height" else image.shape[0]
     if length < least:
         raise ImageError(

@@ -36,7 +36,7 @@ class StripeStatus(IntEnum):
     NO_STRIPE = 1
     """Nothing on the line rises above the threshold, or only things too narrow or too wide for a stripe."""
     AMBIGUOUS = 2
-    """A second stripe of comparable strength (rule ``strongest``), or two stripes within one window."""
+    """A second stripe of comparable strength; see `StripeOptions.ambiguous_ratio`."""
     BORDER = 3
     """The pixels needed around the centre run over the image border."""
     SATURATED = 4
@@ -55,7 +55,7 @@ class StripeOptions:
         Which of several stripes on a line counts.
     half_window_px : int
         Pixels on either side of the centre that may be used: stripe, tails and the background beside them. Stripes
-        up to this full width at half maximum are measured. At least 8.
+        whose full width at half maximum is at most this are measured. At least 8.
     smoothing_px : float
         Sigma of the Gaussian low-pass across the stripe, px, for detection, width and the quadratic fit. The other
         two methods place the centre on the unsmoothed profile.
@@ -69,9 +69,10 @@ class StripeOptions:
     min_fwhm_px : float
         Least full width at half maximum, px; narrower things are hot pixels.
     ambiguous_ratio : float
-        Under rule ``strongest``, a second stripe at least this share of the strongest makes the line ambiguous.
-        Stripes count as separate where the profile falls below half the height of the stronger between them. 1 or less
-        and more than 0.5.
+        Share of the strongest peak from which another one on the line counts as a stripe too. Under rule
+        ``strongest`` two such stripes make the line ambiguous; ``first`` and ``last`` choose among them, and the line
+        is ambiguous only if another reaches into the pixels used. Within one window peaks are separate only if the
+        profile falls below half height between them, and shares below one half count as one half.
 
     Raises
     ------
@@ -107,7 +108,7 @@ class StripeOptions:
         _demand("threshold_sigmas", self.threshold_sigmas, 1.0, 1e6)
         _demand("threshold_floor", self.threshold_floor, 0.0, 1e9)
         _demand("min_fwhm_px", self.min_fwhm_px, 0.0, self.half_window_px)
-        _demand("ambiguous_ratio", self.ambiguous_ratio, 0.5, 1.0)
+        _demand("ambiguous_ratio", self.ambiguous_ratio, 0.05, 1.0)
 
 
 def _demand(name: str, value: float, low: float, high: float) -> None:

@@ -14,12 +14,16 @@ PASSES = 2
 # small blob half the minor semi-axis is all there is before the opposite edge is felt.
 REACH_PX = 2.5
 
-# Largest rms distance of the edge from its ellipse: absolute, as a share of the mean radius, and against the median of
-# all blobs of the image, which all have about the same noise and blur.
+# Largest rms distance of the edge from its ellipse: absolute, as a share of the mean radius, against what the noise of a
+# single pixel does to an edge, and against the median of all blobs of the image, which have about the same noise and blur.
 MAX_RESIDUAL_PX = 0.15
 MAX_RESIDUAL_OVER_RADIUS = 0.01
+MAX_RESIDUAL_OVER_NOISE = 1.5
 MAX_RESIDUAL_OVER_MEDIAN = 2.5
 RESIDUAL_FLOOR_PX = 0.03
+
+# Slope over contrast, 1/px, of the edge under a blur of 4 px: a softer edge is not one to measure on.
+MIN_SHARPNESS = 0.1
 
 # Largest departure of one profile's contrast from the smooth course around the blob.
 MAX_CONTRAST_DEPARTURE = 0.2
@@ -64,8 +68,8 @@ def fit_ellipses(image, blobs):
     """Fit ellipses to the edges of blobs and keep those that are ellipses.
 
     The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
-    ellipse. Both levels follow a constant and first harmonic around the blob, so that shading does not shift the
-    centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
+    ellipse. Both levels follow a constant, a first harmonic (shading) and a second one (blur over the ends of a
+    narrow ellipse) around the blob. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
     least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the plate's edge show a large residual or
     an uneven contrast and are left out; nothing is downweighted.
 
@@ -95,7 +99,9 @@ def fit_ellipses(image, blobs):
         return Ellipses(np.empty((0, 2)), np.empty((0, 2, 2)), empty, empty, empty, blobs.bright)
     found = Ellipses(centres, shapes, residual, edge.contrast, edge.sharpness, blobs.bright)[kept]
     radii = np.sqrt(np.linalg.det(found.shapes))
-    round_enough = found.residual_px <= np.maximum(MAX_RESIDUAL_PX, MAX_RESIDUAL_OVER_RADIUS * radii)
+    from_noise = noise / (found.contrast * np.maximum(found.sharpness, MIN_SHARPNESS))
+    limit = np.maximum(MAX_RESIDUAL_PX, MAX_RESIDUAL_OVER_RADIUS * radii)
+    round_enough = found.residual_px <= np.maximum(limit, MAX_RESIDUAL_OVER_NOISE * from_noise)
     if round_enough.any():
         usual = np.median(found.residual_px[round_enough])
         round_enough &= found.residual_px <= max(RESIDUAL_FLOOR_PX, MAX_RESIDUAL_OVER_MEDIAN * usual)
@@ -132,7 +138,8 @@ def _edges(grey, centres, shapes, *, bright, noise):
     if not bright:
         profiles = -profiles
     inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
-    harmonics = np.stack([np.ones(PROFILES), *directions.T], 1)
+    x, y = directions.T
+    harmonics = np.stack([np.ones(PROFILES), x, y, x * x - y * y, 2 * x * y], 1)
     smoother = harmonics @ np.linalg.pinv(harmonics)
     inner_level, outer_level = inner @ smoother, outer @ smoother
     contrast = inner_level - outer_level

@@ -1,0 +1,194 @@
+"""Finds what the commands have left in a campaign's folder, and which file belongs to which."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.calibration.model import Calibration, read_calibration
+from uwlts.capture import Capture, CaptureHeader
+from uwlts.cloud import PointCloud, read_cloud
+from uwlts.errors import CaptureError
+from uwlts.report.judged import Judged, read_judged
+from uwlts.scan import calibration_digest
+from uwlts.sensor import Sensor
+from uwlts.truth import read_truth
+
+_EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"
+
+
+@dataclass(frozen=True, eq=False)
+class GatheredCapture:
+    """A capture of the campaign: its header, number of images and indices of those with the laser on."""
+
+    path: Path
+    header: CaptureHeader
+    images: int
+    laser_images: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the file without its suffix."""
+        return self.path.stem
+
+
+@dataclass(frozen=True, eq=False)
+class GatheredCalibration:
+    """A calibration of the campaign, with the digest by which clouds name it."""
+
+    name: str
+    calibration: Calibration
+    digest: str
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A cloud with everything that belongs to it; what the folder lacks is None, never all of it."""
+
+    name: str
+    cloud: PointCloud | None
+    judged: Judged | None
+    capture: GatheredCapture | None
+    calibration: GatheredCalibration | None
+
+    @property
+    def digest(self) -> str | None:
+        """Digest of the calibration with which the cloud was made, whether that calibration is at hand or not."""
+        if self.judged is not None and self.judged.calibration is not None:
+            return self.judged.calibration
+        found = None if self.cloud is None else self.cloud.metadata.get("calibration")
+        return found if isinstance(found, str) else None
+
+    @property
+    def known_as(self) -> tuple[str, ...]:
+        """Names under which published values may stand: the measurement's own, then its capture's."""
+        return (self.name,) if self.capture is None else (self.name, self.capture.name)
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """All files of a folder. ``true_sensors`` are those of the truth files, ``seconds`` the time of each stage."""
+
+    folder: Path
+    measurements: tuple[Measurement, ...]
+    calibrations: tuple[GatheredCalibration, ...]
+    captures: tuple[GatheredCapture, ...]
+    true_sensors: tuple[Sensor, ...]
+    seconds: dict[str, float]
+
+    @property
+    def main_digest(self) -> str | None:
+        """Digest of the calibration that most clouds were made with; of equally many the first calibration's."""
+        used = Counter(m.digest for m in self.measurements if m.digest is not None)
+        own = [calibration.digest for calibration in self.calibrations]
+        if not used:
+            return own[0] if own else None
+        return max(used, key=lambda digest: (used[digest], -own.index(digest) if digest in own else -len(own)))
+
+    @property
+    def main_calibration(self) -> GatheredCalibration | None:
+        """The calibration of `main_digest`; None where its file is not in the folder."""
+        return next((c for c in self.calibrations if c.digest == self.main_digest), None)
+
+    @property
+    def main_measurements(self) -> tuple[Measurement, ...]:
+        """Measurements made with the main calibration, or without word of any."""
+        return tuple(m for m in self.measurements if m.digest in (None, self.main_digest))
+
+    @property
+    def true_sensor(self) -> Sensor | None:
+        """The sensor behind its windows as it truly was; None without truth files, or where they disagree."""
+        mounted = [sensor for sensor in self.true_sensors if sensor.camera.window.mounted]
+        same = all((s.camera, s.laser) == (mounted[0].camera, mounted[0].laser) for s in mounted)
+        return mounted[0] if mounted and same else None
+
+
+def gather_campaign(folder: str | Path) -> Campaign:
+    """Read a campaign's folder.
+
+    Captures are ``NAME.h5`` with their truth ``NAME.truth.h5``, clouds ``NAME.ply``, evaluations
+    ``NAME.evaluation.json``, calibrations ``calibration*.json``, times ``seconds.json``. A cloud names its capture in
+    its metadata; otherwise the capture of the same name is taken.
+
+    Raises
+    ------
+    CaptureError
+        The folder is missing or holds nothing to report, or a file (named in the message) is damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise CaptureError(f"there is no folder {folder}; give the folder that holds the campaign's files")
+    captures = {path.name: _capture(path) for path in _files(folder, "*.h5", but=_TRUTH)}
+    calibrations = [_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)]
+    calibrations.sort(key=lambda found: (len(found.name), found.name))
+    clouds = {path.stem: read_cloud(path) for path in _files(folder, "*.ply")}
+    judged = {
+        path.name.removesuffix(_EVALUATION): read_judged(path) for path in _files(folder, f"*{_EVALUATION}")
+    }
+    if not (clouds or judged or calibrations):
+        raise CaptureError(
+            f"{folder} holds {len(captures)} captures, but no cloud (.ply), evaluation ({_EVALUATION}) or calibration "
+            "(calibration*.json): reconstruct and evaluate first"
+        )
+    by_digest = {calibration.digest: calibration for calibration in calibrations}
+    measurements = [
+        _measurement(name, clouds.get(name), judged.get(name), captures, by_digest) for name in sorted({*clouds, *judged})
+    ]
+    return Campaign(
+        folder=folder,
+        measurements=tuple(measurements),
+        calibrations=tuple(calibrations),
+        captures=tuple(captures.values()),
+        true_sensors=tuple(read_truth(path)[0].sensor for path in _files(folder, f"*{_TRUTH}")),
+        seconds=_seconds(folder / "seconds.json"),
+    )
+
+
+def _files(folder: Path, pattern: str, *, but: str | None = None) -> Iterator[Path]:
+    for path in sorted(folder.glob(pattern)):
+        # A hidden file is one that is still being written.
+        if path.is_file() and not path.name.startswith(".") and not (but and path.name.endswith(but)):
+            yield path
+
+
+def _capture(path: Path) -> GatheredCapture:
+    with Capture(path) as capture:
+        laser = tuple(np.flatnonzero(capture.laser_on).tolist())
+        return GatheredCapture(path, capture.header, len(capture), laser)
+
+
+def _calibration(path: Path) -> GatheredCalibration:
+    calibration = read_calibration(path)
+    return GatheredCalibration(path.stem, calibration, calibration_digest(calibration))
+
+
+def _measurement(
+    name: str,
+    cloud: PointCloud | None,
+    judged: Judged | None,
+    captures: dict[str, GatheredCapture],
+    calibrations: dict[str, GatheredCalibration],
+) -> Measurement:
+    recorded = None if cloud is None else cloud.metadata.get("capture")
+    capture = captures.get(recorded) if isinstance(recorded, str) else None
+    found = Measurement(name, cloud, judged, capture or captures.get(f"{name}.h5"), None)
+    return Measurement(name, cloud, judged, found.capture, calibrations.get(found.digest or ""))
+
+
+def _seconds(path: Path) -> dict[str, float]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"{path} cannot be read, or is truncated: {error}") from error
+    numbers = isinstance(content, dict) and all(
+        isinstance(value, int | float) and math.isfinite(value) and value >= 0 for value in content.values()
+    )
+    if not numbers:
+        raise CaptureError(f"{path} must hold the seconds of each stage by name: {{\"render\": 12.3, ...}}")
+    return {stage: float(value) for stage, value in content.items()}

@@ -1,0 +1,127 @@
+"""The campaign's key figures as plain JSON."""
+
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwlts.files import written_aside
+from uwlts.report.gather import Campaign, Measurement
+from uwlts.report.judged import TruthFigures
+from uwlts.report.published import CALIBRATION, Reference
+from uwlts.report.table import true_window_distance
+
+KEY_FIGURES = {
+    "sphere_spacing_error_mm": ("spheres", "SSE"),
+    "probing_error_mm": ("spheres", "PE"),
+    "std_mm": (None, "STD"),
+    "step_height_error_mm": ("step", "height error"),
+    "pipe_diameter_error_mm": ("pipe", "diameter error"),
+    "plane_range_error_mm": ("plane", "RE"),
+}
+"""Key figures by name: kind of the artefact (None: any), and the evaluation's figure, one for every pair of spheres."""
+
+
+def summary(campaign: Campaign, reference: Reference | None = None) -> dict[str, Any]:
+    """Key figures of a campaign; what was not measured is None or empty.
+
+    The figures at the top are those of the measurements made with the campaign's main calibration; others stand under
+    ``other_calibrations``. An error's ``mean_abs`` is the mean of its absolute values over the measurements, each of
+    which counts with its largest.
+    """
+    main = campaign.main_measurements
+    others: dict[str, list[Measurement]] = {}
+    for measurement in campaign.measurements:
+        if measurement not in main:
+            known = measurement.calibration
+            others.setdefault(known.name if known else str(measurement.digest), []).append(measurement)
+    calibration = campaign.main_calibration
+    return {
+        "campaign": campaign.folder.resolve().name,
+        "calibration": None if calibration is None else calibration.name,
+        **_key_figures(main),
+        "window_distance_mm": _window(campaign),
+        "truth": _truth(main),
+        "points": {
+            m.name: {
+                "total": m.judged.evaluation.points_total,
+                "used": m.judged.evaluation.points_used,
+                "rejected": m.judged.evaluation.points_rejected,
+            }
+            for m in campaign.measurements
+            if m.judged is not None and m.judged.evaluation is not None
+        },
+        "seconds": dict(campaign.seconds),
+        "other_calibrations": {name: _key_figures(found) | {"truth": _truth(found)} for name, found in others.items()},
+        "published": None if reference is None else _published(main, reference),
+    }
+
+
+def write_summary(
+    path: str | Path, campaign: Campaign, reference: Reference | None = None, *, overwrite: bool = False
+) -> None:
+    """Write the summary as indented JSON, whole or not at all; OutputError where that fails."""
+    text = json.dumps(summary(campaign, reference), indent=2, allow_nan=False)
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(text + "\n", encoding="utf-8")
+
+
+def _key_figures(measurements: Iterable[Measurement]) -> dict[str, Any]:
+    figures = {}
+    for key, (kind, figure) in KEY_FIGURES.items():
+        wanted, values = re.compile(rf"{figure}( \d+-\d+)?"), {}
+        for measurement in measurements:
+            evaluation = None if measurement.judged is None else measurement.judged.evaluation
+            if evaluation is None or kind not in (None, evaluation.kind):
+                continue
+            found = [value for name, value in evaluation.figures_mm.items() if wanted.fullmatch(name)]
+            if found:
+                values[measurement.name] = max(found, key=abs)
+        figures[key] = {"mean_abs": _mean_abs(values.values()), "by_measurement": values}
+    return figures
+
+
+def _mean_abs(values: Iterable[float]) -> float | None:
+    sizes = np.abs(list(values))
+    return float(sizes.mean()) if len(sizes) else None
+
+
+def _window(campaign: Campaign) -> dict[str, float | None]:
+    found = campaign.main_calibration
+    window = None if found is None else found.calibration.window
+    true = None if window is not None and window.refractions == 1 else true_window_distance(campaign)
+    return {"estimated": None if window is None else window.distance_mm, "true": true}
+
+
+def _truth(measurements: Iterable[Measurement]) -> dict[str, Any]:
+    """Comparisons with truth: over the points of all measurements, and of each."""
+    compared = {m.name: m.judged.truth for m in measurements if m.judged is not None and m.judged.truth is not None}
+    by_measurement = {name: truth.model_dump() for name, truth in compared.items()}
+    pooled: dict[str, float | None] = dict.fromkeys(("tolerance_mm", "share_within_tolerance", "rms_mm"))
+    all_of_them: list[TruthFigures] = list(compared.values())
+    if all_of_them and len({truth.tolerance_mm for truth in all_of_them}) == 1:
+        weight = [truth.matched for truth in all_of_them]
+        pooled = {
+            "tolerance_mm": all_of_them[0].tolerance_mm,
+            "share_within_tolerance": float(
+                np.average([truth.share_within_tolerance for truth in all_of_them], weights=weight)
+            ),
+            "rms_mm": float(np.sqrt(np.average([truth.rms_mm**2 for truth in all_of_them], weights=weight))),
+        }
+    return {**pooled, "by_measurement": by_measurement}
+
+
+def _published(measurements: Iterable[Measurement], reference: Reference) -> dict[str, Any]:
+    """Published key figures of the measurements made, by the names that the reference gives them."""
+    measurements = list(measurements)
+    result: dict[str, Any] = {"title": reference.title}
+    for key, (_, figure) in KEY_FIGURES.items():
+        values = {m.name: list(found) for m in measurements if (found := reference.values(m.known_as, figure))}
+        result[key] = {
+            "mean_abs": _mean_abs(value for several in values.values() for value in several), "by_measurement": values,
+        }  # fmt: skip
+    result["window_distance_mm"] = list(reference.values((CALIBRATION,), "window_distance_mm"))
+    return result
