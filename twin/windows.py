@@ -88,7 +88,7 @@ class WindowFaces:
             sample, transmitted = face.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
             weight *= dr.select(valid, transmitted[0], 0.0)
             if face is self._faces[1] and self._absorption > 0:
-                weight *= dr.exp(-self._absorption * si.t)
+                weight *= dr.exp(-self._absorption * (si.t + STEP_MM))
             onward = si.to_world(sample.wo)
             ray = mi.Ray3f(si.p + onward * STEP_MM, onward)
         return LightPath(ray.o, ray.d, weight, valid & (weight > 0))

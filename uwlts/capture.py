@@ -1,8 +1,9 @@
 """The capture file: images of a scan with everything known about them, written frame by frame.
 
-An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle), per frame
-``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, and JSON attributes for sensor, medium,
-target, artefact and provenance. Nothing in it is ever executed, and real and synthetic captures look the same.
+An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle, Fletcher-32
+checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, and attributes
+``format``, ``version`` and ``header``: JSON with sensor, medium, target, artefact and provenance. Nothing in it is ever
+executed, and real and synthetic captures look the same.
 
 While it is being recorded the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so
 an interrupted recording keeps all its complete frames; closing it gives it its name.
@@ -14,18 +15,24 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
 import hdf5plugin
 import numpy as np
+from pydantic import Field, field_validator
 
-from uwlts.errors import CaptureError, ImageError, OutputError
-from uwlts.sensor import Description, Medium, Sensor
+from uwlts.errors import CaptureError, ImageError, OutputError, UwltsError
+from uwlts.library import validated
+from uwlts.sensor import Description, Medium, Sensor, Vector
 
 FORMAT = "uwlts-capture"
 VERSION = 1
 _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
+# What h5py raises on a damaged file depends on where the damage is.
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+# Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
+_MARGIN_BYTES = 2**18
 
 
 class CaptureHeader(Description):
@@ -40,16 +47,23 @@ class CaptureHeader(Description):
     sensor: Sensor
     medium_name: str
     medium: Medium
-    stage_direction: tuple[float, float, float]
-    saturation_dn: int
+    stage_direction: Vector
+    saturation_dn: Annotated[int, Field(gt=0)]
     target: dict[str, Any] | None = None
     artefact: dict[str, Any] | None = None
     provenance: dict[str, Any] = {}
 
+    @field_validator("stage_direction")
+    @classmethod
+    def _unit(cls, value: Vector) -> Vector:
+        if not np.isclose(np.linalg.norm(value), 1, atol=1e-6):
+            raise ValueError(f"stage_direction {value} is not a unit vector")
+        return value
+
 
 @dataclass(frozen=True)
 class Frame:
-    """One image (H, W) with its stage position in mm, pose (4, 4) or NaN, light, exposure in ms and time in s."""
+    """One image (H, W) with its stage position in mm, light, exposure in ms, time in s, and pose (4, 4) if known."""
 
     image: np.ndarray
     stage_mm: float
@@ -64,11 +78,6 @@ def part_path(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
 
-def _storage_failed(path: Path, error: OSError) -> OutputError:
-    reason = os.strerror(error.errno) if error.errno else str(error)
-    return OutputError(f"cannot write {path}: {reason}; frames written so far are kept in {part_path(path).name}")
-
-
 class CaptureWriter:
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
@@ -77,7 +86,7 @@ class CaptureWriter:
     OutputError
         The file exists (give ``overwrite``), a part is left over (give ``resume`` or ``overwrite``), or storage fails.
     CaptureError
-        ``resume`` of a part that belongs to another recording.
+        ``resume`` of a part that is damaged or belongs to another recording.
     """
 
     def __init__(
@@ -85,76 +94,131 @@ class CaptureWriter:
     ):
         self.path, self.header = Path(path), header
         self._part = part_path(self.path)
+        camera = header.sensor.camera
+        self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
+        if self._dtype not in (np.uint8, np.uint16):
+            raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
+        if self.path.exists() and not self.path.is_file():
+            raise OutputError(f"{self.path} exists and is not a regular file; give another name")
         if self.path.exists() and not overwrite:
             raise OutputError(f"{self.path} exists already; give another name, or --overwrite to replace it")
         if not self.path.parent.is_dir():
             raise OutputError(f"the folder {self.path.parent} does not exist; create it first")
-        camera = header.sensor.camera
-        self._shape = (camera.height_px, camera.width_px)
+        if self._part.exists() and not (resume or overwrite):
+            raise OutputError(f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite")
         try:
-            if self._part.exists() and resume:
-                self._file = self._continue()
-            elif self._part.exists() and not overwrite:
-                raise OutputError(f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite")
+            if resume and self._part.exists():
+                with self._left_over() as unfinished:
+                    self._begin(unfinished)
             else:
-                self._file = self._create(self._part, np.dtype(dtype))
+                self._begin(None)
+            self._file = h5py.File(self._part, "r+", libver="latest")
             self._file.swmr_mode = True
-        except OSError as error:
-            raise _storage_failed(self.path, error) from error
+        except (OSError, RuntimeError) as error:
+            raise self._storage_failed(error) from error
 
-    def _create(self, path: Path, dtype: np.dtype) -> h5py.File:
-        file = h5py.File(path, "w", libver="latest")
-        file.attrs.update(format=FORMAT, version=VERSION, header=self.header.model_dump_json())
-        file.create_dataset(
-            "frames", (0, *self._shape), dtype, maxshape=(None, *self._shape), chunks=(1, *self._shape),
-            **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+    def _left_over(self) -> "Capture":
+        """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
+        try:
+            unfinished = Capture(self._part)
+        except CaptureError as error:
+            raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
+        same_header = unfinished.header.model_dump_json() == self.header.model_dump_json()
+        if not same_header or unfinished.dtype != self._dtype:
+            unfinished.close()
+            raise CaptureError(f"{self._part} belongs to another recording; give --overwrite to start afresh")
+        return unfinished
+
+    def _begin(self, unfinished: "Capture | None") -> None:
+        """Put a valid part in place, empty or with the complete frames of the one left over.
+
+        HDF5 cannot append to a killed writer's file, so a new one is made; it is made aside, so that a run that is
+        killed meanwhile leaves the old one.
+        """
+        fresh = self._part.with_suffix(".fresh")
+        try:
+            with h5py.File(fresh, "w", libver="latest") as self._file:
+                self._claim_space()
+                self._lay_out()
+                for index in range(len(unfinished) if unfinished else 0):
+                    self._store(unfinished.frame(index))
+            os.replace(fresh, self._part)
+        finally:
+            fresh.unlink(missing_ok=True)
+
+    def _lay_out(self) -> None:
+        self._file.attrs.update(format=FORMAT, version=VERSION, header=self.header.model_dump_json())
+        # The checksum finds damage that the compression would decode to a different picture.
+        self._file.create_dataset(
+            "frames", (0, *self._shape), self._dtype, maxshape=(None, *self._shape), chunks=(1, *self._shape),
+            fletcher32=True, **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
         )  # fmt: skip
         for name, shape in _PER_FRAME.items():
             kind = bool if name == "laser_on" else float
-            file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=(256, *shape))
-        return file
-
-    def _continue(self) -> h5py.File:
-        """A fresh part with the complete frames of the one left over (HDF5 cannot append to a killed writer's file)."""
-        with Capture(self._part) as unfinished:
-            if unfinished.header != self.header:
-                raise CaptureError(f"{self._part} belongs to another recording; give --overwrite to start afresh")
-            old, count = unfinished.file, len(unfinished)
-            aside = self._part.with_suffix(".resumed")
-            file = self._create(aside, old["frames"].dtype)
-            for name in _PER_FRAME:
-                file[name].resize(count, axis=0)
-                file[name][:] = old[name][:count]
-            file["frames"].resize(count, axis=0)
-            for index in range(count):
-                mask, chunk = old["frames"].id.read_direct_chunk((index, 0, 0))
-                file["frames"].id.write_direct_chunk((index, 0, 0), chunk, mask)
-        os.replace(aside, self._part)
-        return file
+            # No checksum here: a kill while 256 rows are rewritten would then lose them all, not only the last one.
+            self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=(256, *shape))
 
     def __len__(self) -> int:
         """Number of complete frames written."""
         return self._file["time_s"].shape[0]
 
     def append(self, frame: Frame) -> None:
-        """Store one frame; it is complete and safe on return."""
-        if frame.image.shape != self._shape or frame.image.dtype != self._file["frames"].dtype:
+        """Store one frame; once this returns, the frame survives the end of the program.
+
+        Raises
+        ------
+        ImageError
+            The image has another size or type than the capture.
+        CaptureError
+            Stage position, exposure, time or pose is not finite, or the pose is not (4, 4).
+        OutputError
+            Storage fails; the frames before are kept.
+        """
+        if frame.image.shape != self._shape or frame.image.dtype != self._dtype:
             raise ImageError(
-                f"frame is {frame.image.shape} {frame.image.dtype}, the capture holds {self._shape} "
-                f"{self._file['frames'].dtype}"
+                f"frame is {frame.image.shape} {frame.image.dtype}, the capture holds {self._shape} {self._dtype}"
             )
+        if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all():
+            raise CaptureError(
+                f"a frame at stage position {frame.stage_mm} mm, exposure {frame.exposure_ms} ms and time "
+                f"{frame.time_s} s cannot be stored: all three must be finite"
+            )
+        if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
+            raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
+        try:
+            self._store(frame)
+        except (OSError, RuntimeError) as error:
+            raise self._storage_failed(error) from error
+
+    def _store(self, frame: Frame) -> None:
+        self._claim_space()
         pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
         values = {"frames": frame.image, "stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
-        try:
-            for name, value in values.items():
-                dataset = self._file[name]
-                dataset.resize(count + 1, axis=0)
-                dataset[count] = value
-                dataset.flush()
-        except OSError as error:
-            raise _storage_failed(self.path, error) from error
+        for name, value in values.items():
+            dataset = self._file[name]
+            dataset.resize(count + 1, axis=0)
+            dataset[count] = value
+            dataset.flush()
+
+    def _claim_space(self) -> None:
+        """Make the file long enough for one more frame, by zeros behind what HDF5 uses; OSError where the disk is full.
+
+        HDF5 does not survive a full disk: closing the file fails and the process may crash.
+        """
+        frame_bytes = self._shape[0] * self._shape[1] * self._dtype.itemsize
+        wanted = self._file.id.get_filesize() + frame_bytes + _MARGIN_BYTES
+        with open(self._file.filename, "r+b", buffering=0) as file:
+            size = file.seek(0, os.SEEK_END)
+            while size < wanted:
+                size += file.write(bytes(wanted - size))
+
+    def _storage_failed(self, error: OSError | RuntimeError) -> OutputError:
+        number = getattr(error, "errno", None)
+        reason = os.strerror(number) if number else " ".join(str(error).split())
+        kept = f"; complete frames are kept in {self._part.name}" if self._part.exists() else ""
+        return OutputError(f"cannot write {self.path}: {reason}{kept}")
 
     def __enter__(self) -> "CaptureWriter":
         return self
@@ -163,13 +227,28 @@ class CaptureWriter:
         try:
             self._file.close()
             if kind is None:
+                # Opened and closed once more, HDF5 cuts off the space that was claimed and not used.
+                h5py.File(self._part, "r+").close()
                 os.replace(self._part, self.path)
-        except OSError as error:
-            raise _storage_failed(self.path, error) from error
+        except (OSError, RuntimeError) as error:
+            raise self._storage_failed(error) from error
 
 
 class Capture:
     """A capture opened for reading: per-frame arrays in memory, images read on demand.
+
+    A recording that is still going on can be read too; it has the frames that were complete when it was opened.
+
+    Attributes
+    ----------
+    header : CaptureHeader
+        What holds for all frames.
+    stage_mm, exposure_ms, time_s : (N,) float64
+        Stage position in mm, exposure in ms, time in s of every frame; finite.
+    laser_on : (N,) bool
+        Whether the laser was on, rather than the lamp.
+    pose : (N, 4, 4) float64
+        ``T_scene_object`` of the sensor's OCS; all NaN for a frame without one.
 
     Raises
     ------
@@ -183,40 +262,62 @@ class Capture:
             raise CaptureError(f"no capture at {self.path}")
         try:
             self.file = h5py.File(self.path, "r", swmr=True, libver="latest")
-        except OSError as error:
-            raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 cannot open it") from error
+        except _DAMAGE as error:
+            raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 cannot open it ({error})") from error
         try:
             self._read_header()
+            self._read_frames()
+        except _DAMAGE as error:
+            self.file.close()
+            raise CaptureError(f"{self.path} is damaged: {error}") from error
         except BaseException:
             self.file.close()
             raise
 
     def _read_header(self) -> None:
-        attributes = self.file.attrs
-        found = attributes.get("format")
-        if found != FORMAT:
+        found, version = (self.file.attrs.get(name) for name in ("format", "version"))
+        if not isinstance(found, str) or found != FORMAT:
             raise CaptureError(f"{self.path} is HDF5 but not a capture: format is {found!r}, expected '{FORMAT}'")
-        if attributes["version"] > VERSION:
-            raise CaptureError(
-                f"{self.path} has version {attributes['version']}; this program reads up to {VERSION}: update it"
-            )
+        if not isinstance(version, int | np.integer) or version < 1:
+            raise CaptureError(f"{self.path} is damaged: version is {version!r}, expected a whole number from 1")
+        if version > VERSION:
+            raise CaptureError(f"{self.path} has version {version}; this program reads up to {VERSION}: update it")
         try:
-            self.header = CaptureHeader.model_validate(json.loads(attributes["header"]))
-            counts = [self.file[name].shape[0] for name in ("frames", *_PER_FRAME)]
-            self._count = min(counts)
-            self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
-                self.file[name][: self._count] for name in _PER_FRAME
-            )
-        except (KeyError, ValueError, OSError) as error:
-            raise CaptureError(f"{self.path} is damaged: {error}") from error
+            self.header = validated(CaptureHeader, json.loads(self.file.attrs["header"]), f"the header of {self.path}")
+        except UwltsError as error:
+            raise CaptureError(str(error)) from error
+
+    def _read_frames(self) -> None:
         camera = self.header.sensor.camera
-        if self.file["frames"].shape[1:] != (camera.height_px, camera.width_px):
+        images = self._dataset("frames", (camera.height_px, camera.width_px), "u")
+        if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
+            raise CaptureError(f"{self.path} is damaged: frames are {images.dtype}, stored in chunks of {images.chunks}")
+        columns = {name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()}
+        self.dtype = images.dtype
+        self._count = min(len(images), *map(len, columns.values()))
+        # HDF5 shows chunks that were never stored as zeros.
+        if images.id.get_num_chunks() < self._count:
+            raise CaptureError(f"{self.path} is damaged: it holds {images.id.get_num_chunks()} of {self._count} images")
+        self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
+            dataset[: self._count] for dataset in columns.values()
+        )
+        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
+            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
+        finite = np.isfinite(self.pose).reshape(self._count, 16)
+        if (finite.any(axis=1) != finite.all(axis=1)).any():
+            raise CaptureError(f"{self.path} holds poses of which only some elements are known")
+
+    def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
+        """A dataset with one row of a shape per frame; CaptureError where it is something else."""
+        dataset = self.file.get(name)
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim == 0:
+            raise CaptureError(f"{self.path} is damaged: it has no '{name}' for every frame")
+        if dataset.shape[1:] != shape or dataset.dtype.kind != kind:
             raise CaptureError(
-                f"{self.path} holds images of {self.file['frames'].shape[1:]} rows and columns, its sensor has "
-                f"{(camera.height_px, camera.width_px)}"
+                f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, expected "
+                f"{shape} of kind '{kind}'"
             )
-        if not (np.isfinite(self.stage_mm).all() and np.isfinite(self.exposure_ms).all()):
-            raise CaptureError(f"{self.path} holds stage positions or exposures that are not finite")
+        return dataset
 
     def __len__(self) -> int:
         return self._count
@@ -232,8 +333,16 @@ class Capture:
             raise IndexError(f"frame {index} of {self._count}")
         try:
             return self.file["frames"][index]
-        except OSError as error:
-            raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged") from error
+        except _DAMAGE as error:
+            raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
+
+    def frame(self, index: int) -> Frame:
+        """A frame with everything known about it; raises CaptureError where its data are damaged."""
+        pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
+        return Frame(
+            image=self.image(index), stage_mm=float(self.stage_mm[index]), laser_on=bool(self.laser_on[index]),
+            exposure_ms=float(self.exposure_ms[index]), time_s=float(self.time_s[index]), pose=pose,
+        )  # fmt: skip
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
         """Index and image of all frames, or only of those with the laser on or off."""

@@ -107,6 +107,34 @@ def calibrate(
 
 
 @app.command
+def nominal(sensor: str, *, medium: str, out: Path, overwrite: Flag = False) -> None:
+    """Write the calibration that a sensor would have if it were built exactly as described.
+
+    Example: uwlts nominal thesis --medium water --out nominal.json
+
+    Parameters
+    ----------
+    sensor
+        Name or path of a sensor description.
+    medium
+        One of the sensor's media; the laser's window may turn the sheet in it.
+    out
+        Calibration file to write.
+    overwrite
+        Replace an existing file.
+    """
+    from uwlts.calibration.model import write_calibration
+    from uwlts.calibration.nominal import nominal_calibration
+    from uwlts.library import load_sensor
+
+    described = load_sensor(sensor)
+    if medium not in described.media:
+        raise DescriptionError(f"the sensor '{described.name}' knows the media {', '.join(described.media)}, not '{medium}'")
+    write_calibration(out, nominal_calibration(described, described.media[medium]), overwrite=overwrite)
+    print(f"wrote {out}")
+
+
+@app.command
 def reconstruct(
     capture: Path,
     *,

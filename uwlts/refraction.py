@@ -91,7 +91,7 @@ def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tupl
 
 
 def window_normal(window: WindowModel) -> np.ndarray:
-    """Unit normal (3,) of a window, along the light of a camera ray; RangeError where the camera looks along the glass."""
+    """Unit normal (3,) of a window, along a camera ray; RangeError where the camera looks along the glass."""
     normal = np.array(window.normal)
     length = np.linalg.norm(normal)
     if not abs(normal[2]) > 1e-6 * length:

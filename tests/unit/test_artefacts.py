@@ -286,6 +286,17 @@ def test_the_height_of_many_profiles_has_no_bias_and_the_stated_scatter():
     assert np.std(heights) == pytest.approx(np.mean(stated), rel=0.4)
 
 
+def test_rounded_edges_stay_out():
+    # Over 0.8 mm beside the edges the treads bend by 0.2 mm, within the limit of 5 x 0.05 mm.
+    rng, y = np.random.default_rng(4), np.linspace(-88, 88, 4000)
+    up = SHAPES["base, block, base"](y)
+    rounded = np.abs(np.abs(y) - 25) < 0.8
+    z = np.where(up, -HEIGHT, 0.0) + np.where(rounded, np.where(up, 0.2, -0.2), 0.0) + rng.normal(0, 0.05, len(y))
+    points = np.column_stack([y, z])
+    assert not label_treads(points, height_mm=HEIGHT, edge_mm=1.0)[rounded].any()
+    assert label_treads(points, height_mm=HEIGHT, edge_mm=0.0)[rounded].any()
+
+
 def test_labels_serve_slightly_changed_points():
     points, _ = step_profile(np.random.default_rng(1), "base, block, base")
     labels = label_treads(points, height_mm=HEIGHT)

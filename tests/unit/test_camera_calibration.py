@@ -184,7 +184,8 @@ def test_free_poses_agree_with_opencv():
 
 
 def test_a_restart_ends_at_the_same_camera():
-    images, _, _ = stage_images(SENSOR, positions=FEW, noise_px=0.05, rng=np.random.default_rng(4), stage_tilt=(0.01, 0))
+    rng = np.random.default_rng(4)
+    images, _, _ = stage_images(SENSOR, positions=FEW, noise_px=0.05, rng=rng, stage_tilt=(0.01, 0))
     for poses in ("stage-normal", "stage"):
         first = solve_camera(images, **SIZE, poses=poses)
         again = solve_camera(images, **SIZE, poses=poses, start=first)

@@ -157,32 +157,34 @@ CASES = {
     "plane": (lambda rng, count: centred(flat(rng, count)), plane_parameters, [0, 0, 0], plane_in_world),
     "profile": (lambda rng, count: centred(flat(rng, count))[:, [1, 2]], shifted_line, [0, 0], None),
 }  # fmt: skip
-REPEATS = 200
+REPEATS = {"pipe, 70 deg": 200, "pipe, known radius": 200}
+OTHER_REPEATS = 600
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_repeats_scatter_about_the_truth_as_the_covariance_says(name):
     draw, solve, truth, turned = CASES[name]
     rng = np.random.default_rng(11)
-    exact = draw(rng, 400)
+    exact, repeats = draw(rng, 200), REPEATS.get(name, OTHER_REPEATS)
     errors, covariances = [], []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         parameters, fit = solve(exact + rng.normal(0, SIGMA, exact.shape))
         errors.append(parameters - truth)
         covariances.append(fit.covariance if turned is None else turned(fit, fit.covariance))
-        assert fit.std_mm == pytest.approx(SIGMA, rel=0.2)  # 400 points: 3.6 % standard deviation
+        assert fit.std_mm == pytest.approx(SIGMA, rel=0.3)  # 200 points: 5 % standard deviation
     errors, stated = np.array(errors), np.mean(covariances, axis=0)
     size = len(truth)
-    # Mean of 200: 4.5 standard errors are passed once in 1e5. The least-squares sphere and cylinder have a bias of
+    # 4.5 standard errors of the mean are passed once in 1e5. The least-squares sphere and cylinder have a bias of
     # second order in the noise; a tenth of a standard deviation is allowed for it.
-    limit = (4.5 / np.sqrt(REPEATS) + 0.1) * np.sqrt(np.diag(stated))
+    limit = (4.5 / np.sqrt(repeats) + 0.1) * np.sqrt(np.diag(stated))
     assert (np.abs(errors.mean(axis=0)) < limit).all()
     # Squared errors in the metric of the covariance: chi square with `size` degrees of freedom each. The stated
-    # covariances scatter with the estimate of the noise, 2 x 3.6 %, whose mean over the repeats is accurate.
+    # covariances scatter with the estimate of the noise, whose mean over the repeats is accurate to a percent. Four
+    # standard deviations of the mean and 3 % for the curvature of the problem.
     squared = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(stated), errors)
-    assert squared.mean() == pytest.approx(size, abs=4.5 * np.sqrt(2 * size / REPEATS) + 0.05 * size)
-    # Each variance by itself: relative standard deviation sqrt(2 / 200) = 10 %.
-    np.testing.assert_allclose(errors.var(axis=0) / np.diag(stated), 1, atol=0.5)
+    assert squared.mean() == pytest.approx(size, abs=4 * np.sqrt(2 * size / repeats) + 0.03 * size)
+    # Each variance by itself has a relative standard deviation of sqrt(2 / repeats), at most 10 %.
+    np.testing.assert_allclose(errors.var(axis=0) / np.diag(stated), 1, atol=4.5 * np.sqrt(2 / repeats))
 
 
 @pytest.mark.parametrize("size", [1e-4, 1e-2])
@@ -216,7 +218,8 @@ def test_pipe_patches_in_any_pose_find_the_axis_without_a_start():
 
 
 def test_the_known_radius_does_not_end_on_the_wrong_side_of_a_noisy_cap():
-    # A sagitta of 25 (1 - cos 5 deg) = 0.1 mm, as large as the noise: algebraic starts often lie on the wrong side.
+    # A sagitta of 25 (1 - cos 5 deg) = 0.1 mm, as large as the noise of one point. The curvature of 400 points is
+    # known to a few percent, so that the right side is never in doubt.
     wrong = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ import pytest
 from uwlts import media
 from uwlts.errors import DescriptionError, RangeError
 
-# Quan and Fry 1995, Eq. 3, evaluated independently to six decimals: wavelength in nm, degC, g/kg, index relative to air.
+# Quan and Fry 1995, Eq. 3, evaluated independently to six decimals: nm, degC, g/kg, index relative to air.
 QUAN_FRY = [
     (450.0, 0.0, 0.0, 1.340243),
     (450.0, 30.0, 35.0, 1.344670),

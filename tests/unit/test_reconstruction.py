@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles import fermat
-from uwlts.calibration.model import Calibration, CameraModel, SheetModel, WindowModel, nominal_calibration
+from uwlts.calibration.model import Calibration, CameraModel, SheetModel, WindowModel
+from uwlts.calibration.nominal import nominal_calibration
 from uwlts.camera import directions, project, project_through_window
 from uwlts.errors import RangeError
 from uwlts.library import load_sensor
@@ -305,7 +306,7 @@ def test_failures_of_lens_and_window_keep_their_status_among_good_points():
 
 
 def test_a_calibration_without_a_window_measures_along_straight_rays():
-    bare = nominal_calibration(thesis("width"), window=False)
+    bare = nominal("width").model_copy(update={"window": None})
     assert bare.window is None
     pixels = whole_image(50)
     found = points_on_sheet(bare, pixels, medium_index=WATER)

@@ -1,4 +1,4 @@
-"""Snell's law at flat windows against Fermat's principle, against the law's own invariants, and against closed forms."""
+"""Snell's law at flat windows against Fermat's principle, the law's own invariants, and closed forms."""
 
 import math
 
@@ -46,12 +46,12 @@ def test_refraction_obeys_snell(x_deg, y_deg, n1, n2, seed):
     normal, incident = tilted(x_deg, y_deg), cone(seed)
     refracted, reflected = refract(incident, normal, ratio=n1 / n2)
     sine = np.linalg.norm(np.cross(incident, normal), axis=1)
-    # Incidence reaches 60 deg: total reflection where n1 sin i > n2. Rays within rounding of the limit may go either way.
+    # Incidence reaches 60 deg: total reflection where n1 sin i > n2. Within rounding of the limit it may go either way.
     certain = np.abs(n1 * sine - n2) > 1e-12
     np.testing.assert_array_equal(reflected[certain], (n1 * sine > n2)[certain])
     assert np.isnan(refracted[reflected]).all()
     incident, refracted = incident[~reflected], refracted[~reflected]
-    # The parts across the normal, scaled by indices up to 1.8, and the square of a unit vector: a few roundings of 2e-16.
+    # The parts across the normal times indices up to 1.8, and the square of a unit vector: a few roundings of 2e-16.
     # The part along the normal may near grazing be wrong by sqrt(4e-16), but enters only squared, or not at all.
     across_in, across_out = (v - np.outer(v @ normal, normal) for v in (incident, refracted))
     np.testing.assert_allclose(n1 * across_in, n2 * across_out, rtol=0, atol=2e-15)

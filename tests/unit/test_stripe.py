@@ -105,11 +105,13 @@ def test_lengths_that_are_no_whole_number_of_blocks(shape):
 def test_width_and_amplitude(sigma):
     image = (gaussian(phases(), sigma=sigma, amplitude=150) + 20).astype(np.float32)
     found = rows(image)
-    # The pixel's own width adds 1/12 to the variance and lowers the peak by the same share; half crossings are read
-    # off straight lines between pixels, good to a few hundredths of a pixel.
+    # The pixel's own width adds 1/12 to the variance and lowers the peak by the same share. The highest pixel misses
+    # the peak by up to 1 / (8 s^2) of it, s^2 = 1 + 1 + 1/12 after the low-pass, which lowers the half height by 3 %
+    # and, with the straight lines between pixels, widens a stripe of sigma 1 by 0.28 px or 12 %; less for wider ones.
+    # The amplitude of the Gaussian that fits falls with the square root of its width.
     wide = math.sqrt(sigma**2 + 1 / 12)
-    assert found.width_px == pytest.approx(wide * math.sqrt(8 * math.log(2)), rel=0.07)
-    assert found.amplitude == pytest.approx(150 * sigma / wide, rel=0.04)
+    assert found.width_px == pytest.approx(wide * math.sqrt(8 * math.log(2)), rel=0.13 / sigma)
+    assert found.amplitude == pytest.approx(150 * sigma / wide, rel=0.065 / sigma)
 
 
 @pytest.mark.parametrize(("sigma", "efficiency"), [(0.7, 0.7), (1.0, 0.85), (2.0, 0.8), (3.0, 0.75), (4.0, 0.6)])
@@ -130,20 +132,25 @@ def test_zero_crossing_is_the_least_noisy():
     rng = np.random.default_rng(2)
     centre = LENGTH / 2 + rng.uniform(-0.5, 0.5, 2000)
     image = gaussian(centre, sigma=2, amplitude=60) + 20 + 2 * rng.standard_normal((2000, LENGTH))
-    spread = {m: np.std(rows(image.astype(np.float32), options=StripeOptions(method=m)).centre_px - centre) for m in METHODS}
+    image = image.astype(np.float32)
+    spread = {m: np.std(rows(image, options=StripeOptions(method=m)).centre_px - centre) for m in METHODS}
     assert min(spread, key=spread.get) is StripeOptions().method
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_linear_background_does_not_shift(method):
+# Left in, 0.2 levels per px would move the zero crossing by b 2^1.5 sigma^2 / A = 0.011 px and the centre of mass by
+# b 2 R^3 / 3 / (sqrt(2 pi) sigma A), R = 2.25 sigma, 0.03 px. The tilt still acts on the width found and thus on where
+# the windows of the other two end, within the error with the phase that they have anyway.
+@pytest.mark.parametrize(
+    ("method", "limit"), [("zero-crossing", 0.003), ("centre-of-mass", 0.012), ("quadratic", 0.02)]
+)
+def test_linear_background_does_not_shift(method, limit):
     centre = phases()
     profile = gaussian(centre, sigma=1.5, amplitude=120) + 20
     plain = rows(profile.astype(np.float32), options=StripeOptions(method=method))
     tilted = rows((profile + 0.2 * np.arange(LENGTH)).astype(np.float32), options=StripeOptions(method=method))
-    # Left in, 0.2 levels per px would move the maximum of the matched filter by b 2^1.5 sigma^2 / A = 0.011 px and the
-    # centre of mass by b 2 R^3 / 3 / (sqrt(2 pi) sigma A), R = 2.25 sigma, 0.011 px. The window ends and low-pass act
-    # on the tilt only through the width they find.
-    assert np.abs(tilted.centre_px - plain.centre_px).max() < 0.006
+    shift = tilted.centre_px - plain.centre_px
+    assert np.abs(shift).max() < limit
+    assert abs(shift.mean()) < 0.003
 
 
 def test_far_haze_step_and_symmetric_halo():
@@ -164,7 +171,7 @@ def test_step_within_the_flanks_moves_less_than_the_step_as_a_slope():
     error = rows(image.astype(np.float32)).centre_px - centre
     # Wholly taken for a slope over the 17 px between the flanks: b 2^1.5 sigma^2 / A with b = 10 / 17, 0.044 px.
     assert np.abs(error).max() < 0.05
-    assert (np.isfinite(error)).all()
+    assert np.abs(error).max() > 0.001, "the step lies outside what the extraction looks at"
 
 
 def test_background_image_is_subtracted():
@@ -196,8 +203,40 @@ def test_moderate_saturation_is_unbiased(method, sigma, over):
     assert abs(error.mean()) < 0.01
 
 
+@pytest.mark.parametrize("rule", list(PeakRule))
+def test_wide_and_clipped_stripes_are_one_wherever_they_fall(rule):
+    centre = np.linspace(45, 75, 301)
+    for sigma, over in [(4, 1.5), (3, 4.0), (5, 0.6)]:
+        found = rows(grey(gaussian(centre, sigma=sigma, amplitude=255 * over) + 20), options=StripeOptions(peak=rule))
+        assert (found.status == StripeStatus.OK).all()
+        # Flanks 11 px from the middle hold up to a tenth of a stripe of sigma 5, unevenly by the pixel phase.
+        assert np.abs(found.centre_px - centre).max() < 0.1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("rule", list(PeakRule))
+@pytest.mark.parametrize("method", METHODS)
+def test_anything_at_all_gives_a_status_and_agreeing_fields(dtype, rule, method):
+    rng = np.random.default_rng(9)
+    blobs = np.where(rng.random((80, 90)) < 0.05, 255.0, 0.0).cumsum(axis=1) % 256
+    spikes, ramp = 200 * rng.random((80, 90)) ** 20, np.outer(np.arange(80), np.ones(90))
+    images = [rng.uniform(0, 255, (80, 90)), spikes, blobs, ramp]
+    seen = set()
+    for image in images:
+        for along in ("height", "width"):
+            options = StripeOptions(method=method, peak=rule, threshold_sigmas=2)
+            found = extract_stripe(image.astype(dtype), stripe_along=along, options=options)
+            ok = found.status == StripeStatus.OK
+            for values in (found.centre_px, found.amplitude, found.width_px):
+                assert np.array_equal(np.isfinite(values), ok)
+            assert (found.centre_px[ok] > 0).all()
+            assert (found.width_px[ok] <= 16).all()
+            seen |= set(found.status.tolist())
+    assert {StripeStatus.OK, StripeStatus.NO_STRIPE} <= seen
+
+
 def test_plateau_wider_than_the_window_is_saturated():
-    image = grey(gaussian(phases(), sigma=6, amplitude=255 * 8) + 20)
+    image = grey(gaussian(phases(), sigma=6, amplitude=255 * 8, length=160) + 20)
     found = rows(image)
     assert (found.status == StripeStatus.SATURATED).all()
     assert np.isnan(found.centre_px).all()

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from tests.unit.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
-from uwlts.calibration.model import WindowModel, nominal_calibration
+from uwlts.calibration.model import WindowModel
+from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.window import label_step, solve_window
 from uwlts.calibration.window import step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.metrology.treads import Tread
 
 SENSOR = built_sensor()
-AIR = nominal_calibration(SENSOR, window=False)
+AIR = nominal_calibration(SENSOR).model_copy(update={"window": None})
 DISTANCE = SENSOR.camera.window.distance_mm
 NORMAL = tuple(SENSOR.camera.window.normal())
 PLATE = WindowModel(refractions=2, distance_mm=62.8, normal=NORMAL, thickness_mm=5.93, glass_index=1.52)

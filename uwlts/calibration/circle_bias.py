@@ -14,6 +14,7 @@ from uwlts.targets import circle_centre_bias
 Solve = Callable[[Sequence[TargetImage], CameraSolution | None], CameraSolution]
 
 _ROUNDS = 10
+_X, _Y = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ def solve_without_bias(
         solution = solve(centred, solution)
         before, bias = bias, [
             circle_centre_bias(
-                _projection(solution, index), image.points_mm, diameter_mm=diameter_mm, axis_u=(1, 0, 0), axis_v=(0, 1, 0)
+                _projection(solution, index), image.points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y
             )
             for index, image in enumerate(images)
         ]

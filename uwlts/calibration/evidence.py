@@ -18,6 +18,7 @@ Progress = Callable[[str, int, int], None]
 
 _SAME_POSITION_MM = 1e-6
 _FEWEST_LINES = 20
+_STRIPE = StripeOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +56,9 @@ class StepEvidence:
 
 
 def air_evidence(
-    captures: Sequence[Capture], *, stripe: StripeOptions | None = None, progress: Progress | None = None
+    captures: Sequence[Capture], *, stripe: StripeOptions = _STRIPE, progress: Progress | None = None
 ) -> AirEvidence:
-    """Find the target in the images with the laser off and the stripe in those with the laser on, at the same positions.
+    """Find the target in the images with the laser off, and the stripe in those with it on at the same positions.
 
     Raises
     ------
@@ -103,7 +104,7 @@ def step_evidence(
     captures: Sequence[Capture],
     *,
     medium_index: float | None = None,
-    stripe: StripeOptions | None = None,
+    stripe: StripeOptions = _STRIPE,
     progress: Progress | None = None,
 ) -> tuple[list[StepEvidence], list[str]]:
     """Stripes on the step standard in all images with the laser on, and warnings about images left out.
@@ -142,7 +143,7 @@ def _add_stripe(
     capture: Capture,
     frame: int,
     image: np.ndarray,
-    options: StripeOptions | None,
+    options: StripeOptions,
     warnings: list[str],
 ) -> None:
     along, clip = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn

@@ -9,8 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from uwlts.errors import CaptureError
 from uwlts.files import written_aside
-from uwlts.placement import camera_from_object, laser_pose
-from uwlts.sensor import Description, Distortion, Positive, Sensor, Vector
+from uwlts.sensor import Description, Distortion, Positive, Vector
 
 FORMAT = "uwlts-calibration"
 VERSION = 1
@@ -91,29 +90,6 @@ class Calibration(Description):
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""
         return np.array(self.camera_from_object)
-
-
-def nominal_calibration(sensor: Sensor, *, window: bool = True) -> Calibration:
-    """The calibration a sensor would have if it were built exactly as its description says."""
-    camera, pose = sensor.camera, laser_pose(sensor)
-    f, (cx, cy) = camera.focal_length_px(), camera.principal_point()
-    plate = camera.window
-    return Calibration(
-        sensor_name=sensor.name,
-        stripe_along=camera.stripe_along,
-        wavelength_nm=sensor.laser.wavelength_nm,
-        camera=CameraModel(
-            width_px=camera.width_px, height_px=camera.height_px, fx_px=f, fy_px=f, cx_px=cx, cy_px=cy,
-            distortion=camera.distortion,
-        ),
-        window=WindowModel(
-            refractions=2, distance_mm=plate.distance_mm, normal=tuple(plate.normal()),
-            thickness_mm=plate.thickness_mm, glass_index=plate.index(sensor.laser.wavelength_nm),
-        ) if window and plate.mounted else None,
-        sheet=SheetModel(normal=tuple(pose.normal), offset_mm=float(pose.normal @ pose.origin_mm)),
-        camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
-        provenance={"source": f"description of the sensor '{sensor.name}'"},
-    )  # fmt: skip
 
 
 def write_calibration(path: str | Path, calibration: Calibration, *, overwrite: bool = False) -> None:

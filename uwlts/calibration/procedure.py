@@ -38,7 +38,7 @@ class CalibrationOptions:
     poses : {"stage-normal", "stage", "free"}
         As for `solve_camera`.
     camera : CameraOptions
-    stripe : StripeOptions, optional
+    stripe : StripeOptions
     correct_circles : bool
         Take out the offset between a circle's image and the image of its centre.
     margin_mm : float, optional
@@ -52,7 +52,7 @@ class CalibrationOptions:
     refractions: Literal[1, 2] = 2
     poses: Poses = "stage-normal"
     camera: CameraOptions = CameraOptions()
-    stripe: StripeOptions | None = None
+    stripe: StripeOptions = StripeOptions()
     correct_circles: bool = True
     margin_mm: float | None = None
     medium_index: float | None = None
@@ -254,7 +254,7 @@ def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: 
     mounted = [capture.header.sensor.camera.window.mounted for capture in air]
     if options.refractions == 2 and any(mounted):
         return [
-            "the window stood before the camera in air, so its shift of the rays went into distortion and focal length; "
+            "the window stood before the camera in air, so its shift of the rays went into the camera's parameters: "
             "with two refractions take the images in air without it, or use refractions=1"
         ]
     if options.refractions == 1 and not all(mounted):

@@ -141,8 +141,8 @@ def fit_sheet(points_mm: np.ndarray, *, nominal_normal: np.ndarray) -> SheetSolu
         )
     if robust.rejected_share > _LARGEST_REJECTED:
         raise CalibrationError(
-            f"{100 * robust.rejected_share:.0f} % of the stripe points do not lie on the plane of the others: check the "
-            f"stage positions, and that the stripe falls on the target"
+            f"{100 * robust.rejected_share:.0f} % of the stripe points do not lie on the plane of the others: check "
+            f"the stage positions, and that the stripe falls on the target"
         )
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
     if turn > _LARGEST_TURN:

@@ -230,8 +230,8 @@ def _refuse(distance: float, low: float, high: float, changes: np.ndarray, heigh
     scatter = float(np.sqrt(np.mean(height_std**2)))
     if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
         raise CalibrationError(
-            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} to "
-            f"{high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
+            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} "
+            f"to {high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
         )
     inner = _inside(low, high)
     if not inner[0] < distance < inner[1]:

@@ -18,7 +18,7 @@ from uwlts.metrology.least_squares import (
     principal_axes,
     require_convergence,
 )
-from uwlts.metrology.round_starts import algebraic_centres, centres_of_known_radius
+from uwlts.metrology.round_starts import algebraic_centres, centre_of_known_radius
 
 _THINNED = 600
 _NEIGHBOURS = 12
@@ -185,8 +185,8 @@ def _starts(points: np.ndarray, known: float | None, axis_start: Any) -> list[tu
         if known is None:
             starts.append((frames[best], np.array([*centres[best], 0.0, 0.0, radii[best]])))
         else:
-            for centre in centres_of_known_radius(seen[best], known):
-                starts.append((frames[best], np.array([*centre, 0.0, 0.0])))
+            centre = seen_mean[best, 0] + centre_of_known_radius(seen[best] - seen_mean[best], known)
+            starts.append((frames[best], np.array([*centre, 0.0, 0.0])))
     return starts
 
 

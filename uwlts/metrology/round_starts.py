@@ -23,13 +23,13 @@ def algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return centres, radii
 
 
-def centres_of_known_radius(points: np.ndarray, radius: float) -> np.ndarray:
-    """Start centres (2, D) of a circle or sphere of known radius: on both sides of the centred points (N, D).
+def centre_of_known_radius(points: np.ndarray, radius: float) -> np.ndarray:
+    """Start centre (D,) of a circle or sphere of known radius through centred points (N, D).
 
-    On a small, noisy cap the algebraic centre may lie on the wrong side, where there is a second minimum.
+    In the direction of the algebraic centre, as deep below the points as their extent across it demands.
     """
     centre, _ = algebraic_centres(points)
     direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
     across = np.sum(points**2, axis=-1) - (points @ direction) ** 2
     depth = np.sqrt(max(radius**2 - float(across.mean()), (0.1 * radius) ** 2))
-    return np.array([direction * depth, -direction * depth])
+    return direction * depth

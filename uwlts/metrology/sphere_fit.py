@@ -10,16 +10,13 @@ from uwlts.metrology.least_squares import (
     LARGEST_RELATIVE_STD,
     accepted_points,
     covariance_of,
-    evenly_thinned,
     is_flat,
     minimised,
     normalise,
     principal_axes,
     require_convergence,
 )
-from uwlts.metrology.round_starts import algebraic_centres, centres_of_known_radius
-
-_THINNED = 2000
+from uwlts.metrology.round_starts import algebraic_centres, centre_of_known_radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +105,7 @@ def _jacobian(parameters: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _start(points: np.ndarray, known: float | None) -> np.ndarray:
-    if known is None:
-        centre, radius = algebraic_centres(points)
-        return np.array([*centre, radius])
-    thinned = evenly_thinned(points, _THINNED)
-    trials = [
-        minimised(lambda x: _residuals(x, thinned, known), lambda x: _jacobian(x, thinned), start)
-        for start in centres_of_known_radius(points, known)
-    ]
-    return min(trials, key=lambda trial: trial[1])[0]
+    if known is not None:
+        return centre_of_known_radius(points, known)
+    centre, radius = algebraic_centres(points)
+    return np.array([*centre, radius])

@@ -48,9 +48,14 @@ class Row:
             measured = MISSING if self.measured is None else f"{fixed(100 * self.measured, 2)} %"
         else:
             measured = fixed(self.measured)
-        published = ", ".join(f"{value:g}" for value in self.published) or MISSING
+        published = ", ".join(_as_published(value) for value in self.published) or MISSING
         error = fixed(self.error, signed=True)
         return self.measurement, self.quantity, fixed(self.true), measured, error, published
+
+
+def _as_published(value: float) -> str:
+    """Two decimals below a millimetre where more were not printed: 0.10 is not the same claim as 0.1."""
+    return fixed(value, 2) if abs(value) < 1 and round(value, 2) == value else f"{value:g}"
 
 
 def summary_table(campaign: Campaign, reference: Reference | None = None) -> list[Row]:

@@ -65,15 +65,13 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
     background cut off at black is met better this way than by the deviation of single pixels.
     """
     sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)]
-    if np.issubdtype(contrast.dtype, np.integer):
+    middle = np.partition(sample, sample.size // 2)[sample.size // 2]
+    median = float(middle)
+    if contrast.dtype.kind in "iu":
         # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.
-        counts = np.bincount(sample)
-        upto = np.cumsum(counts)
-        level = int(np.searchsorted(upto, sample.size / 2))
-        median = level + 0.5 - (upto[level] - sample.size / 2) / counts[level]
-    else:
-        median = np.median(sample)
-    return max(float(median), 0.0) / _unit_contrast(block)
+        below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
+        median += (0.5 * sample.size - below) / equal - 0.5
+    return max(median, 0.0) / _unit_contrast(block)
 
 
 def coarse_threshold(noise: float, *, block: int, floor: float) -> float:

@@ -31,16 +31,16 @@ def place_centre(method: StripeMethod, lobe: Lobe) -> tuple[np.ndarray, np.ndarr
     amplitude : (M,) float32
         Height of the best-fitting Gaussian of the lobe's sigma at the centre, grey levels.
     """
-    kernel = np.maximum(lobe.sigma, _LEAST_KERNEL)
+    sigma = np.maximum(lobe.sigma, np.float32(0.3))
+    kernel = np.maximum(sigma, _LEAST_KERNEL)
     if method is StripeMethod.ZERO_CROSSING:
         centre, under = _zero_crossing(lobe, kernel)
     else:
         centre = _centre_of_mass(lobe) if method is StripeMethod.CENTRE_OF_MASS else _quadratic(lobe)
         (under,) = _gaussian_moments(lobe, centre, kernel, 0)
     # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
-    sigma = np.maximum(lobe.sigma, np.float32(0.3))
-    joint = np.sqrt(sigma * sigma + kernel * kernel)
-    return centre, under * joint / (np.float32(math.sqrt(2.0 * math.pi)) * sigma * kernel)
+    joint = np.float32(0.5 / math.pi) * (1 / (sigma * sigma) + 1 / (kernel * kernel))
+    return centre, under * np.sqrt(joint)
 
 
 def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +51,7 @@ def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarra
     position of a Gaussian, of least variance in white noise. The kernel is evaluated at a real-valued c0, the midpoint
     of the half-height crossings, instead of interpolating between pixels. With Mk = sum f t^k g the slope of F by c / s
     is M2 - M0, so that Newton's step is r = M1 / (M0 - M2). For a Gaussian f of sigma s, F(c) is proportional to
-    d exp(-d^2 / 4), d being the step that is sought, and r = d / (1 - d^2 / 2): the step is r - r^3 / 2 to fourth order.
+    d exp(-d^2 / 4), d being the step that is sought, and r = d / (1 - d^2 / 2): d is r - r^3 / 2 to fourth order.
 
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
     """

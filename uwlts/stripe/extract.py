@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from uwlts.stripe.candidates import (
@@ -145,15 +144,17 @@ def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: S
         again = found.status[lines] == _OK
         new = stripe & ~again
         if again.any():
-            rival = stripe & again & (lobe.height >= options.ambiguous_ratio * found.height[lines])
+            # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
+            other = np.abs(lobe.start + lobe.middle - found.centre[lines]) > found.width[lines]
+            rival = stripe & again & other & (lobe.height >= options.ambiguous_ratio * found.height[lines])
             found.discard(lines[rival], _AMBIGUOUS)
         found.status[lines[new]] = verdict[new]
         _measure(found, lines, lobe, new & (verdict == _OK), options)
 
         # The window has been searched for rivals already; of what is no stripe only the block itself is done with.
-        if not stripe.all():
-            board[chosen[~stripe], lines[~stripe]] = 0
-        board.ravel()[(chosen[stripe] + _SEARCHED_BLOCKS) * board.shape[1] + lines[stripe]] = 0
+        place = chosen * board.shape[1] + lines
+        board.ravel()[place] = 0
+        board.ravel()[(place if stripe.all() else place[stripe]) + _SEARCHED_BLOCKS * board.shape[1]] = 0
         least = np.where(new, np.maximum(coarse, there * share), least)
         status = found.status[lines]
         unsettled = status == _NO_STRIPE

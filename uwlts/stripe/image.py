@@ -36,7 +36,12 @@ def check_image(image: np.ndarray, *, name: str) -> None:
 
 
 def check_length(image: np.ndarray, *, stripe_along: str, least: int) -> None:
-    """Refuse an unknown orientation, lines shorter than the search needs and images OpenCV cannot address, with an `ImageError`."""
+    """Refuse an unknown orientation, lines shorter than the search needs and images OpenCV cannot address.
+
+    Raises
+    ------
+    ImageError
+    """
     if stripe_along not in ("height", "width"):
         raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
     if max(image.shape) > _LONGEST_SIDE:

@@ -77,7 +77,15 @@ class Lobe:
 
 
 def look(
-    profiles: np.ndarray, lines: np.ndarray, place: np.ndarray, *, half: int, block: int, smoothing: float, share: float, whole: bool
+    profiles: np.ndarray,
+    lines: np.ndarray,
+    place: np.ndarray,
+    *,
+    half: int,
+    block: int,
+    smoothing: float,
+    share: float,
+    whole: bool,
 ) -> Lobe:
     """Measure what stands at or near the `block` pixels that begin at `place`.
 
@@ -85,10 +93,11 @@ def look(
     ----------
     profiles : (N, L) array
         Grey levels, position along the line first.
-    lines, start : (M,) int
-        Line and first pixel of each window of 2 * `half` + `block` pixels; `start` may lie outside the image.
+    lines, place : (M,) int
+        Line and first pixel of each place.
     half, block : int
-        The peak is sought in the middle `block` pixels and half a block on either side.
+        The window is the block and `half` pixels on either side; it may run over the image border. The peak is sought
+        in the block and half a block on either side.
     smoothing : float
         Sigma of the low-pass, px.
     share : float
@@ -134,9 +143,11 @@ def look(
     before, after = _flanks(smooth, columns, np.stack([near - reach - FLANK + 1, near + reach - 1]))
     crowded = size - low.sum(axis=0, dtype=rows.dtype) != right - left - 1
     if crowded.any():
-        limits = (left, right) if whole else (left, right, near - reach - FLANK, near + reach + FLANK)
+        first_row = np.zeros_like(near) if whole else near - reach - FLANK + 1
+        last_row = np.full_like(near, size) if whole else near + reach + FLANK - 1
         floor = (ground + share * (peak - ground))[crowded]
-        crowded[crowded] = _second_lobe(smooth[:, crowded] >= floor, *(limit[crowded] for limit in limits))
+        limits = (limit[crowded] for limit in (left, right, first_row, last_row))
+        crowded[crowded] = _second_lobe(smooth[:, crowded] >= floor, *limits)
     slope = (after - before) / (2 * reach + FLANK - 2).astype(np.float32)
     base = np.float32(0.5) * (before + after) + slope * (middle - near).astype(np.float32)
     return Lobe(
@@ -171,9 +182,11 @@ def off_centre(lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
 
 def _cut(profiles: np.ndarray, lines: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
     """(size, M) array of the profiles' type: windows from them, the border pixel repeated beyond the border."""
-    position = np.arange(size, dtype=np.float32)[:, None] + start.astype(np.float32)
-    line = np.repeat(lines.astype(np.float32)[None], size, axis=0)
-    return cv2.remap(profiles, line, position, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    # Relative maps: row r of the window is r pixels after its start, column m is line m plus the difference.
+    down = np.repeat(start.astype(np.float32)[None], size, axis=0)
+    right = np.repeat((lines - np.arange(lines.size)).astype(np.float32)[None], size, axis=0)
+    nearest = cv2.INTER_NEAREST | cv2.WARP_RELATIVE_MAP
+    return cv2.remap(profiles, right, down, nearest, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=16)
@@ -191,11 +204,11 @@ def noise_gain(sigma: float) -> float:
 
 
 def _second_lobe(
-    high: np.ndarray, left: np.ndarray, right: np.ndarray, first: np.ndarray | int = -1, last: np.ndarray | int = 1 << 30
+    high: np.ndarray, left: np.ndarray, right: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """(M,) bool: something in the (W, M) mask between `first` and `last` but not between `left` and `right`."""
+    """(M,) bool: something in the (W, M) mask from `first` to `last` but not between `left` and `right`."""
     row = np.arange(high.shape[0])[:, None]
-    return (high & ((row <= left) | (row >= right)) & (row > first) & (row < last)).any(axis=0)
+    return (high & ((row <= left) | (row >= right)) & (row >= first) & (row <= last)).any(axis=0)
 
 
 def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level: np.ndarray) -> np.ndarray:

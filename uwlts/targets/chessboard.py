@@ -33,8 +33,7 @@ def detect_chessboard(image, target: ChessboardTarget) -> TargetView:
                 f"found no chessboard of {size[0]} x {size[1]} inner corners; the whole board must be in view with a "
                 "bright rim, and columns and rows count inner corners, not squares"
             )
-        corners = _refined(image, corners.reshape(-1, 2), size)
-    grid = corners.reshape(target.rows, target.columns, 2).astype(np.float64)
+    grid = _refined(image, corners.reshape(-1, 2), size).reshape(target.rows, target.columns, 2).astype(np.float64)
     pixels = _from_top_left(grey, grid).reshape(-1, 2)
     indices = np.stack(np.meshgrid(np.arange(target.columns), np.arange(target.rows)), 2).reshape(-1, 2)
     points = np.column_stack([indices * target.square_mm, np.zeros(len(indices))])

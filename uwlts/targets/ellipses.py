@@ -25,8 +25,10 @@ RESIDUAL_FLOOR_PX = 0.03
 # Slope over contrast, 1/px, of the edge under a blur of 4 px: a softer edge is not one to measure on.
 MIN_SHARPNESS = 0.1
 
-# Largest departure of one profile's contrast from the smooth course around the blob.
+# Largest departure of one profile's contrast from the smooth course around the blob. Where blur fills a small blob, its
+# inside level differs between the ends and the flanks of the ellipse.
 MAX_CONTRAST_DEPARTURE = 0.2
+MAX_CONTRAST_DEPARTURE_IF_SMALL = 0.4
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,8 @@ def fit_ellipses(image, blobs):
     """Fit ellipses to the edges of blobs and keep those that are ellipses.
 
     The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
-    ellipse. Both levels follow a constant, a first harmonic (shading) and a second one (blur over the ends of a
-    narrow ellipse) around the blob. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
+    ellipse. Both levels follow a constant and a first harmonic around the blob, so that shading does not shift the
+    centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
     least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the plate's edge show a large residual or
     an uneven contrast and are left out; nothing is downweighted.
 
@@ -138,13 +140,13 @@ def _edges(grey, centres, shapes, *, bright, noise):
     if not bright:
         profiles = -profiles
     inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
-    x, y = directions.T
-    harmonics = np.stack([np.ones(PROFILES), x, y, x * x - y * y, 2 * x * y], 1)
+    harmonics = np.stack([np.ones(PROFILES), *directions.T], 1)
     smoother = harmonics @ np.linalg.pinv(harmonics)
     inner_level, outer_level = inner @ smoother, outer @ smoother
     contrast = inner_level - outer_level
     departure = np.abs(inner - outer - contrast)
-    whole = (contrast > 0).all(1) & (departure <= np.maximum(MAX_CONTRAST_DEPARTURE * contrast, 6 * noise)).all(1)
+    share = np.where(reach < REACH_PX, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
+    whole = (contrast > 0).all(1) & (departure <= np.maximum(share[:, None] * contrast, 6 * noise)).all(1)
     excess = profiles - (inner_level + outer_level)[:, :, None] / 2
     distance, crossed = _crossing(excess)
     middle = SAMPLES // 2

@@ -20,6 +20,13 @@ TOLERANCE = 0.25
 # Largest ratio of the radii of neighbouring circles.
 MAX_SIZE_RATIO = 1.5
 
+# Smallest sine of the angle between the steps of a seed, where the ellipse of its circle is a circle. An ellipse 20 %
+# too round turns a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice of sides 1 : 3 has the sine 0.95.
+MIN_SINE = 0.95
+
+# Largest ratio of the area of a seed's cell to the median, half-way between one and two cells.
+MAX_CELL_RATIO = 1.4
+
 MIN_LABELLED = 4
 MAX_SEEDS = 20
 
@@ -97,9 +104,9 @@ def label_lattice(centres, shapes):
         return indices, labelled
     tree = cKDTree(centres)
     radii = np.sqrt(np.linalg.det(shapes))
-    bases = _bases(centres, shapes, tree)
+    bases, sines = _bases(centres, shapes, tree)
     tried = np.zeros(len(centres), bool)
-    for seed in _seeds(centres, radii, bases, tree):
+    for seed in _seeds(centres, radii, bases, sines, tree):
         if tried[seed]:
             continue
         places = _grown(seed, centres, radii, bases[seed], tree)
@@ -120,7 +127,10 @@ def label_lattice(centres, shapes):
 
 
 def _bases(centres, shapes, tree):
-    """Steps (N, 2, 2) along i (row 0) and j (row 1) suggested by each circle's nearest neighbours; zero where none."""
+    """Steps (N, 2, 2) along i (row 0) and j (row 1) to each circle's nearest neighbours, and the sine between them (N,).
+
+    The second step is zero where there is none.
+    """
     count = min(NEIGHBOURS + 1, len(centres))
     _, index = tree.query(centres, k=count)
     steps = centres[index[:, 1:]] - centres[:, None]
@@ -130,19 +140,18 @@ def _bases(centres, shapes, tree):
     first = length.argmin(1)
     a, seen_a = steps[order, first], seen[order, first]
     across = np.abs(_cross(seen, seen_a[:, None])) / (length * np.linalg.norm(seen_a, axis=1)[:, None])
-    # Half-way between the rectangle's corner (sine 1) and its diagonal at equal sides (sine 0.71).
-    length = np.where(across > 0.85, length, np.inf)
+    length = np.where(across > MIN_SINE, length, np.inf)
     second = length.argmin(1)
     b = np.where(np.isfinite(length[order, second])[:, None], steps[order, second], 0.0)
     b *= np.sign(_cross(a, b))[:, None]
-    return np.stack([a, b], 1)
+    return np.stack([a, b], 1), across[order, second]
 
 
 def _cross(p, q):
     return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
 
 
-def _seeds(centres, radii, bases, tree):
+def _seeds(centres, radii, bases, sines, tree):
     """Circles with four alike neighbours where their bases say, best first."""
     expected = centres[:, None] + np.concatenate([bases, -bases], 1)
     distance, index = tree.query(expected)
@@ -152,7 +161,12 @@ def _seeds(centres, radii, bases, tree):
     # An edge of a narrow plate may have no circle with four neighbours; two at a right angle are then enough.
     partial = np.sort(distance[:, :2] / np.maximum(step, 1e-9), 1)[:, 1]
     usable = (step > 0).all(1) & (partial < TOLERANCE)
-    score = np.where(miss < TOLERANCE, miss + ratio, 1.0 + partial + ratio)
+    # Over the square of the radius the lattice's cell has one size in the whole image, whatever the perspective. Next to
+    # gaps two diagonals may pass for a basis; their cell is twice as large.
+    cell = _cross(bases[:, 0], bases[:, 1]) / radii**2
+    if usable.any():
+        usable &= np.abs(np.log(np.maximum(cell, 1e-9) / np.median(cell[usable]))) < np.log(MAX_CELL_RATIO)
+    score = np.where(miss < TOLERANCE, miss, 1.0 + partial) + ratio + (1 - sines)
     return np.flatnonzero(usable)[np.argsort(score[usable])][:MAX_SEEDS]
 
 

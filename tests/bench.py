@@ -1,0 +1,152 @@
+"""Measures speed and memory against the project's limits: ``python -m tests.bench``; writes ``runs/bench.json``.
+
+Medians after a warm-up, so without compilation. Limits are for two cores.
+"""
+
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+RESULT = Path("runs/bench.json")
+CORES = 2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured value and its limit; ``ok`` tells whether it is kept."""
+
+    name: str
+    value: float
+    unit: str
+    limit: float
+    ok: bool
+
+
+def at_most(name: str, value: float, unit: str, limit: float) -> Row:
+    """A row whose value must not exceed the limit."""
+    return Row(name, round(value, 4), unit, limit, value <= limit)
+
+
+def at_least(name: str, value: float, unit: str, limit: float) -> Row:
+    """A row whose value must reach the limit."""
+    return Row(name, round(value, 4), unit, limit, value >= limit)
+
+
+def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: int = 15) -> float:
+    """Median duration of ``action(k)`` after a warm-up."""
+    seconds = []
+    for k in range(warm_up + runs):
+        start = time.perf_counter()
+        action(k)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[warm_up:])
+
+
+def rendering() -> list[Row]:
+    """Time of a full-size laser frame and a lamp frame of the thesis's sensor."""
+    from twin.variant import use_variant
+
+    use_variant()
+    from twin.renderer import Renderer
+    from twin.scene import load_scene
+    from uwlts.library import load_sensor
+
+    sensor = load_sensor("thesis-as-built")
+
+    def pose(k: int) -> np.ndarray:
+        transform = np.eye(4)
+        transform[0, 3] = 0.5 * (k - 8)
+        return transform
+
+    spheres = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
+    pipe = Renderer(sensor, sensor.media["water"], load_scene("pipe"))
+    limit = 0.25
+    return [
+        at_most(
+            "laser frame 1280 x 1024, 64 samples per lit pixel, spheres in water",
+            median_seconds(lambda k: spheres.irradiance("laser", pose(k), spp=64, seed=k)), "s", limit,
+        ),
+        at_most(
+            "laser frame 1280 x 1024, 64 samples per lit pixel, pipe across the whole image in water",
+            median_seconds(lambda k: pipe.irradiance("laser", pose(k), spp=64, seed=k)), "s", limit,
+        ),
+    ]  # fmt: skip
+
+
+def pipeline() -> list[Row]:
+    """Time of stripe extraction and reconstruction on one core, on frames with a stripe on every line."""
+    from twin.scene import load_scene
+    from twin.simulate import Options, Studio
+    from uwlts.calibration.nominal import nominal_calibration
+    from uwlts.library import load_sensor
+    from uwlts.reconstruction import reconstruct_pixels
+    from uwlts.stripe import extract_stripe
+
+    rows = []
+    for along in ("width", "height"):
+        sensor = load_sensor("thesis")
+        sensor = sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"stripe_along": along})})
+        calibration = nominal_calibration(sensor, sensor.media["water"])
+        index = sensor.media["water"].refractive_index(sensor.laser.wavelength_nm)
+        studio = Studio(sensor, load_scene("pipe"), Options(spp=4))
+        image = studio.image(next(iter(load_scene("pipe").motion.shots())), 0)
+        cv2.setNumThreads(1)
+
+        def extract(k: int, image: np.ndarray = image, along: str = along) -> object:
+            return extract_stripe(image, stripe_along=along)
+
+        def measure(k: int, extract: Callable = extract, calibration: object = calibration, index: float = index) -> object:
+            pixels = extract(k).pixels()
+            return reconstruct_pixels(
+                calibration, pixels, medium_index=index, stage_mm=0.1 * k, stage_direction=np.array([1.0, 0.0, 0.0])
+            )
+
+        extraction, both = median_seconds(extract, runs=101), median_seconds(measure, runs=101)
+        rows.append(at_most(f"stripe extraction, stripe along the {along}", 1e3 * extraction, "ms/frame", 1.0))
+        rows.append(at_least(f"extraction and reconstruction, one core, along the {along}", 1 / both, "frames/s", 300))
+    return rows
+
+
+def demo() -> list[Row]:
+    """Duration and peak memory of the demo, in a folder of its own."""
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "twin.demo"], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+        seconds = time.perf_counter() - start
+    # ru_maxrss of the children is the largest single process; the demo runs one at a time.
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    return [at_most("demo", seconds, "s", 120), at_most("demo, peak memory", peak, "GiB", 3)]
+
+
+def main() -> int:
+    """Measure, print a table, write the result; exit code 1 if a limit is broken."""
+    if (count := len(os.sched_getaffinity(0))) > CORES:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
+        print(f"{count} cores found, measuring on {CORES}")
+    rows = [*demo(), *rendering(), *pipeline()]
+    table = Table("what", "value", "limit", "unit", "")
+    for row in rows:
+        table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:g}", row.unit, "ok" if row.ok else "MISSED")
+    Console(width=130).print(table)
+    RESULT.parent.mkdir(parents=True, exist_ok=True)
+    RESULT.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
+    print(f"wrote {RESULT}")
+    return 0 if all(row.ok for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

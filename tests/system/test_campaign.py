@@ -1,0 +1,135 @@
+"""The main job in small: render, calibrate from rendered images only, reconstruct, and judge against truth.
+
+Two gates stand here. With perfect images and true parameters nothing but the stripe's centre and the chain's arithmetic
+is left, so errors of micrometres show. With noise and a calibration from noisy images of a sensor that differs from its
+drawings, the gates are a few times the errors that the full campaign shows, and well below the thesis's own 0.11 mm.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.scene import load_scene
+from twin.simulate import Options, simulate
+from uwlts.calibration.model import Calibration
+from uwlts.calibration.nominal import nominal_calibration
+from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate
+from uwlts.capture import Capture
+from uwlts.evaluate import Judgement, judge, parse_artefact
+from uwlts.library import load_sensor
+from uwlts.scan import reconstruct_capture
+from uwlts.truth import read_truth, truth_path
+
+PLACEMENTS = ("near", "standoff", "far")
+PROFILES = {"start_mm": -18.0, "step_mm": 3.0, "count": 13}
+
+
+def true_calibration() -> Calibration:
+    sensor = load_sensor("thesis")
+    return nominal_calibration(sensor, sensor.media["water"])
+
+
+def measured(path: Path, calibration: Calibration) -> Judgement:
+    with Capture(path) as capture:
+        scan = reconstruct_capture(capture, calibration)
+        artefact = parse_artefact(capture.header.artefact)
+    return judge(scan.cloud, artefact=artefact, truth=read_truth(truth_path(path))[1], source=path.name)
+
+
+def record(scene: str, path: Path, *, as_built: str | None = None, ideal: bool = False, seed: int = 0, **changes) -> Path:
+    built = load_sensor(as_built) if as_built else None
+    options = Options(spp=64 if ideal else 16, seed=seed, ideal=ideal)
+    simulate(load_scene(scene, changes=changes), load_sensor("thesis"), path, as_built=built, options=options)
+    return path
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_perfect_images_and_true_parameters_give_micrometres(tmp_path: Path, placement: str):
+    path = record("spheres", tmp_path / "spheres.h5", ideal=True, placement=placement, motion=PROFILES)
+    judgement = measured(path, true_calibration())
+    truth, figures = judgement.content["truth"], judgement.content["evaluation"]["figures_mm"]
+    assert truth["matched"] > 5000
+    assert truth["share_within_tolerance"] >= 0.99
+    assert truth["tolerance_mm"] == pytest.approx(0.010)
+    assert abs(figures["SSE"]) <= 0.005
+    # Rows of a stripe that ends in a point are lost or doubtful, never more than a tenth of them.
+    assert truth["missed"] + truth["false_points"] < 0.1 * truth["matched"]
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CalibrationResult]:
+    folder = tmp_path_factory.mktemp("campaign")
+    poses = {"direction": (0.0, 0.0, 1.0), "start_mm": -180.0, "step_mm": 44.0, "count": 7, "lights": ("lamp", "laser")}
+    target = record("target", folder / "target.h5", as_built="thesis-as-built", motion=poses)
+    steps = [
+        record("step", folder / f"step-{place}.h5", as_built="thesis-as-built", placement=place) for place in PLACEMENTS
+    ]
+    with Capture(target) as air:
+        opened = [Capture(path) for path in steps]
+        result = calibrate([air], opened, options=CalibrationOptions(refractions=2))
+        for capture in opened:
+            capture.close()
+    return folder, result
+
+
+def test_calibration_finds_the_sensor_as_built(campaign: tuple[Path, CalibrationResult]):
+    calibration, built = campaign[1].calibration, load_sensor("thesis-as-built")
+    camera = calibration.camera
+    # Circle centres are good to some 0.02 px and there are over a thousand of them; the focal length follows to about
+    # 1e-4 of itself, the principal point to a fraction of a pixel.
+    assert camera.fx_px == pytest.approx(built.camera.focal_length_px(), rel=5e-4)
+    assert camera.cx_px == pytest.approx(built.camera.principal_point()[0], abs=1.0)
+    assert camera.cy_px == pytest.approx(built.camera.principal_point()[1], abs=1.0)
+    # The window's true tilt of 0.08 deg is not part of the thesis's model and moves its distance by about 1 mm.
+    assert calibration.window.distance_mm == pytest.approx(built.camera.window.distance_mm, abs=2.5)
+    assert calibration.residuals["sheet"]["rms_mm"] < 0.03
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationResult], placement: str):
+    folder, result = campaign
+    path = record(
+        "spheres", folder / f"spheres-{placement}.h5", as_built="thesis-as-built", seed=1, placement=placement, motion=PROFILES
+    )
+    figures = measured(path, result.calibration).content["evaluation"]["figures_mm"]
+    assert abs(figures["SSE"]) <= 0.08
+    assert figures["STD"] <= 0.02
+    assert abs(figures["diameter error sphere 1"]) <= 0.08
+
+
+def test_a_hundredth_of_a_millimetre_is_noticed(tmp_path: Path):
+    """A window moved by 0.3 mm shifts the spacing by about 0.01 mm; the gate of perfect images must catch that."""
+    path = record("spheres", tmp_path / "spheres.h5", ideal=True, placement="standoff", motion=PROFILES)
+    true = true_calibration()
+    wrong = true.model_copy(
+        update={"window": true.window.model_copy(update={"distance_mm": true.window.distance_mm + 0.3})}
+    )
+    truth = measured(path, wrong).content["truth"]
+    assert truth["share_within_tolerance"] < 0.99
+
+
+def test_pipe_and_step_in_water(tmp_path: Path, campaign: tuple[Path, CalibrationResult]):
+    calibration = campaign[1].calibration
+    few = {"start_mm": -20.0, "step_mm": 5.0, "count": 9}
+    pipe = record("pipe", tmp_path / "pipe.h5", as_built="thesis-as-built", motion=few)
+    step = record("step-scan", tmp_path / "step.h5", as_built="thesis-as-built", motion=few)
+    # The pipe's radius follows from 60 deg of arc: an error of depth counts about four times in the diameter.
+    assert abs(measured(pipe, calibration).content["evaluation"]["figures_mm"]["diameter error"]) < 0.4
+    assert abs(measured(step, calibration).content["evaluation"]["figures_mm"]["height error"]) < 0.05
+
+
+def test_shadowed_lines_give_no_points(tmp_path: Path):
+    """Behind a block that keeps the sheet off a plate there is no true stripe and no measured point."""
+    scene = load_scene("plane", changes={"motion": {"count": 1}})
+    block = {"kind": "block", "size_mm": (40.0, 30.0, 4.0), "position_mm": (0.0, 0.0, -40.0)}
+    objects = (*[thing.model_dump() for thing in scene.objects], block)
+    path = tmp_path / "plane.h5"
+    shaded = type(scene).model_validate(scene.model_dump() | {"objects": objects, "artefact": None})
+    simulate(shaded, load_sensor("thesis"), path, options=Options(ideal=True))
+    with Capture(path) as capture:
+        cloud = reconstruct_capture(capture, true_calibration()).cloud
+    on_block = cloud.points_mm[:, 2] < -30
+    assert np.count_nonzero(on_block) > 200
+    behind = ~on_block & (np.abs(cloud.points_mm[:, 1]) < 12)
+    assert not behind.any()

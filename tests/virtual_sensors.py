@@ -1,0 +1,115 @@
+"""Sensors and scenes for the tests of the twin, and the same sensors as the oracles describe them."""
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.oracles import fermat
+from tests.oracles.fan import Fan
+from twin.scene import Scene
+from uwlts.library import merged
+from uwlts.sensor import Medium, Sensor, Window
+
+_TOWARDS_LASER = {"width": np.array([0.0, -1.0, 0.0]), "height": np.array([1.0, 0.0, 0.0])}
+
+
+def altered(sensor: Sensor, changes: dict[str, Any]) -> Sensor:
+    """The sensor with nested ``changes`` laid over its description."""
+    return Sensor.model_validate(merged(sensor.model_dump(), changes))
+
+
+def cropped(sensor: Sensor, width_px: int, height_px: int) -> Sensor:
+    """The sensor reading out only the middle of its image."""
+    return altered(sensor, {"camera": {"width_px": width_px, "height_px": height_px}})
+
+
+def scene_of(*objects: dict[str, Any], **rest: Any) -> Scene:
+    """A scene of objects in the water."""
+    return Scene.model_validate({"title": "test", "objects": list(objects)} | rest)
+
+
+def plate(z: float = 0.0, *, reflectance: float = 0.8, side: float = 400.0, x: float = 0.0, y: float = 0.0) -> dict[str, Any]:
+    """A plate square to the laser's axis."""
+    size = {"width_mm": side, "height_mm": side, "reflectance": reflectance}
+    return {"kind": "plate", "position_mm": (x, y, z)} | size
+
+
+def block(size: tuple[float, float, float], position: tuple[float, float, float], *, reflectance: float = 0.0) -> dict[str, Any]:
+    """A block, black unless told otherwise."""
+    return {"kind": "block", "size_mm": size, "position_mm": position, "reflectance": reflectance}
+
+
+def sensor_at(z: float = 0.0, *, x: float = 0.0) -> np.ndarray:
+    """Pose (4, 4) of the OCS that brings the scene's point (x, 0, z) to the stand-off."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, 0.0, z
+    return pose
+
+
+def camera_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Columns X, Y, Z (3, 3) of the OCS in the camera frame and its origin (3,), from the sensor's baseline and angle.
+
+    Written from the words of the description: the laser stands beside the camera, above it or to its right, its axis
+    leans towards the camera's by the triangulation angle, and the roll turns the sheet about that axis.
+    """
+    laser = sensor.laser
+    towards = _TOWARDS_LASER[sensor.camera.stripe_along]
+    lean = Rotation.from_rotvec(math.radians(laser.triangulation_angle_deg) * np.cross(towards, (0.0, 0.0, 1.0)))
+    axis = lean.apply((0.0, 0.0, 1.0))
+    normal = Rotation.from_rotvec(math.radians(laser.roll_deg) * axis).apply(lean.apply(towards))
+    standoff = laser.baseline_mm / math.tan(math.radians(laser.triangulation_angle_deg))
+    return np.stack([normal, np.cross(axis, normal), axis], axis=1), np.array([0.0, 0.0, standoff])
+
+
+def laser_origin(sensor: Sensor) -> np.ndarray:
+    """Origin (3,) of the fan in the OCS."""
+    axes, standoff = camera_axes(sensor)
+    towards = _TOWARDS_LASER[sensor.camera.stripe_along]
+    return axes.T @ (sensor.laser.baseline_mm * towards - standoff)
+
+
+def oracle_window(window: Window, medium: Medium, *, wavelength_nm: float = 635.0) -> tuple[list[fermat.Face], list[float]]:
+    """Faces and indices of a window before a module that looks along +z; none if it is taken off."""
+    if not window.mounted:
+        return [], [1.0]
+    turned = Rotation.from_euler("xy", [window.tilt_x_deg, window.tilt_y_deg], degrees=True)
+    faces = fermat.plate(
+        distance=window.distance_mm, thickness=window.thickness_mm, normal=turned.apply((0.0, 0.0, 1.0))
+    )
+    return faces, [1.0, window.index(wavelength_nm), medium.refractive_index(wavelength_nm)]
+
+
+def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
+    """The sensor's fan in closed form; its origin lies at `laser_origin`."""
+    laser, window = sensor.laser, sensor.laser.window
+    index = medium.refractive_index(laser.wavelength_nm)
+    return Fan(
+        power_w=1e-3 * laser.power_mw,
+        full_angle=math.radians(laser.fan_angle_deg),
+        window_distance=window.distance_mm,
+        window_thickness=window.thickness_mm,
+        glass_index=window.index(laser.wavelength_nm),
+        medium_index=index,
+        glass_absorption=window.absorption_per_mm(),
+        extinction=medium.absorption_per_mm(laser.wavelength_nm) + medium.scattering_per_mm(laser.wavelength_nm),
+        waist_radius=laser.waist_radius_mm,
+        waist_distance=laser.waist_distance_mm,
+        # A beam of quality M2 opens by M2 times the diffraction of its waist (ISO 11146-1).
+        divergence=laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm / (math.pi * laser.waist_radius_mm * index),
+    )
+
+
+def oracle_paths(sensor: Sensor, medium: Medium, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the camera sees points (N, 3) of the OCS by Fermat's principle.
+
+    Unit directions (N, 3) at the pupil in the camera frame, and the path's part in the medium, from the window's outer
+    face (N, 3) in the OCS and its length (N,).
+    """
+    axes, standoff = camera_axes(sensor)
+    faces, indices = oracle_window(sensor.camera.window, medium)
+    ends = points @ axes.T + standoff
+    crossings = fermat.least_time_crossings(np.zeros(3), ends, faces, indices)
+    directions = crossings[:, 0] / np.linalg.norm(crossings[:, 0], axis=1, keepdims=True)
+    return directions, (crossings[:, -1] - standoff) @ axes, np.linalg.norm(ends - crossings[:, -1], axis=1)

@@ -1,0 +1,140 @@
+"""What the report says first: what was measured with, and the key figures in plain words."""
+
+from dataclasses import dataclass
+
+from uwlts.report.gather import Campaign, GatheredCapture
+from uwlts.report.numbers import fixed, small_length
+from uwlts.report.published import Reference
+from uwlts.report.summary_file import summary
+from uwlts.report.table import Row
+
+_TILES = {
+    "sphere_spacing_error_mm": "Sphere spacing error",
+    "probing_error_mm": "Probing error",
+    "std_mm": "Standard deviation",
+    "step_height_error_mm": "Step height error",
+    "pipe_diameter_error_mm": "Pipe diameter error",
+    "plane_range_error_mm": "Plane range error",
+}
+
+_EXPLANATIONS = {
+    "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free (VDI/VDE "
+    "2634: SSE is its error).",
+    "probing error PE": "Range of the points' distances from the fitted sphere, after at most 0.3 % of stray points are "
+    "left out (VDI/VDE 2634); of several spheres the worst.",
+    "range error RE": "Range of the points' distances from the fitted plane.",
+    "deviations STD": "Standard deviation of the points' distances from the fitted surface; of several surfaces the "
+    "largest.",
+    "deviations range": "Largest less smallest distance of the points from the fitted surface.",
+    "step height": "Mean distance of one tread's points from the plane fitted to the other tread.",
+    "pipe diameter": "Diameter of the fitted cylinder.",
+    "points within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
+    "rms distance": "Root mean square of those distances. Only rendered captures have a true surface.",
+    "window distance": "From the camera's entrance pupil to the window's inner face, found from the step standard in "
+    "water; true is what was set in the twin.",
+    "interface distance": "With one refraction a single interface stands for the whole window; its distance has no true "
+    "value.",
+}
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A key figure: its name, value, what it covers, and what was published."""
+
+    name: str
+    value: str
+    note: str
+    published: str | None
+
+
+def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile]:
+    """The key figures that the campaign has."""
+    content = summary(campaign, reference)
+    published = content["published"] or {}
+    tiles = []
+    for key, name in _TILES.items():
+        found = content[key]
+        count = len(found["by_measurement"])
+        if count:
+            mean = published.get(key, {}).get("mean_abs")
+            note = f"mean size over {count} measurements" if count > 1 else "one measurement"
+            tiles.append(Tile(name, small_length(found["mean_abs"]), note, None if mean is None else small_length(mean)))
+    truth = content["truth"]
+    if truth["share_within_tolerance"] is not None:
+        name = f"Points within {small_length(truth['tolerance_mm'])} of the truth"
+        note = f"rms distance {small_length(truth['rms_mm'])}"
+        tiles.append(Tile(name, f"{100 * truth['share_within_tolerance']:.2f} %", note, None))
+    window = content["window_distance_mm"]
+    if window["estimated"] is not None:
+        true = "" if window["true"] is None else f"true {fixed(window['true'])} mm"
+        values = published.get("window_distance_mm") or []
+        tiles.append(
+            Tile("Window distance", f"{fixed(window['estimated'])} mm", true,
+                 ", ".join(f"{value:g} mm" for value in values) or None)
+        )  # fmt: skip
+    return tiles
+
+
+def introduction(campaign: Campaign) -> list[tuple[str, str]]:
+    """Sensor, medium, calibration and origin of the images, each in a sentence."""
+    recorded = [m.capture for m in campaign.measurements if m.capture is not None] or list(campaign.captures)
+    judged = [m.judged for m in campaign.measurements if m.judged is not None]
+    facts = []
+    if sensors := _once([_sensor(capture) for capture in recorded] or [j.sensor for j in judged if j.sensor]):
+        facts.append(("Sensor", "; ".join(sensors)))
+    if media := _once([_medium(capture) for capture in recorded]):
+        facts.append(("Medium", "; ".join(media)))
+    if origins := _once([_origin(capture) for capture in recorded]):
+        facts.append(("Images", "; ".join(origins)))
+    calibration = campaign.main_calibration
+    if calibration is not None:
+        window = calibration.calibration.window
+        seen = "no window" if window is None else (
+            f"window {fixed(window.distance_mm)} mm from the entrance pupil, "
+            + ("glass plate with two refractions" if window.refractions == 2 else "taken as one refracting interface")
+        )  # fmt: skip
+        source = calibration.calibration.provenance.get("source")
+        facts.append(("Calibration", f"{calibration.name}: {seen}" + (f" ({source})" if source else "")))
+    return facts
+
+
+def explanations(rows: list[Row], reference: Reference | None) -> list[tuple[str, str]]:
+    """What the quantities of a table mean."""
+    found = [
+        (start, text) for start, text in _EXPLANATIONS.items() if any(row.quantity.startswith(start) for row in rows)
+    ]
+    if reference is not None:
+        found.append((
+            reference.title,
+            "Published values in mm for the same kind of measurement: errors where there is a calibrated value, else the "
+            "quantity itself; several values are several positions.",
+        ))  # fmt: skip
+    return found
+
+
+def _sensor(capture: GatheredCapture) -> str:
+    sensor = capture.header.sensor
+    return f"{sensor.name}, {sensor.camera.width_px} x {sensor.camera.height_px} pixels, {sensor.laser.wavelength_nm:g} nm"
+
+
+def _medium(capture: GatheredCapture) -> str:
+    medium, wavelength = capture.header.medium, capture.header.sensor.laser.wavelength_nm
+    parts = [f"{medium.temperature_c:g} °C"] if medium.kind != "custom" else []
+    if medium.kind == "sea":
+        parts.append(f"{medium.salinity_g_kg:g} g/kg salt")
+    parts.append(f"n = {medium.refractive_index(wavelength):.5f} relative to air at {wavelength:g} nm")
+    name = capture.header.medium_name
+    return f"{name if name == medium.kind else f'{name} ({medium.kind})'}, {', '.join(parts)}"
+
+
+def _origin(capture: GatheredCapture) -> str:
+    provenance = capture.header.provenance
+    source = provenance.get("source")
+    if source == "twin":
+        ideal = provenance.get("ideal")
+        return "rendered by the digital twin" + (", without noise" if ideal is True else "")
+    return f"recorded by {source}" if isinstance(source, str) else "of unknown origin"
+
+
+def _once(texts: list[str]) -> list[str]:
+    return list(dict.fromkeys(texts))

@@ -1,0 +1,220 @@
+"""The report: one HTML page that holds everything it shows and asks nothing of the network."""
+
+import json
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+import uwlts
+from uwlts.files import written_aside
+from uwlts.report.calibration_figures import residual_figures, seconds_figure, window_curve_figure
+from uwlts.report.calibration_table import parameter_table, residual_table
+from uwlts.report.figures import Drawn, along_stripe_figure, cloud_figure, histogram_figure
+from uwlts.report.gather import Campaign, GatheredCapture, Measurement
+from uwlts.report.headline import headline_tiles, introduction, explanations
+from uwlts.report.numbers import MISSING, fixed, small_length
+from uwlts.report.pictures import cloud_png, data_uri, stripe_png
+from uwlts.report.published import Reference
+from uwlts.report.table import Row, summary_table, true_window_distance
+
+_LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "plotly")
+
+
+def write_report(
+    path: str | Path, campaign: Campaign, reference: Reference | None = None, *, overwrite: bool = False
+) -> None:
+    """Write the report of a campaign, whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        The page exists and ``overwrite`` is not given, or cannot be written.
+    CaptureError
+        An image of a capture is damaged.
+    """
+    text = report_page(campaign, reference)
+    with written_aside(path, overwrite=overwrite) as aside:
+        # A file name may hold bytes that are no text.
+        aside.write_text(text, encoding="utf-8", errors="replace")
+
+
+def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
+    """The page as text."""
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["minus"] = _with_minus
+    template = environment.from_string(files("uwlts.report").joinpath("template.html.j2").read_text(encoding="utf-8"))
+    collected = _Figures()
+    rows = summary_table(campaign, reference)
+    return template.render(
+        title=campaign.folder.resolve().name,
+        introduction=introduction(campaign),
+        tiles=headline_tiles(campaign, reference),
+        groups=_grouped(rows),
+        published=None if reference is None else reference.title,
+        explanations=explanations(rows, reference),
+        measurements=[_measurement(measurement, collected) for measurement in campaign.measurements],
+        calibration=_calibration(campaign, collected),
+        seconds=collected.add(seconds_figure(campaign.seconds)),
+        provenance=_provenance(campaign),
+        figures=collected.scripts,
+        plotly=_script(get_plotlyjs()),
+    )
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A figure's place in the page."""
+
+    number: int
+    caption: str
+    solid: bool
+    height: int
+
+
+class _Figures:
+    """Hands out numbers to figures and keeps their JSON for the end of the page."""
+
+    def __init__(self) -> None:
+        self.scripts: list[Markup] = []
+
+    def add(self, drawn: Drawn | None) -> _Shown | None:
+        if drawn is None:
+            return None
+        text = drawn.figure.to_json(validate=False)
+        # Within a script element nothing is escaped, and nothing may look like its end.
+        self.scripts.append(Markup(text.replace("<", "\\u003c")))
+        return _Shown(len(self.scripts) - 1, drawn.caption, drawn.solid, int(drawn.figure.layout.height))
+
+
+def _measurement(measurement: Measurement, collected: _Figures) -> dict[str, Any]:
+    cloud, judged, capture = measurement.cloud, measurement.judged, measurement.capture
+    coloured = cloud is not None and cloud.deviation_mm is not None
+    stripe, still = stripe_png(measurement), cloud_png(measurement)
+    return {
+        "name": measurement.name,
+        "facts": _facts(measurement),
+        "stripe": None if stripe is None else data_uri(stripe),
+        "no_stripe": "no image of its capture shows a stripe" if capture else "its capture is not in the folder",
+        "cloud": None if cloud is None else collected.add(cloud_figure(cloud)),
+        "still": None if still is None else data_uri(still),
+        "histogram": collected.add(histogram_figure(cloud.deviation_mm)) if coloured else None,
+        "along": collected.add(along_stripe_figure(cloud)) if coloured else None,
+        "deviation_from": "the artefact's fitted surface" if judged and judged.evaluation else "the true surface",
+        "figures": [] if judged is None or judged.evaluation is None else [
+            (name, small_length(value, signed="error" in name or "SSE" in name))
+            for name, value in judged.evaluation.figures_mm.items()
+        ],
+        "truth": [] if judged is None or judged.truth is None else _truth(measurement),
+    }  # fmt: skip
+
+
+def _facts(measurement: Measurement) -> list[tuple[str, str]]:
+    judged, capture, cloud = measurement.judged, measurement.capture, measurement.cloud
+    facts = []
+    if judged is not None and judged.artefact is not None:
+        artefact = judged.artefact.model_dump(mode="json", exclude_none=True)
+        kind = artefact.pop("kind")
+        facts.append(("artefact", f"{kind}: {', '.join(f'{_words(k)} {_value(v)}' for k, v in artefact.items())}"))
+    if capture is not None:
+        laser = len(capture.laser_images)
+        facts.append(("capture", f"{capture.path.name}, {capture.images} images, {laser} with the laser on"))
+    if cloud is not None:
+        facts.append(("points", f"{len(cloud):,}"))
+    if judged is not None and judged.evaluation is not None:
+        found = judged.evaluation
+        share = found.points_rejected / max(1, found.points_used + found.points_rejected)
+        allowed = "within" if found.within_vdi_outliers else "more than"
+        facts.append((
+            "points evaluated",
+            f"{found.points_used:,}, and {found.points_rejected:,} left out as stray ({100 * share:.2f} %, {allowed} the "
+            "0.3 % of VDI/VDE 2634)",
+        ))  # fmt: skip
+    if measurement.digest is not None:
+        known = measurement.calibration
+        facts.append(("calibration", known.name if known else f"not in the folder (digest {measurement.digest})"))
+    return facts
+
+
+def _truth(measurement: Measurement) -> list[tuple[str, str]]:
+    truth = measurement.judged.truth
+    return [
+        (f"points within {small_length(truth.tolerance_mm)}", f"{100 * truth.share_within_tolerance:.2f} %"),
+        ("mean distance", small_length(truth.mean_mm, signed=True)),
+        ("standard deviation", small_length(truth.std_mm)),
+        ("rms distance", small_length(truth.rms_mm)),
+        ("95 % are closer than", small_length(truth.p95_mm)),
+        ("99 % are closer than", small_length(truth.p99_mm)),
+        ("largest distance", small_length(truth.largest_mm)),
+        ("points compared", f"{truth.matched:,}"),
+        ("points where no stripe is visible", f"{truth.false_points:,}"),
+        ("visible stripe points not found", f"{truth.missed:,}"),
+    ]
+
+
+def _calibration(campaign: Campaign, collected: _Figures) -> dict[str, Any] | None:
+    if not campaign.calibrations:
+        return None
+    return {
+        "parameters": parameter_table(campaign),
+        "residuals": residual_table(campaign.calibrations),
+        "curve": collected.add(window_curve_figure(campaign.calibrations, true_window_distance(campaign))),
+        "groups": [
+            (found.name, [collected.add(drawn) for drawn in residual_figures(found)]) for found in campaign.calibrations
+        ],
+    }
+
+
+def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
+    """Rows as text under their measurement; the uncertainty stands beside the calibrated value."""
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for row in rows:
+        name, quantity, true, *others = row.texts()
+        if row.uncertainty:
+            true = f"{true} ± {fixed(row.uncertainty)}"
+        groups.setdefault(name, []).append((quantity, true, *others))
+    return list(groups.items())
+
+
+def _provenance(campaign: Campaign) -> list[tuple[str, str]]:
+    entries = [("report", f"uwlts {uwlts.__version__}, Python {platform.python_version()}, "
+                + ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]  # fmt: skip
+    for found in campaign.calibrations:
+        entries.append((f"calibration {found.name}", f"digest {found.digest}; {_pairs(found.calibration.provenance)}"))
+    entries += [(f"capture {capture.path.name}", _recorded(capture)) for capture in campaign.captures]
+    return entries
+
+
+def _recorded(capture: GatheredCapture) -> str:
+    header = capture.header
+    return f"'{header.name}', sensor '{header.sensor.name}', {header.medium_name}; {_pairs(header.provenance) or MISSING}"
+
+
+def _pairs(table: dict[str, Any]) -> str:
+    return "; ".join(f"{_words(key)} {_value(value)}" for key, value in table.items())
+
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_value, value)) or "none"
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def _with_minus(text: str) -> str:
+    """A number with the typographic minus."""
+    return f"−{text[1:]}" if text[:1] == "-" and text != MISSING else text.replace(MISSING, "–") if text == MISSING else text
+
+
+def _script(source: str) -> Markup:
+    """Source of a script, with nothing in it that looks like the script's end."""
+    return Markup(source.replace("</script", "<\\/script"))
