@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.oracles import fermat
 from tests.oracles.fan import Fan
+from tests.oracles.optics import fresnel_transmittance
 from twin.scene import Scene
 from uwlts.library import merged
 from uwlts.sensor import Medium, Sensor, Window
@@ -113,3 +114,47 @@ def oracle_paths(sensor: Sensor, medium: Medium, points: np.ndarray) -> tuple[np
     crossings = fermat.least_time_crossings(np.zeros(3), ends, faces, indices)
     directions = crossings[:, 0] / np.linalg.norm(crossings[:, 0], axis=1, keepdims=True)
     return directions, (crossings[:, -1] - standoff) @ axes, np.linalg.norm(ends - crossings[:, -1], axis=1)
+
+
+def clear(absorption_per_m: float = 0.0, scattering_per_m: float = 0.0, **rest: object) -> Medium:
+    """A medium of water's index with given coefficients."""
+    coefficients = {"absorption_per_m": absorption_per_m, "scattering_per_m": scattering_per_m}
+    return Medium.model_validate({"kind": "custom", "index": 1.3312} | coefficients | rest)
+
+
+def extinction(medium: Medium, *, wavelength_nm: float = 635.0) -> float:
+    """Absorption and scattering in 1/mm."""
+    return medium.absorption_per_mm(wavelength_nm) + medium.scattering_per_mm(wavelength_nm)
+
+
+def window_transmittance(cosine: np.ndarray, window: Window, medium_index: float, *, absorption_per_mm: float) -> np.ndarray:
+    """Both faces and the glass between them, for the cosine of the angle in air."""
+    glass = window.index(635.0)
+    in_glass = np.sqrt(1 - (1 - cosine**2) / glass**2)
+    faces = fresnel_transmittance(cosine, n1=1.0, n2=glass) * fresnel_transmittance(in_glass, n1=glass, n2=medium_index)
+    return faces * np.exp(-absorption_per_mm * window.thickness_mm / in_glass)
+
+
+def lens_factor(sensor: Sensor, medium: Medium, rays: np.ndarray, *, wavelength_nm: float = 635.0) -> np.ndarray:
+    """Irradiance on the image sensor per radiance before the window, for unit directions (N, 3) at the pupil.
+
+    Radiance over the index squared stays along a ray but for the window's losses. A thin lens of focal length f and
+    diameter f / N, its image at f (1 + m), collects the solid angle pi / 4 / (N (1 + m))^2, and cos^4 off the axis.
+    """
+    camera, window = sensor.camera, sensor.camera.window
+    index = medium.refractive_index(wavelength_nm)
+    passed = window_transmittance(rays[:, 2], window, index, absorption_per_mm=window.absorption_per_mm()) / index**2
+    magnification = 1 / (camera.focus_distance_mm / camera.focal_length_mm - 1)
+    return passed * math.pi / 4 / (camera.f_number * (1 + magnification)) ** 2 * rays[:, 2] ** 4
+
+
+def image_of(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
+    """Image points (N, 2) of points (N, 3) of the OCS, for a lens without distortion."""
+    rays = oracle_paths(sensor, medium, points)[0]
+    return rays[:, :2] / rays[:, 2:] * sensor.camera.focal_length_px() + sensor.camera.principal_point()
+
+
+def gauss_legendre(low: float, high: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of an integral from ``low`` to ``high``."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (high - low) * nodes + 0.5 * (high + low), 0.5 * (high - low) * weights

@@ -100,6 +100,7 @@ def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
     bundle = renderer.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
     hit = renderer.objects.ray_intersect_preliminary(SensorPose(scene_from_object).ray(bundle.origin, bundle.direction))
-    point = mi.Transform4f(mi.Matrix4f(camera_from_object(renderer.sensor))) @ (bundle.origin + bundle.direction * hit.t)
+    point = mi.Point3f(bundle.origin + bundle.direction * hit.t)  # a sum with a vector is a vector, which would not move
+    point = mi.Transform4f(mi.Matrix4f(camera_from_object(renderer.sensor))) @ point
     depth = dr.select(hit.is_valid() & (bundle.weight > 0), point.z, dr.nan)
     return depth.numpy().reshape(camera.height_px, camera.width_px)

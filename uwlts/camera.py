@@ -107,9 +107,10 @@ def project_through_window(
 
 
 def _check_finite(name: str, values: np.ndarray) -> None:
-    if not np.isfinite(values).all():
-        found = np.count_nonzero(~np.isfinite(values).all(axis=1))
-        raise RangeError(f"{found} of {len(values)} {name} are not finite; pass only those that were found")
+    finite = np.isfinite(values)
+    if not finite.all():
+        example = values[~finite.all(axis=1)][0]
+        raise RangeError(f"{name} must be finite, but there is {example}; pass only those that were found")
 
 
 def _tangent_in_air(
@@ -198,9 +199,11 @@ def _newton_step(
 
 def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of `_distorted` in its domain around the centre; NaN where there is none."""
-    x, y = x_seen, y_seen
     allowed = _allowed(x_seen, y_seen)
     with np.errstate(all="ignore"):
+        s = x_seen * x_seen + y_seen * y_seen
+        start = 1.0 / (1.0 + s * (d.k1 + s * (d.k2 + s * d.k3)))
+        x, y = start * x_seen, start * y_seen
         for _ in range(_USUAL_STEPS):
             x_step, y_step, missing = _newton_step(d, x_seen, y_seen, x, y)
             found = missing <= allowed
@@ -210,7 +213,6 @@ def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple
         found &= x * x + y * y < _largest_square(d)
     if not found.all():
         hard = np.flatnonzero(~found)
-        x, y = np.array(x), np.array(y)
         x[hard], y[hard] = _undistorted_with_care(d, x_seen[hard], y_seen[hard])
     return x, y
 

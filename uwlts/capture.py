@@ -25,6 +25,7 @@ from pydantic import Field, field_validator
 from uwlts.errors import CaptureError, ImageError, OutputError, UwltsError
 from uwlts.library import validated
 from uwlts.sensor import Description, Medium, Sensor, Vector
+from uwlts.unfinished import has_writer, open_unfinished
 
 FORMAT = "uwlts-capture"
 VERSION = 1
@@ -78,6 +79,11 @@ def part_path(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
 
+def _cut_to_used(path: Path) -> None:
+    """Cut off space that was claimed and not used, as HDF5 does when a file is opened and closed once more."""
+    h5py.File(path, "r+", locking=False).close()
+
+
 class CaptureWriter:
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
@@ -112,7 +118,7 @@ class CaptureWriter:
                     self._begin(unfinished)
             else:
                 self._begin(None)
-            self._file = h5py.File(self._part, "r+", libver="latest")
+            self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
         except (OSError, RuntimeError) as error:
             raise self._storage_failed(error) from error
@@ -137,11 +143,12 @@ class CaptureWriter:
         """
         fresh = self._part.with_suffix(".fresh")
         try:
-            with h5py.File(fresh, "w", libver="latest") as self._file:
+            with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
                 self._lay_out()
                 for index in range(len(unfinished) if unfinished else 0):
                     self._store(unfinished.frame(index))
+            _cut_to_used(fresh)
             os.replace(fresh, self._part)
         finally:
             fresh.unlink(missing_ok=True)
@@ -227,8 +234,7 @@ class CaptureWriter:
         try:
             self._file.close()
             if kind is None:
-                # Opened and closed once more, HDF5 cuts off the space that was claimed and not used.
-                h5py.File(self._part, "r+").close()
+                _cut_to_used(self._part)
                 os.replace(self._part, self.path)
         except (OSError, RuntimeError) as error:
             raise self._storage_failed(error) from error
@@ -261,7 +267,9 @@ class Capture:
         if not self.path.is_file():
             raise CaptureError(f"no capture at {self.path}")
         try:
-            self.file = h5py.File(self.path, "r", swmr=True, libver="latest")
+            # Reading must never be in the way of the writer, so nothing is locked.
+            unfinished = not self.finished or has_writer(self.path)
+            self.file = open_unfinished(self.path) if unfinished else h5py.File(self.path, "r", locking=False)
         except _DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 cannot open it ({error})") from error
         try:

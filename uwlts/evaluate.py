@@ -12,7 +12,7 @@ from uwlts.cloud import PointCloud
 from uwlts.errors import CaptureError, EvaluationError
 from uwlts.files import written_aside
 from uwlts.metrology.artefacts import Artefact, evaluate_cloud
-from uwlts.metrology.truth import compare_with_truth
+from uwlts.metrology.truth import TruthComparison, best_fit_motion, compare_with_truth
 from uwlts.truth import Truth
 
 FORMAT = "uwlts-evaluation"
@@ -53,17 +53,28 @@ def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, 
     content |= {"artefact": None, "evaluation": None, "truth": None}
     deviation = np.full(len(cloud), np.nan)
     if truth is not None:
-        compared = compare_with_truth(
-            cloud.points_mm, cloud.frame, cloud.line,
-            point_mm=truth.point_mm, normal=truth.normal, status=truth.status, tolerance_mm=TOLERANCE_MM,
-        )  # fmt: skip
-        content["truth"] = compared.as_dict()
+        compared, fitted = _against_truth(cloud, truth)
+        content["truth"] = compared.as_dict() | {"after_best_fit": fitted.as_dict()}
         deviation = compared.distance_mm
     if artefact is not None:
         evaluation = evaluate_cloud(cloud, artefact)
         content |= {"artefact": artefact.model_dump(mode="json"), "evaluation": evaluation.as_dict()}
         deviation = evaluation.deviation_mm
     return Judgement(content, replace(cloud, deviation_mm=deviation))
+
+
+def _against_truth(cloud: PointCloud, truth: Truth) -> tuple[TruthComparison, TruthComparison]:
+    """Comparison as measured, and after the rigid motion that takes out the difference of the coordinate systems."""
+
+    def compared(points: np.ndarray) -> TruthComparison:
+        return compare_with_truth(
+            points, cloud.frame, cloud.line,
+            point_mm=truth.point_mm, normal=truth.normal, status=truth.status, tolerance_mm=TOLERANCE_MM,
+        )  # fmt: skip
+
+    plain = compared(cloud.points_mm)
+    motion = best_fit_motion(plain, cloud.points_mm)
+    return plain, compared(cloud.points_mm @ motion[:3, :3].T + motion[:3, 3])
 
 
 def write_evaluation(path: str | Path, judgement: Judgement, *, overwrite: bool = False) -> None:

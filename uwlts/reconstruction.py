@@ -13,6 +13,9 @@ from uwlts.refraction import RaysInMedium, RayStatus, trace_window
 # angle would meet a sheet 1 mm away after a million kilometres.
 _PARALLEL = 1e-12
 
+# Pixels computed together, so that all intermediate results stay in the processor's cache.
+_BLOCK = 4096
+
 
 @dataclass(frozen=True)
 class SheetPoints:
@@ -107,8 +110,17 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
     RangeError
         A pixel is not finite, or the index is not finite and positive.
     """
-    rays = trace_window(directions(calibration.camera, pixels), calibration.window, medium_index=medium_index)
-    return _crossings(rays, calibration.sheet)
+    pixels = np.asarray(pixels, dtype=float)
+    blocks = [
+        _crossings(
+            trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index),
+            calibration.sheet,
+        )
+        for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK))
+    ]
+    return SheetPoints(
+        np.concatenate([block.points_camera_mm for block in blocks]), np.concatenate([block.status for block in blocks])
+    )
 
 
 def to_object(

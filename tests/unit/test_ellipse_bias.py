@@ -81,8 +81,8 @@ def test_square_on_without_distortion_there_is_no_bias_and_distortion_makes_one(
     arguments = {"diameter_mm": 5.0, "axis_u": (1, 0, 0), "axis_v": (0, 1, 0)}
     np.testing.assert_allclose(circle_centre_bias(plain, [[60.0, 0.0, 0.0]], **arguments), 0, atol=1e-8)
     ((du, dv),) = circle_centre_bias(distorted, [[60.0, 0.0, 0.0]], **arguments)
-    # On the rim of radius a around (r, 0) the map x (1 + k |x|^2) adds, to second order in a, k r a^2 (2 + cos 2t) along
-    # the radius and k r a^2 sin 2t across it. Along the normal (cos t, sin t) this has the first harmonic
+    # On the rim of radius a around (r, 0) the map x (1 + k |x|^2) adds, to second order in a, k r a^2 (2 + cos 2t)
+    # along the radius and k r a^2 sin 2t across it. Along the normal (cos t, sin t) this has the first harmonic
     # k r a^2 (2 + 1/2 + 1/2) cos t, which moves a fitted ellipse by 3 k r a^2 px. Neglected: a^4, (2.5 / 60)^2 = 0.2 %,
     # and the focal length's scale of k, k r^2 = 1 %.
     assert du == pytest.approx(3 * -0.3 * (60 / 350) * (2.5 / 350) ** 2 * FOCAL, rel=0.02)

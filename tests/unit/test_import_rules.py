@@ -14,9 +14,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 # What the twin may know of the sensor's software: what the sensor is (description, nominal media and placement, the
-# library that finds descriptions), how a capture is stored, how files are written, and the errors. Nothing of how the
-# software computes: camera, refraction, sheet, stripe, targets, calibration, reconstruction, metrology.
-SHARED_WITH_TWIN = {"errors", "sensor", "media", "placement", "library", "capture", "files"}
+# library that finds descriptions), how a capture and its ground truth are stored, how files are written, the errors, and
+# how both commands speak on the terminal. Nothing of how the software computes: camera, refraction, sheet, stripe, targets, calibration, reconstruction, metrology.
+SHARED_WITH_TWIN = {"errors", "sensor", "media", "placement", "library", "capture", "truth", "files", "unfinished", "console"}
 
 RENDERER = {"mitsuba", "drjit"}
 

@@ -7,11 +7,19 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from uwlts.report.calibration_table import SHORT_LIST, is_number, residual_name, unit_of
+from uwlts.report.calibration_table import SHORT_LIST
 from uwlts.report.figures import BLUE, INK, RED, Drawn, layout
 from uwlts.report.gather import GatheredCalibration
+from uwlts.report.numbers import is_number, unit_of, words_of
 
 _FLAT = 1.2
+_CAPTIONS = {
+    "camera image_rms_px": "Root mean square distance between found and calculated target points of each image.",
+    "window heights_mm": "Height of the step in each image, with the estimated window distance.",
+    "window errors_mm": "Error of the step's height in each image, with the estimated window distance.",
+    "window height_std_mm": "Standard deviation of each height from the scatter of the stripe's points.",
+    "window image_distances_mm": "Window distance that each image alone would give.",
+}
 _COLOURS = (BLUE, "#c9772b", "#4f8f5b", "#7a5aa6")
 
 
@@ -24,14 +32,18 @@ def window_curve_figure(calibrations: tuple[GatheredCalibration, ...], true_mm: 
         if curve is None:
             continue
         model, colour = found.calibration.window, _COLOURS[number % len(_COLOURS)]
-        name = plain_text(found.name)
+        name, errors = plain_text(found.name), window.get("errors_mm")
+        least = None
+        if model is not None and isinstance(errors, list) and errors and all(map(is_number, errors)):
+            # The tried distances are too coarse to meet the bottom of the valley.
+            least = model.distance_mm, float(np.sqrt(np.mean(np.square(errors))))
+            curve = np.vstack([curve, least])
+            curve = curve[np.argsort(curve[:, 0])]
         figure.add_scatter(x=curve[:, 0], y=curve[:, 1], mode="lines", line={"color": colour}, name=name)
-        if model is not None:
-            known = np.isfinite(curve).all(axis=1)
-            least = float(np.interp(model.distance_mm, curve[known, 0], curve[known, 1])) if known.any() else 0.0
+        if least is not None:
             figure.add_scatter(
-                x=[model.distance_mm], y=[least], mode="markers", marker={"color": colour, "size": 11, "symbol": "diamond"},
-                name=f"{name}: {model.distance_mm:.3f} mm",
+                x=least[:1], y=least[1:], mode="markers", marker={"color": colour, "size": 11, "symbol": "diamond"},
+                name=f"{name}: {least[0]:.3f} mm, error {least[1]:.4f} mm",
             )  # fmt: skip
     if not figure.data:
         return None
@@ -52,7 +64,7 @@ def residual_figures(found: GatheredCalibration) -> list[Drawn]:
         labels = _labels(found.calibration.residuals, group, len(values))
         heights = [value if is_number(value) else None for value in values]
         known = [value for value in heights if value is not None]
-        words, unit = residual_name(name), unit_of(name)
+        words, unit = words_of(name), unit_of(name)
         figure, places = go.Figure(), labels or list(range(1, len(values) + 1))
         if min(known) > 0 and max(known) < _FLAT * min(known):
             # Bars must start at zero, where such values would all look the same.
@@ -61,10 +73,11 @@ def residual_figures(found: GatheredCalibration) -> list[Drawn]:
             figure.add_bar(x=places, y=heights, marker={"color": "#7fa6cc"})
             figure.add_hline(y=0, line={"color": INK, "width": 1})
         across = "image" if labels or "image" in name else "number"
-        layout(figure, x=across, y=f"{words} / {unit}" if unit else words, height=300)
+        layout(figure, x=across, y=f"{words} / {unit}" if unit else words, height=400 if labels else 300)
         if labels:
             figure.update_xaxes(type="category", tickangle=-40)
-        drawn.append(Drawn(figure, f"{group}: {words}, {len(known)} values" if group else words))
+        name_in_full = f"{group} {name}".strip()
+        drawn.append(Drawn(figure, _CAPTIONS.get(name_in_full, f"{group}: {words}." if group else f"{words}.")))
     return drawn
 
 

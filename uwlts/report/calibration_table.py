@@ -1,7 +1,6 @@
 """Parameters and single residual figures of calibrations side by side."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -11,9 +10,8 @@ import numpy as np
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.report.gather import Campaign, GatheredCalibration
-from uwlts.report.numbers import MISSING, fixed, plain
+from uwlts.report.numbers import MISSING, fixed, is_number, plain, unit_of, words_of
 
-_UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}
 SHORT_LIST = 3
 """Lists up to this length are written out; longer ones are drawn."""
 
@@ -52,22 +50,6 @@ def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> Comparison:
     )
 
 
-def unit_of(name: str) -> str:
-    """Unit that ends a name, as in ``rms_px``; nothing for a pure number."""
-    return _UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
-
-
-def residual_name(name: str) -> str:
-    """A name in words, without its unit."""
-    bare = name.rsplit("_", 1)[0] if unit_of(name) else name
-    return re.sub(r"_+", " ", bare)
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value from JSON is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
     std = _camera_std(calibration)
@@ -101,12 +83,16 @@ def _camera_std(calibration: Calibration) -> dict[str, float]:
 
 
 def _with_std(value: float, std: float | None, decimals: int) -> str:
-    return fixed(value, decimals) if std is None else f"{fixed(value, decimals)} ± {std:.2g}"
+    """A value, and its standard deviation with two significant digits; both with the same decimals."""
+    if std is None or not std > 0:
+        return fixed(value, decimals)
+    decimals = max(0, 1 - math.floor(math.log10(std)))
+    return f"{fixed(value, decimals)} ± {fixed(std, decimals)}"
 
 
 def _figures(table: dict[str, Any], group: str) -> Iterator[tuple[tuple[str, str], str]]:
     for name, value in table.items():
-        words = f"{group}: {residual_name(name)}" if group else residual_name(name)
+        words = f"{group}: {words_of(name)}" if group else words_of(name)
         if isinstance(value, dict):
             # Standard deviations of the camera stand beside its parameters.
             if (group, name) != ("camera", "std"):

@@ -6,7 +6,10 @@ STOPS = ((0.0, (33, 82, 172)), (0.25, (99, 161, 214)), (0.5, (205, 205, 200)), (
 """Place between -1 and +1 limit (0 to 1), and its colour red-green-blue."""
 
 UNKNOWN = (85, 85, 80)
-"""Red-green-blue of points without a deviation."""
+"""Red-green-blue of points without a deviation, among others that have one."""
+
+PLAIN = (93, 130, 168)
+"""Red-green-blue of the points of a cloud without deviations."""
 
 LIMIT_STD = 2.0
 """The colours end at this many standard deviations, as in the thesis."""
@@ -23,7 +26,7 @@ def coloured(share: np.ndarray) -> np.ndarray:
     position = (np.clip(share, -1, 1) + 1) / 2
     channels = [np.interp(position, places, channel) for channel in zip(*colours, strict=True)]
     rgb = np.round(np.nan_to_num(np.column_stack(channels))).astype(np.uint8)
-    rgb[np.isnan(share)] = UNKNOWN
+    rgb[np.isnan(share)] = PLAIN if np.isnan(share).all() else UNKNOWN
     return rgb
 
 

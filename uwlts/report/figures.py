@@ -7,8 +7,8 @@ import plotly.graph_objects as go
 
 from uwlts.cloud import PointCloud
 from uwlts.report.cloud_picture import view_direction
-from uwlts.report.colours import LIMIT_STD, UNKNOWN, colour_limit_mm, plotly_scale
-from uwlts.report.numbers import unit_for
+from uwlts.report.colours import LIMIT_STD, PLAIN, UNKNOWN, colour_limit_mm, plotly_scale
+from uwlts.report.numbers import as_fine_as, unit_for
 
 MOST_POINTS = 15_000
 INK, FAINT, BLUE, RED = "#2b3440", "#dde2e8", "#3573b1", "#b5303c"
@@ -31,7 +31,7 @@ def layout(figure: go.Figure, *, x: str, y: str, height: int = 320) -> go.Figure
     axis = {"gridcolor": FAINT, "linecolor": INK, "ticks": "outside", "zeroline": False, "automargin": True}
     return figure.update_layout(
         template="none", height=height, margin={"l": 70, "r": 20, "t": 36, "b": 56}, font={"size": 13, "color": INK},
-        xaxis=axis | {"title": {"text": x}}, yaxis=axis | {"title": {"text": y}},
+        xaxis=axis | {"title": {"text": x, "standoff": 10}}, yaxis=axis | {"title": {"text": y, "standoff": 12}},
         legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0}, hoverlabel={"namelength": -1},
         paper_bgcolor="white", plot_bgcolor="white", separators=". ",
     )  # fmt: skip
@@ -46,8 +46,8 @@ def cloud_figure(cloud: PointCloud) -> Drawn:
         shown = f"{MOST_POINTS:,} of {len(cloud):,} points, drawn at random."
     points = cloud.points_mm[chosen].astype(np.float32)
     figure = go.Figure()
-    unknown = np.ones(len(chosen), bool)
-    if cloud.deviation_mm is not None:
+    unknown, coloured = np.ones(len(chosen), bool), cloud.deviation_mm is not None
+    if coloured:
         limit = colour_limit_mm(cloud.deviation_mm)
         unit, factor = unit_for(limit)
         deviation = cloud.deviation_mm[chosen] * np.float32(factor)
@@ -64,17 +64,22 @@ def cloud_figure(cloud: PointCloud) -> Drawn:
     if unknown.any():
         figure.add_scatter3d(
             **_xyz(points[unknown]), mode="markers", name="not evaluated",
-            marker={"size": 1.5, "color": "rgb({}, {}, {})".format(*UNKNOWN)},
+            marker={"size": 1.5, "color": "rgb({}, {}, {})".format(*(UNKNOWN if coloured else PLAIN))},
             hovertemplate="X %{x:.3f}, Y %{y:.3f}, Z %{z:.3f} mm<extra>not evaluated</extra>",
         )  # fmt: skip
-        if cloud.deviation_mm is not None:
-            shown += " Dark points were not evaluated: stray, near an edge, or beside the artefact."
-    eye = dict(zip("xyz", (-1.9 * view_direction()).tolist(), strict=True))
-    scales = {f"{name}axis": {"title": {"text": f"{name.upper()} / mm"}, "gridcolor": FAINT, "color": INK} for name in "xyz"}
+        shown += (
+            " Dark points were not evaluated: stray, near an edge, or beside the artefact." if coloured
+            else " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
+        )  # fmt: skip
+    eye = dict(zip("xyz", (-1.6 * view_direction()).tolist(), strict=True))
+    scales, shape = _equal_scales(cloud.points_mm)
     figure.update_layout(
         template="none", height=520, margin={"l": 0, "r": 0, "t": 0, "b": 0}, showlegend=False,
         font={"size": 12, "color": INK},
-        scene={**scales, "aspectmode": "data", "camera": {"eye": eye, "up": {"x": 0, "y": 0, "z": -1}}},
+        scene={
+            **scales, "aspectmode": "manual", "aspectratio": shape, "dragmode": "orbit",
+            "camera": {"eye": eye, "up": {"x": 0, "y": 0, "z": -1}, "projection": {"type": "orthographic"}},
+        },
     )  # fmt: skip
     return Drawn(figure, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor.", solid=True)
 
@@ -97,7 +102,8 @@ def histogram_figure(deviation_mm: np.ndarray) -> Drawn:
         figure.add_vline(x=factor * place, line={"color": RED, "width": 1.5, "dash": dash})
     layout(figure, x=f"deviation / {unit}", y="points per bin").update_layout(bargap=0)
     beyond = len(finite) - int(counts.sum())
-    caption = f"Mean {factor * mean:.3g} {unit} (solid line), standard deviation {factor * std:.3g} {unit} (dotted)."
+    shown = [as_fine_as(factor * value, factor * std).replace("-", "−") for value in (mean, std)]
+    caption = f"Mean {shown[0]} {unit} (solid line), standard deviation {shown[1]} {unit} (dotted)."
     return Drawn(figure, caption + (f" {beyond:,} of {len(finite):,} points lie farther out." if beyond else ""))
 
 
@@ -124,14 +130,28 @@ def along_stripe_figure(cloud: PointCloud) -> Drawn | None:
     curves = np.full((3, _PLACES), np.nan)
     curves[:, enough] = factor * np.array([mean, mean - std, mean + std])
     figure = go.Figure()
-    for number, name in ((1, "mean - std"), (2, "mean + std")):
+    for number, name in ((1, "mean - standard deviation"), (2, "mean ± standard deviation")):
         line = {"color": "#9dbad6", "width": 1}
         figure.add_scatter(x=middles, y=curves[number], mode="lines", line=line, name=name, showlegend=number == 2)
-    figure.data[1].name = "mean ± standard deviation"
     figure.add_scatter(x=middles, y=curves[0], mode="lines", line={"color": BLUE, "width": 2}, name="mean")
     figure.add_hline(y=0, line={"color": INK, "width": 1})
     layout(figure, x="Y, along the stripe / mm", y=f"deviation / {unit}")
     return Drawn(figure, f"Over all images, in intervals of {edges[1] - edges[0]:.2g} mm along the stripe.")
+
+
+def _equal_scales(points: np.ndarray) -> tuple[dict[str, dict], dict[str, float]]:
+    """Axes that just hold the points, and the shape of the box in which a millimetre is the same along each."""
+    low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.ones(3))
+    half = np.maximum(0.52 * (high - low), 0.02 * max(1e-6, float((high - low).max())))
+    middle = (low + high) / 2
+    axes = {
+        f"{name}axis": {
+            "title": {"text": f"{name.upper()} / mm"}, "gridcolor": FAINT, "color": INK,
+            "range": [middle[number] - half[number], middle[number] + half[number]], "nticks": 8 if number == 1 else 5,
+        }
+        for number, name in enumerate("xyz")
+    }  # fmt: skip
+    return axes, dict(zip("xyz", (2.7 * half / half.max()).tolist(), strict=True))
 
 
 def _xyz(points: np.ndarray) -> dict[str, np.ndarray]:

@@ -126,18 +126,16 @@ def gather_campaign(folder: str | Path) -> Campaign:
     calibrations = [_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)]
     calibrations.sort(key=lambda found: (len(found.name), found.name))
     clouds = {path.stem: read_cloud(path) for path in _files(folder, "*.ply")}
-    judged = {
-        path.name.removesuffix(_EVALUATION): read_judged(path) for path in _files(folder, f"*{_EVALUATION}")
-    }
+    judged = {path.name.removesuffix(_EVALUATION): read_judged(path) for path in _files(folder, f"*{_EVALUATION}")}
     if not (clouds or judged or calibrations):
         raise CaptureError(
             f"{folder} holds {len(captures)} captures, but no cloud (.ply), evaluation ({_EVALUATION}) or calibration "
             "(calibration*.json): reconstruct and evaluate first"
         )
     by_digest = {calibration.digest: calibration for calibration in calibrations}
-    measurements = [
-        _measurement(name, clouds.get(name), judged.get(name), captures, by_digest) for name in sorted({*clouds, *judged})
-    ]
+    measurements = []
+    for name, own in sorted(_paired(clouds, judged).items()):
+        measurements.append(_measurement(name, clouds.get(own or ""), judged.get(name), captures, by_digest))
     return Campaign(
         folder=folder,
         measurements=tuple(measurements),
@@ -164,6 +162,29 @@ def _capture(path: Path) -> GatheredCapture:
 def _calibration(path: Path) -> GatheredCalibration:
     calibration = read_calibration(path)
     return GatheredCalibration(path.stem, calibration, calibration_digest(calibration))
+
+
+def _paired(clouds: dict[str, PointCloud], judged: dict[str, Judged]) -> dict[str, str | None]:
+    """Name of the cloud of every measurement: an evaluation and its cloud, or a cloud without any evaluation.
+
+    The cloud has the evaluation's name, or the one it gives. Where it holds no deviations, a copy of it that does, as
+    the evaluation writes it, takes its place.
+    """
+    pairs: dict[str, str | None] = {}
+    taken = set()
+    for name, found in judged.items():
+        source = name if name in clouds else Path(found.cloud).stem
+        pairs[name] = source if source in clouds else None
+        if source not in clouds:
+            continue
+        taken.add(source)
+        if clouds[source].deviation_mm is None:
+            for copy, cloud in clouds.items():
+                same = np.array_equal(cloud.points_mm, clouds[source].points_mm)
+                if same and cloud.deviation_mm is not None and copy not in judged:
+                    pairs[name] = copy
+                    taken.add(copy)
+    return pairs | {name: name for name in clouds if name not in taken and name not in judged}
 
 
 def _measurement(

@@ -20,8 +20,8 @@ _TILES = {
 _EXPLANATIONS = {
     "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free (VDI/VDE "
     "2634: SSE is its error).",
-    "probing error PE": "Range of the points' distances from the fitted sphere, after at most 0.3 % of stray points are "
-    "left out (VDI/VDE 2634); of several spheres the worst.",
+    "probing error PE": "Range of the points' distances from the fitted sphere without stray points, of which VDI/VDE 2634 "
+    "allows 0.3 %; of several spheres the worst.",
     "range error RE": "Range of the points' distances from the fitted plane.",
     "deviations STD": "Standard deviation of the points' distances from the fitted surface; of several surfaces the "
     "largest.",
@@ -57,11 +57,13 @@ def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile
         count = len(found["by_measurement"])
         if count:
             mean = published.get(key, {}).get("mean_abs")
-            note = f"mean size over {count} measurements" if count > 1 else "one measurement"
-            tiles.append(Tile(name, small_length(found["mean_abs"]), note, None if mean is None else small_length(mean)))
+            note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
+            covered = len(published.get(key, {}).get("by_measurement", ()))
+            theirs = None if mean is None else small_length(mean) + (f" for {covered} of them" if covered < count else "")
+            tiles.append(Tile(name, small_length(found["mean_abs"]), note, theirs))
     truth = content["truth"]
     if truth["share_within_tolerance"] is not None:
-        name = f"Points within {small_length(truth['tolerance_mm'])} of the truth"
+        name = f"Points within {1e3 * truth['tolerance_mm']:g} µm of the truth"
         note = f"rms distance {small_length(truth['rms_mm'])}"
         tiles.append(Tile(name, f"{100 * truth['share_within_tolerance']:.2f} %", note, None))
     window = content["window_distance_mm"]

@@ -1,8 +1,11 @@
-"""Numbers as text: lengths to a micrometre, no negative zero, a dash for what is missing."""
+"""Numbers and their names as text: lengths to a micrometre, no negative zero, a dash for what is missing."""
 
 import math
+import re
+from typing import Any
 
 MISSING = "-"
+_UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}
 
 
 def fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> str:
@@ -14,11 +17,11 @@ def fixed(value: float | None, decimals: int = 3, *, signed: bool = False) -> st
 
 
 def small_length(value_mm: float | None, *, signed: bool = False) -> str:
-    """A length with its unit: micrometres with one decimal below a millimetre, else millimetres with three."""
+    """A length with its unit: micrometres with one decimal (two below 1 µm), or from 1 mm on millimetres with three."""
     if value_mm is None or not math.isfinite(value_mm):
         return MISSING
     if abs(value_mm) < 1:
-        return f"{fixed(1e3 * value_mm, 1, signed=signed)} µm"
+        return f"{fixed(1e3 * value_mm, 1 if abs(value_mm) >= 1e-3 else 2, signed=signed)} µm"
     return f"{fixed(value_mm, signed=signed)} mm"
 
 
@@ -27,6 +30,28 @@ def plain(value: float) -> str:
     if float(value).is_integer() and abs(value) < 1e9:
         return f"{value:.0f}"
     return f"{value:.4g}"
+
+
+def as_fine_as(value: float, scale: float) -> str:
+    """A number with as many decimals as three significant digits of a scale have."""
+    decimals = 2 - math.floor(math.log10(scale)) if scale > 0 else 3
+    return fixed(value, max(0, decimals))
+
+
+def unit_of(name: str) -> str:
+    """Unit that ends a name, as in ``rms_px``; nothing for a pure number."""
+    return _UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
+
+
+def words_of(name: str) -> str:
+    """A name in words, without its unit."""
+    bare = name.rsplit("_", 1)[0] if unit_of(name) else name
+    return re.sub(r"_+", " ", bare)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value from JSON is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def unit_for(spread_mm: float) -> tuple[str, float]:

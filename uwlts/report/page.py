@@ -18,8 +18,8 @@ from uwlts.report.calibration_figures import residual_figures, seconds_figure, w
 from uwlts.report.calibration_table import parameter_table, residual_table
 from uwlts.report.figures import Drawn, along_stripe_figure, cloud_figure, histogram_figure
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement
-from uwlts.report.headline import headline_tiles, introduction, explanations
-from uwlts.report.numbers import MISSING, fixed, small_length
+from uwlts.report.headline import explanations, headline_tiles, introduction
+from uwlts.report.numbers import MISSING, fixed, is_number, small_length, unit_of, words_of
 from uwlts.report.pictures import cloud_png, data_uri, stripe_png
 from uwlts.report.published import Reference
 from uwlts.report.table import Row, summary_table, true_window_distance
@@ -121,7 +121,7 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
     if judged is not None and judged.artefact is not None:
         artefact = judged.artefact.model_dump(mode="json", exclude_none=True)
         kind = artefact.pop("kind")
-        facts.append(("artefact", f"{kind}: {', '.join(f'{_words(k)} {_value(v)}' for k, v in artefact.items())}"))
+        facts.append(("artefact", f"{kind}: {_pairs(artefact)}"))
     if capture is not None:
         laser = len(capture.laser_images)
         facts.append(("capture", f"{capture.path.name}, {capture.images} images, {laser} with the laser on"))
@@ -145,7 +145,7 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
 def _truth(measurement: Measurement) -> list[tuple[str, str]]:
     truth = measurement.judged.truth
     return [
-        (f"points within {small_length(truth.tolerance_mm)}", f"{100 * truth.share_within_tolerance:.2f} %"),
+        (f"points within {1e3 * truth.tolerance_mm:g} µm", f"{100 * truth.share_within_tolerance:.2f} %"),
         ("mean distance", small_length(truth.mean_mm, signed=True)),
         ("standard deviation", small_length(truth.std_mm)),
         ("rms distance", small_length(truth.rms_mm)),
@@ -164,11 +164,19 @@ def _calibration(campaign: Campaign, collected: _Figures) -> dict[str, Any] | No
     return {
         "parameters": parameter_table(campaign),
         "residuals": residual_table(campaign.calibrations),
+        "warnings": [
+            (found.name, text) for found in campaign.calibrations for text in _warnings(found.calibration.provenance)
+        ],
         "curve": collected.add(window_curve_figure(campaign.calibrations, true_window_distance(campaign))),
         "groups": [
             (found.name, [collected.add(drawn) for drawn in residual_figures(found)]) for found in campaign.calibrations
         ],
     }
+
+
+def _warnings(provenance: dict[str, Any]) -> list[str]:
+    found = provenance.get("warnings")
+    return [_value(text) for text in found] if isinstance(found, list) else []
 
 
 def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
@@ -197,16 +205,16 @@ def _recorded(capture: GatheredCapture) -> str:
 
 
 def _pairs(table: dict[str, Any]) -> str:
-    return "; ".join(f"{_words(key)} {_value(value)}" for key, value in table.items())
-
-
-def _words(key: str) -> str:
-    return key.replace("_", " ")
+    return "; ".join(f"{words_of(key)} {_value(value)} {unit_of(key)}".rstrip() for key, value in table.items())
 
 
 def _value(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(_value, value)) or "none"
+    if isinstance(value, dict):
+        return f"({_pairs(value)})"
+    if is_number(value):
+        return f"{value:g}" if isinstance(value, float) else str(value)
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 

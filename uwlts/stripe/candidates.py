@@ -45,7 +45,7 @@ def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.nda
     return np.vstack([high, rest.max(axis=0)]), np.vstack([low, np.minimum(rest[0], rest[rest.shape[0] // 2])])
 
 
-def block_contrast(high: np.ndarray, low: np.ndarray) -> np.ndarray:
+def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.ndarray:
     """How far each block sticks out of its surroundings, grey levels, 0 or more; arrays as of `block_extremes`.
 
     At the ends of a line, where there is nothing two blocks away, the other side counts alone.
@@ -55,7 +55,7 @@ def block_contrast(high: np.ndarray, low: np.ndarray) -> np.ndarray:
     surroundings[:2] = low[2:4]
     surroundings[-2:] = low[-4:-2]
     np.minimum(high, surroundings, out=surroundings)
-    return np.subtract(high, surroundings, out=surroundings)
+    return np.subtract(high, surroundings, out=out)
 
 
 def noise_from_contrast(contrast: np.ndarray, block: int) -> float:

@@ -67,9 +67,9 @@ def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest: int) -> list[np.ndarray]:
     """M0 ... Mk of the profile above `lobe.base` under the Gaussian weight at `centre`; see `_zero_crossing`."""
-    # Rows beyond the weight of every lobe, less than 4e-4 there, are left out.
+    # Rows beyond the weight of every lobe, less than 0.003 there, are left out.
     size = lobe.window.shape[0]
-    reach = 4.0 * float(sigma.max())
+    reach = 3.5 * float(sigma.max())
     rows = slice(max(0, math.floor(float(centre.min()) - reach)), min(size, math.ceil(float(centre.max()) + reach) + 1))
     t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] - centre
     t *= np.float32(1.0) / sigma

@@ -86,9 +86,10 @@ def extract_stripe(
         signal = average_lines(signal, options.smoothing_lines, stripe_along=stripe_along)
     profiles = as_profiles(signal, stripe_along=stripe_along)
     high, low = block_extremes(profiles, block)
-    contrast = block_contrast(high, low)
-    noise = noise_from_contrast(contrast, block)
-    found = _search(profiles, contrast, noise, options)
+    # Two blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
+    board = np.zeros((high.shape[0] + 4, high.shape[1]), high.dtype)
+    contrast = block_contrast(high, low, out=board[2:-2])
+    found = _search(profiles, board, noise_from_contrast(contrast, block), options)
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -119,14 +120,13 @@ class _Lines:
             values[lines] = np.nan
 
 
-def _search(profiles: np.ndarray, contrast: np.ndarray, noise: float, options: StripeOptions) -> _Lines:
+def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: StripeOptions) -> _Lines:
     """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
 
-    Under rule `strongest` a line with a stripe is searched once more for a second one.
+    Under rule `strongest` a line with a stripe is searched once more for a second one. `board` holds the contrasts with
+    two blocks more at either end; blocks that are done with are set to 0 in it.
     """
     block = options.half_window_px // 2
-    board = np.zeros((contrast.shape[0] + 4, contrast.shape[1]), contrast.dtype)
-    board[2:-2] = contrast
     found = _Lines.empty(board.shape[1])
     coarse = coarse_threshold(noise, block=block, floor=options.threshold_floor)
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))

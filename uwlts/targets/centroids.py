@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uwlts.targets.edges import PROFILES, REACH_OVER_MINOR_AXIS, rim_directions, sample
+from uwlts.targets.edges import REACH_OVER_MINOR_AXIS, rim_directions, sample
 
 PASSES = 2
 
@@ -11,6 +11,11 @@ PASSES = 2
 REACH_TIMES_SLOPE = 1.2
 MIN_REACH_PX = 2.5
 MAX_REACH_PX = 8.0
+
+MIN_RELATIVE_CONTRAST = 0.25
+
+# A centroid further from the ellipse's centre than this has something other than a circle in its band.
+MAX_SHIFT_PX = 0.5
 
 
 def area_centroids(grey, ellipses):
@@ -30,16 +35,20 @@ def area_centroids(grey, ellipses):
 
     Returns
     -------
-    (N, 2) float64, px, (u, v)
+    centres : (N, 2) float64, px, (u, v)
+    agree : (N,) bool
+        Whether the centroid is next to the ellipse's centre; where not, the ellipse's centre is given.
     """
-    centres = ellipses.centres.copy()
-    if len(centres) == 0:
-        return centres
+    centres, agree = ellipses.centres.copy(), np.ones(len(ellipses), bool)
+    if len(ellipses) == 0:
+        return centres, agree
     wanted, *reaches = _reaches(grey.shape, ellipses)
     for _ in range(PASSES):
         planes = _level_planes(grey, centres, ellipses.shapes, reaches, wanted)
-        centres = _centroids(grey, centres, ellipses.shapes, reaches, planes)
-    return centres
+        moved = _centroids(grey, centres, ellipses.shapes, reaches, planes)
+        agree &= np.linalg.norm(moved - ellipses.centres, axis=1) < MAX_SHIFT_PX
+        centres = np.where(agree[:, None], moved, ellipses.centres)
+    return centres, agree
 
 
 def _reaches(shape, ellipses):
@@ -92,9 +101,14 @@ def _centroids(grey, centres, shapes, reaches, planes):
     u = np.arange(total) - np.repeat(np.cumsum(lengths) - lengths - starts, lengths)
     v, blob = np.repeat(np.tile(v, 2), lengths), np.repeat(np.tile(blob, 2), lengths)
     du, dv = u - centres[blob, 0], v - centres[blob, 1]
-    inside, outside = (value[blob] + slope_u[blob] * du + slope_v[blob] * dv for value, slope_u, slope_v in
-                       (planes[:, side].T for side in (0, 1)))
-    share = (grey[v, u] - outside) / (inside - outside)
+    inside, outside = (
+        value[blob] + slope_u[blob] * du + slope_v[blob] * dv
+        for value, slope_u, slope_v in (planes[:, side].T for side in (0, 1))
+    )
+    contrast = (planes[:, 0, 0] - planes[:, 1, 0])[blob]
+    # Planes that meet within the band belong to no circle; their share stays finite, and the centre shows it.
+    relative = np.maximum((inside - outside) / contrast, MIN_RELATIVE_CONTRAST)
+    share = (grey[v, u] - outside) / (relative * contrast)
     area += np.bincount(blob, share, len(centres))
     sum_u += np.bincount(blob, share * du, len(centres))
     sum_v += np.bincount(blob, share * dv, len(centres))

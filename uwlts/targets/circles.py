@@ -31,7 +31,8 @@ def find_circles(image):
         The image is no grey image of 8 or 16 bit.
     """
     ellipses = fit_ellipses(image, find_blobs(image))
-    return replace(ellipses, centres=area_centroids(image.astype(np.float32), ellipses))
+    centres, agree = area_centroids(image.astype(np.float32), ellipses)
+    return replace(ellipses, centres=centres)[agree]
 
 
 def mark_strength(image, circles, *, mark_over_circle):

@@ -56,7 +56,9 @@ class CircleTarget(_Description):
         for name, (di, dj) in (("origin", (0, 0)), ("marker_x", self.marker_x), ("marker_y", self.marker_y)):
             i, j = self.origin[0] + di, self.origin[1] + dj
             if not (0 <= i < self.columns and 0 <= j < self.rows):
-                raise ValueError(f"{name} is at ({i}, {j}); expected a place of the {self.columns} x {self.rows} lattice")
+                raise ValueError(
+                    f"{name} is at ({i}, {j}); expected a place of the {self.columns} x {self.rows} lattice"
+                )
         if self.marker_x[0] * self.marker_y[1] == self.marker_x[1] * self.marker_y[0]:
             raise ValueError(
                 f"marker_x {self.marker_x} and marker_y {self.marker_y} lie on one line with the origin; "

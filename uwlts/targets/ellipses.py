@@ -14,8 +14,8 @@ PASSES = 2
 # small blob half the minor semi-axis is all there is before the opposite edge is felt.
 REACH_PX = 2.5
 
-# Largest rms distance of the edge from its ellipse: absolute, as a share of the mean radius, against what the noise of a
-# single pixel does to an edge, and against the median of all blobs of the image, which have about the same noise and blur.
+# Largest rms distance of the edge from its ellipse: absolute, as a share of the mean radius, against what the noise of
+# a single pixel does to an edge, and against the median of all blobs, which have about the same noise and blur.
 MAX_RESIDUAL_PX = 0.15
 MAX_RESIDUAL_OVER_RADIUS = 0.01
 MAX_RESIDUAL_OVER_NOISE = 1.5
@@ -90,12 +90,13 @@ def fit_ellipses(image, blobs):
     centres, shapes = blobs.centres, blobs.shapes
     kept = np.ones(len(centres), bool)
     for _ in range(PASSES):
-        centres, shapes = _inside(grey.shape, centres[kept], shapes[kept])
+        kept = kept & _inside(grey.shape, centres, shapes)
+        centres, shapes = centres[kept], shapes[kept]
         if len(centres) == 0:
             break
         edge = _edges(grey, centres, shapes, bright=blobs.bright, noise=noise)
         centres, shapes, residual, fitted = _moved(centres, shapes, edge)
-        kept = edge.whole & fitted
+        kept = edge.whole & fitted & _inside(grey.shape, centres, shapes)
     if len(centres) == 0:
         empty = np.empty(0)
         return Ellipses(np.empty((0, 2)), np.empty((0, 2, 2)), empty, empty, empty, blobs.bright)
@@ -121,11 +122,10 @@ class _Edges:
 
 
 def _inside(shape, centres, shapes):
-    """The ellipses whose profiles stay within the image."""
+    """Whether the profiles of ellipses stay within the image, (N,) bool."""
     half_width = np.sqrt((shapes**2).sum(2)) + REACH_PX
     limit = np.array([shape[1], shape[0]]) - 1.001
-    inside = (centres - half_width >= 0).all(1) & (centres + half_width <= limit).all(1)
-    return centres[inside], shapes[inside]
+    return (centres - half_width >= 0).all(1) & (centres + half_width <= limit).all(1)
 
 
 def _edges(grey, centres, shapes, *, bright, noise):

@@ -127,7 +127,7 @@ def label_lattice(centres, shapes):
 
 
 def _bases(centres, shapes, tree):
-    """Steps (N, 2, 2) along i (row 0) and j (row 1) to each circle's nearest neighbours, and the sine between them (N,).
+    """Steps (N, 2, 2) along i (row 0) and j (row 1) to each circle's nearest neighbours, and the sine between, (N,).
 
     The second step is zero where there is none.
     """
@@ -161,8 +161,8 @@ def _seeds(centres, radii, bases, sines, tree):
     # An edge of a narrow plate may have no circle with four neighbours; two at a right angle are then enough.
     partial = np.sort(distance[:, :2] / np.maximum(step, 1e-9), 1)[:, 1]
     usable = (step > 0).all(1) & (partial < TOLERANCE)
-    # Over the square of the radius the lattice's cell has one size in the whole image, whatever the perspective. Next to
-    # gaps two diagonals may pass for a basis; their cell is twice as large.
+    # Over the square of the radius the lattice's cell has one size in the whole image, whatever the perspective. Next
+    # to gaps two diagonals may pass for a basis; their cell is twice as large.
     cell = _cross(bases[:, 0], bases[:, 1]) / radii**2
     if usable.any():
         usable &= np.abs(np.log(np.maximum(cell, 1e-9) / np.median(cell[usable]))) < np.log(MAX_CELL_RATIO)
