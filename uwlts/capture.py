@@ -9,7 +9,6 @@ While it is being recorded the file is called ``NAME.part`` and every frame is f
 an interrupted recording keeps all its complete frames; closing it gives it its name.
 """
 
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,10 +21,10 @@ import hdf5plugin
 import numpy as np
 from pydantic import Field, field_validator
 
-from uwlts.errors import CaptureError, ImageError, OutputError, UwltsError
-from uwlts.library import validated
+from uwlts.errors import CaptureError, ImageError, OutputError
+from uwlts.file_label import read_label, write_label
 from uwlts.sensor import Description, Medium, Sensor, Vector
-from uwlts.unfinished import has_writer, open_unfinished
+from uwlts.unfinished import UnfinishedFile, has_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 1
@@ -104,15 +103,8 @@ class CaptureWriter:
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
-        if self.path.exists() and not self.path.is_file():
-            raise OutputError(f"{self.path} exists and is not a regular file; give another name")
-        if self.path.exists() and not overwrite:
-            raise OutputError(f"{self.path} exists already; give another name, or --overwrite to replace it")
-        if not self.path.parent.is_dir():
-            raise OutputError(f"the folder {self.path.parent} does not exist; create it first")
-        if self._part.exists() and not (resume or overwrite):
-            raise OutputError(f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite")
         try:
+            self._refuse_existing(overwrite=overwrite, resume=resume)
             if resume and self._part.exists():
                 with self._left_over() as unfinished:
                     self._begin(unfinished)
@@ -122,6 +114,16 @@ class CaptureWriter:
             self._file.swmr_mode = True
         except (OSError, RuntimeError) as error:
             raise self._storage_failed(error) from error
+
+    def _refuse_existing(self, *, overwrite: bool, resume: bool) -> None:
+        if self.path.exists() and not self.path.is_file():
+            raise OutputError(f"{self.path} exists and is not a regular file; give another name")
+        if self.path.exists() and not overwrite:
+            raise OutputError(f"{self.path} exists already; give another name, or --overwrite to replace it")
+        if not self.path.parent.is_dir():
+            raise OutputError(f"the folder {self.path.parent} does not exist; create it first")
+        if self._part.exists() and not (resume or overwrite):
+            raise OutputError(f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite")
 
     def _left_over(self) -> "Capture":
         """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
@@ -154,7 +156,7 @@ class CaptureWriter:
             fresh.unlink(missing_ok=True)
 
     def _lay_out(self) -> None:
-        self._file.attrs.update(format=FORMAT, version=VERSION, header=self.header.model_dump_json())
+        write_label(self._file, format=FORMAT, version=VERSION, header=self.header)
         # The checksum finds damage that the compression would decode to a different picture.
         self._file.create_dataset(
             "frames", (0, *self._shape), self._dtype, maxshape=(None, *self._shape), chunks=(1, *self._shape),
@@ -269,11 +271,11 @@ class Capture:
         try:
             # Reading must never be in the way of the writer, so nothing is locked.
             unfinished = not self.finished or has_writer(self.path)
-            self.file = open_unfinished(self.path) if unfinished else h5py.File(self.path, "r", locking=False)
+            self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r", locking=False)
         except _DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 cannot open it ({error})") from error
         try:
-            self._read_header()
+            self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
             self._read_frames()
         except _DAMAGE as error:
             self.file.close()
@@ -281,19 +283,6 @@ class Capture:
         except BaseException:
             self.file.close()
             raise
-
-    def _read_header(self) -> None:
-        found, version = (self.file.attrs.get(name) for name in ("format", "version"))
-        if not isinstance(found, str) or found != FORMAT:
-            raise CaptureError(f"{self.path} is HDF5 but not a capture: format is {found!r}, expected '{FORMAT}'")
-        if not isinstance(version, int | np.integer) or version < 1:
-            raise CaptureError(f"{self.path} is damaged: version is {version!r}, expected a whole number from 1")
-        if version > VERSION:
-            raise CaptureError(f"{self.path} has version {version}; this program reads up to {VERSION}: update it")
-        try:
-            self.header = validated(CaptureHeader, json.loads(self.file.attrs["header"]), f"the header of {self.path}")
-        except UwltsError as error:
-            raise CaptureError(str(error)) from error
 
     def _read_frames(self) -> None:
         camera = self.header.sensor.camera

@@ -234,7 +234,14 @@ def evaluate(
 
 
 @app.command
-def report(folder: Path, *, reference: str | None = None, out: Path | None = None, overwrite: Flag = False) -> None:
+def report(
+    folder: Path,
+    *,
+    reference: str | None = None,
+    out: Path | None = None,
+    pictures: Path | None = None,
+    overwrite: Flag = False,
+) -> None:
     """Gather a campaign's files into one page with pictures, a summary and a table on the terminal.
 
     The folder holds captures NAME.h5, coloured clouds NAME.ply, evaluations NAME.evaluation.json and calibrations.
@@ -248,17 +255,29 @@ def report(folder: Path, *, reference: str | None = None, out: Path | None = Non
     reference
         Published values to set beside the measured ones: name (thesis) or path of a TOML file.
     out
-        Page to write; FOLDER/report.html unless given.
+        Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
+    pictures
+        Also write every measurement's stripe and cloud as PNG files into this folder.
     overwrite
         Replace an existing report, summary and pictures.
     """
-    from uwlts.report import gather_campaign, load_reference, print_table, summary_table, write_report, write_summary
+    from uwlts.report import (
+        gather_campaign,
+        load_reference,
+        print_table,
+        summary_table,
+        write_pictures,
+        write_report,
+        write_summary,
+    )
 
     campaign = gather_campaign(folder)
     published = load_reference(reference) if reference else None
     page = out or folder / "report.html"
     write_summary(page.with_name("summary.json"), campaign, published, overwrite=overwrite)
     write_report(page, campaign, published, overwrite=overwrite)
+    if pictures:
+        write_pictures(pictures, campaign, overwrite=overwrite)
     print_table(summary_table(campaign, published))
     print(f"wrote {page} and {page.with_name('summary.json')}")
 

@@ -89,7 +89,7 @@ def read_evaluation(path: str | Path) -> dict[str, Any]:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise CaptureError(f"cannot read the evaluation {path}: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path} is not an evaluation, or is truncated: {error}") from error
     if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
         raise CaptureError(f"{path} is JSON but not an evaluation that this program reads (version {VERSION})")

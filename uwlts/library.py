@@ -4,6 +4,7 @@ Names are looked up in the library that ships with the package: ``scenes/sensors
 A description may name a ``base`` of its own kind and give only what differs from it.
 """
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -48,7 +49,7 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DescriptionError(f"{path} is not valid TOML: {error}") from error
     except OSError as error:
         raise DescriptionError(f"cannot read {path}: {error.strerror}") from error
@@ -75,9 +76,13 @@ def validated(model: type[AnyDescription], table: dict[str, Any], source: str | 
         return model.model_validate(table)
     except ValidationError as error:
         lines = [_explained(problem) for problem in error.errors()]
-        raise DescriptionError(f"{source} is not a valid {model.__name__.lower()}:\n" + "\n".join(lines)) from error
+        raise DescriptionError(f"{source} is not a valid {_words(model)}:\n" + "\n".join(lines)) from error
     except UwltsError as error:
         raise type(error)(f"{source}: {error}") from error
+
+
+def _words(model: type[Description]) -> str:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
 
 
 def _explained(problem: Any) -> str:

@@ -9,11 +9,13 @@ import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError
+from uwlts.file_label import read_label, write_label
 from uwlts.files import written_aside
 from uwlts.sensor import Description, Medium, Sensor
 
 FORMAT = "uwlts-truth"
 VERSION = 1
+_DIMENSIONS = {"centre_px": 2, "point_mm": 3, "normal": 3, "status": 2, "crossings": 2, "depth_mm": 2}
 
 
 class TruthStatus(IntEnum):
@@ -58,20 +60,42 @@ def truth_path(capture: str | Path) -> Path:
 def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
     """Write a truth file whole or not at all; OutputError where that fails."""
     with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w") as file:
-        file.attrs.update(format=FORMAT, version=VERSION, header=header.model_dump_json())
+        write_label(file, format=FORMAT, version=VERSION, header=header)
         for field in fields(truth):
             file.create_dataset(field.name, data=getattr(truth, field.name), compression="gzip", compression_opts=1)
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
-    """Read a truth file; CaptureError where it is missing, foreign, newer or damaged."""
+    """Read a truth file; CaptureError where it is missing, foreign, newer, damaged, or contradicts itself."""
     if not Path(path).is_file():
         raise CaptureError(f"no truth file at {path}")
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT or file.attrs["version"] > VERSION:
-                raise CaptureError(f"{path} is not a truth file this program reads: {dict(file.attrs).get('format')!r}")
-            header = TruthHeader.model_validate_json(file.attrs["header"])
-            return header, Truth(**{field.name: file[field.name][:] for field in fields(Truth)})
-    except (OSError, KeyError, ValueError) as error:
+            header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
+            arrays = {field.name: _array(file, field.name, path) for field in fields(Truth)}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
+    truth = Truth(**arrays)
+    _require_consistent(truth, path)
+    return header, truth
+
+
+def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
+    dataset = file.get(name)
+    kinds = "iu" if name in ("status", "crossings") else "f"
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kinds or dataset.ndim != _DIMENSIONS[name]:
+        raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {_DIMENSIONS[name]} dimensions")
+    return dataset[...]
+
+
+def _require_consistent(truth: Truth, path: str | Path) -> None:
+    lines = truth.status.shape
+    shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}
+    expected = {name: lines if _DIMENSIONS[name] == 2 else (*lines, 3) for name in shapes}
+    if shapes != expected:
+        raise CaptureError(f"{path} contradicts itself: its arrays have the shapes {shapes}")
+    if not np.isin(truth.status, list(TruthStatus)).all():
+        raise CaptureError(f"{path} holds unknown statuses; known are {[int(status) for status in TruthStatus]}")
+    visible = truth.status == TruthStatus.VISIBLE
+    if not all(np.isfinite(values[visible]).all() for values in (truth.centre_px, truth.point_mm, truth.normal)):
+        raise CaptureError(f"{path} says that a stripe is visible where centre, point or normal are not finite")

@@ -26,9 +26,21 @@ def has_writer(path: str | Path) -> bool:
     return len(start) == _SIZE and start.startswith(_SIGNATURE_AND_VERSION) and start[_FLAGS] != 0
 
 
-def open_unfinished(path: str | Path) -> h5py.File:
+class UnfinishedFile(h5py.File):
     """The file for reading as its writer last flushed it; errors as of ``h5py.File``."""
-    return h5py.File(_AsIfClosed(path), "r")
+
+    def __init__(self, path: str | Path):
+        self._view = _AsIfClosed(path)
+        try:
+            super().__init__(self._view, "r")
+        except BaseException:
+            self._view.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        super().close()
+        self._view.close()
 
 
 class _AsIfClosed(io.FileIO):

@@ -224,7 +224,7 @@ def test_anything_at_all_gives_a_status_and_agreeing_fields(dtype, rule, method)
     seen = set()
     for image in images:
         for along in ("height", "width"):
-            options = StripeOptions(method=method, peak=rule, threshold_sigmas=2)
+            options = StripeOptions(method=method, peak=rule, threshold_sigmas=2, end_lines=0)
             found = extract_stripe(image.astype(dtype), stripe_along=along, options=options)
             ok = found.status == StripeStatus.OK
             for values in (found.centre_px, found.amplitude, found.width_px):
@@ -353,7 +353,8 @@ def test_stripe_of_six_times_the_noise_is_found(sigma):
     rng = np.random.default_rng(7)
     centre = 640 + rng.uniform(-100, 100, 2000)
     image = gaussian(centre, sigma=sigma, amplitude=18, length=1280) + 30 + 3 * rng.standard_normal((2000, 1280))
-    found = rows(grey(image))
+    # The stripe jumps from line to line, so its ends have to stay.
+    found = rows(grey(image), options=StripeOptions(end_lines=0))
     ok = found.status == StripeStatus.OK
     assert ok.mean() > 0.95
     # The bound is 0.22 to 0.31 px; 1 % of the lines may lie on noise instead.
@@ -463,3 +464,25 @@ def test_bad_settings_are_refused(settings_, words):
 def test_bad_options_are_refused(wrong):
     with pytest.raises(RangeError, match=next(iter(wrong))):
         StripeOptions(**wrong)
+
+
+def test_lines_next_to_an_end_or_a_jump_are_left_out():
+    centre = np.where(np.arange(120) < 60, 40.0, 70.0)
+    image = grey(gaussian(centre, sigma=2, amplitude=150) + 10)
+    image[90:] = 10  # the stripe ends after line 89
+    image[20:22] = 10  # and is lost for two lines, which is no end
+    found = rows(image)
+    ends = np.flatnonzero(found.status == StripeStatus.END)
+    assert ends.tolist() == [58, 59, 60, 61, 88, 89]
+    assert np.isnan(found.centre_px[ends]).all()
+    assert np.flatnonzero(found.status == StripeStatus.NO_STRIPE).tolist() == [20, 21, *range(90, 120)]
+    kept = rows(image, options=StripeOptions(end_lines=0))
+    assert (kept.status[ends] == StripeStatus.OK).all()
+    more = rows(image, options=StripeOptions(end_lines=5))
+    assert np.flatnonzero(more.status == StripeStatus.END).tolist() == [*range(55, 65), *range(85, 90)]
+
+
+def test_a_stripe_shorter_than_its_two_ends_gives_no_points():
+    image = np.full((40, 128), 10, np.uint8)
+    image[20:23] = grey(gaussian(np.full(3, 60.0), sigma=2, amplitude=150, length=128) + 10)
+    assert (rows(image).status[20:23] == StripeStatus.END).all()

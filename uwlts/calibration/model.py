@@ -19,8 +19,8 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]
 class CameraModel(Description):
     """Pinhole with Brown-Conrady distortion, as OpenCV has it; pixel (0, 0) is the centre of the first pixel."""
 
-    width_px: int
-    height_px: int
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
     fx_px: Positive
     fy_px: Positive
     cx_px: float
@@ -79,17 +79,35 @@ class Calibration(Description):
     provenance: dict[str, Any] = {}
 
     @model_validator(mode="after")
-    def _rigid(self) -> "Calibration":
-        rotation = np.array(self.camera_from_object)[:3, :3]
-        if np.shape(self.camera_from_object) != (4, 4) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
-            raise ValueError("camera_from_object must be a 4x4 rigid transform")
-        if not np.isclose(np.linalg.norm(self.sheet.normal), 1, atol=1e-6):
-            raise ValueError(f"the sheet's normal {self.sheet.normal} is not a unit vector")
+    def _consistent(self) -> "Calibration":
+        if not _is_rigid(self.camera_from_object):
+            raise ValueError("camera_from_object must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
+        _require_unit(self.sheet.normal, "the sheet's normal")
+        if self.window is not None:
+            _require_unit(self.window.normal, "the window's normal")
+        try:
+            json.dumps([self.residuals, self.provenance], allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
         return self
 
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""
         return np.array(self.camera_from_object)
+
+
+def _is_rigid(matrix: Matrix4) -> bool:
+    """Whether a matrix (4, 4) is a rotation, not a reflection, and a shift; to 1e-6, as text may be rounded."""
+    if len(matrix) != 4:
+        return False
+    rotation = np.array(matrix)[:3, :3]
+    square = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+    return square and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
+
+
+def _require_unit(vector: Vector, name: str) -> None:
+    if not np.isclose(np.linalg.norm(vector), 1, atol=1e-6):
+        raise ValueError(f"{name} {vector} is not a unit vector")
 
 
 def write_calibration(path: str | Path, calibration: Calibration, *, overwrite: bool = False) -> None:
@@ -105,7 +123,7 @@ def read_calibration(path: str | Path) -> Calibration:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise CaptureError(f"cannot read the calibration {path}: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path} is not a calibration, or is truncated: {error}") from error
     if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
         raise CaptureError(f"{path} is JSON but not a calibration: expected \"format\": \"{FORMAT}\"")

@@ -69,7 +69,8 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
         residuals = calibration.residuals.get("window")
         known = residuals.get("std_mm") if isinstance(residuals, dict) else None
         table["window distance d", "mm"] = _with_std(window.distance_mm, known if is_number(known) else None, 3)
-        table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, window.normal[2] / np.linalg.norm(window.normal)))), 3)
+        cosine = float(window.normal[2] / np.linalg.norm(window.normal))
+        table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
         if window.refractions == 2:
             table["glass thickness", "mm"] = fixed(window.thickness_mm)
             table["index of the glass", ""] = fixed(window.glass_index, 4)

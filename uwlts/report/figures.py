@@ -1,4 +1,4 @@
-"""Interactive figures of one measurement: the cloud, its deviations' distribution, and where along the stripe they lie."""
+"""Interactive figures of one measurement: its cloud, its deviations, and where along the stripe they lie."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,12 @@ import plotly.graph_objects as go
 from uwlts.cloud import PointCloud
 from uwlts.report.cloud_picture import view_direction
 from uwlts.report.colours import LIMIT_STD, PLAIN, UNKNOWN, colour_limit_mm, plotly_scale
-from uwlts.report.numbers import as_fine_as, unit_for
+from uwlts.report.numbers import as_fine_as, typographic, unit_for
 
 MOST_POINTS = 15_000
 INK, FAINT, BLUE, RED = "#2b3440", "#dde2e8", "#3573b1", "#b5303c"
 _SEED = 0
+_PLACE = "X %{x:.3f}, Y %{y:.3f}, Z %{z:.3f} mm"
 _BINS, _SHOWN_STD = 81, 4.0
 _PLACES, _LEAST_OF_PLACE = 120, 5
 
@@ -55,17 +56,18 @@ def cloud_figure(cloud: PointCloud) -> Drawn:
         figure.add_scatter3d(
             **_xyz(points[~unknown]), mode="markers", name="evaluated",
             marker={
-                "size": 2, "color": deviation[~unknown], "colorscale": plotly_scale(), "cmin": -factor * limit,
-                "cmax": factor * limit, "colorbar": {"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
+                "size": 2, "color": deviation[~unknown], "colorscale": plotly_scale(),
+                "cmin": -factor * limit, "cmax": factor * limit,
+                "colorbar": {"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
             },
-            hovertemplate=f"X %{{x:.3f}}, Y %{{y:.3f}}, Z %{{z:.3f}} mm<br>deviation %{{marker.color:.4g}} {unit}<extra></extra>",
+            hovertemplate=f"{_PLACE}<br>deviation %{{marker.color:.4g}} {unit}<extra></extra>",
         )  # fmt: skip
         shown += f" The colours end at {LIMIT_STD:g} standard deviations, ±{factor * limit:.3g} {unit}."
     if unknown.any():
         figure.add_scatter3d(
             **_xyz(points[unknown]), mode="markers", name="not evaluated",
             marker={"size": 1.5, "color": "rgb({}, {}, {})".format(*(UNKNOWN if coloured else PLAIN))},
-            hovertemplate="X %{x:.3f}, Y %{y:.3f}, Z %{z:.3f} mm<extra>not evaluated</extra>",
+            hovertemplate=f"{_PLACE}<extra>not evaluated</extra>",
         )  # fmt: skip
         shown += (
             " Dark points were not evaluated: stray, near an edge, or beside the artefact." if coloured
@@ -97,12 +99,13 @@ def histogram_figure(deviation_mm: np.ndarray) -> Drawn:
     if std > 0:
         normal = len(finite) * (2 * reach / _BINS) / (std * np.sqrt(2 * np.pi))
         curve = normal * np.exp(-0.5 * ((edges[1:] + edges[:-1]) / 2 - mean) ** 2 / std**2)
-        figure.add_scatter(x=middles, y=curve, mode="lines", line={"color": INK, "width": 1.5}, name="normal distribution")
+        line = {"color": INK, "width": 1.5}
+        figure.add_scatter(x=middles, y=curve, mode="lines", line=line, name="normal distribution")
     for place, dash in ((mean, "solid"), (mean - std, "dot"), (mean + std, "dot")):
         figure.add_vline(x=factor * place, line={"color": RED, "width": 1.5, "dash": dash})
     layout(figure, x=f"deviation / {unit}", y="points per bin").update_layout(bargap=0)
     beyond = len(finite) - int(counts.sum())
-    shown = [as_fine_as(factor * value, factor * std).replace("-", "−") for value in (mean, std)]
+    shown = [typographic(as_fine_as(factor * value, factor * std)) for value in (mean, std)]
     caption = f"Mean {shown[0]} {unit} (solid line), standard deviation {shown[1]} {unit} (dotted)."
     return Drawn(figure, caption + (f" {beyond:,} of {len(finite):,} points lie farther out." if beyond else ""))
 

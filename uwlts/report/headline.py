@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from uwlts.report.gather import Campaign, GatheredCapture
-from uwlts.report.numbers import fixed, small_length
+from uwlts.report.gather import Campaign, GatheredCapture, Measurement
+from uwlts.report.numbers import fixed, is_number, small_length
 from uwlts.report.published import Reference
 from uwlts.report.summary_file import summary
 from uwlts.report.table import Row
@@ -18,23 +18,27 @@ _TILES = {
 }
 
 _EXPLANATIONS = {
-    "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free (VDI/VDE "
-    "2634: SSE is its error).",
-    "probing error PE": "Range of the points' distances from the fitted sphere without stray points, of which VDI/VDE 2634 "
-    "allows 0.3 %; of several spheres the worst.",
+    "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free "
+    "(VDI/VDE 2634: SSE is its error).",
+    "probing error PE": "Range of the points' distances from the fitted sphere without stray points, of which "
+    "VDI/VDE 2634 allows 0.3 %; of several spheres the worst.",
     "range error RE": "Range of the points' distances from the fitted plane.",
-    "deviations STD": "Standard deviation of the points' distances from the fitted surface; of several surfaces the "
-    "largest.",
+    "deviations STD": "Standard deviation of the points' distances from the fitted surface; of several the largest.",
     "deviations range": "Largest less smallest distance of the points from the fitted surface.",
     "step height": "Mean distance of one tread's points from the plane fitted to the other tread.",
     "pipe diameter": "Diameter of the fitted cylinder.",
     "points within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
-    "rms distance": "Root mean square of those distances. Only rendered captures have a true surface.",
+    "rms distance": "Root mean square of those distances. Only rendered captures have a true surface. A best fit turns "
+    "and shifts the whole cloud, as aligning it with a drawing would.",
     "window distance": "From the camera's entrance pupil to the window's inner face, found from the step standard in "
     "water; true is what was set in the twin.",
-    "interface distance": "With one refraction a single interface stands for the whole window; its distance has no true "
-    "value.",
+    "interface distance": "With one refraction a single interface stands for the whole window; its distance has no "
+    "true value.",
 }
+_PUBLISHED = (
+    "Published values in mm for the same kind of measurement: errors where there is a calibrated value, else the "
+    "quantity itself; several values are several positions."
+)
 
 
 @dataclass(frozen=True)
@@ -59,12 +63,17 @@ def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile
             mean = published.get(key, {}).get("mean_abs")
             note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
             covered = len(published.get(key, {}).get("by_measurement", ()))
-            theirs = None if mean is None else small_length(mean) + (f" for {covered} of them" if covered < count else "")
+            theirs = None if mean is None else small_length(mean)
+            if theirs and covered < count:
+                theirs += f" for {covered} of them"
             tiles.append(Tile(name, small_length(found["mean_abs"]), note, theirs))
     truth = content["truth"]
     if truth["share_within_tolerance"] is not None:
         name = f"Points within {1e3 * truth['tolerance_mm']:g} µm of the truth"
-        note = f"rms distance {small_length(truth['rms_mm'])}"
+        note, fitted = f"rms distance {small_length(truth['rms_mm'])}", truth["after_best_fit"]
+        if fitted["share_within_tolerance"] is not None:
+            share = f"{100 * fitted['share_within_tolerance']:.2f} %"
+            note += f"; after best fit {share}, {small_length(fitted['rms_mm'])}"
         tiles.append(Tile(name, f"{100 * truth['share_within_tolerance']:.2f} %", note, None))
     window = content["window_distance_mm"]
     if window["estimated"] is not None:
@@ -84,7 +93,8 @@ def introduction(campaign: Campaign) -> list[tuple[str, str]]:
     facts = []
     if sensors := _once([_sensor(capture) for capture in recorded] or [j.sensor for j in judged if j.sensor]):
         facts.append(("Sensor", "; ".join(sensors)))
-    if media := _once([_medium(capture) for capture in recorded]):
+    indices = [text for m in campaign.measurements if (text := _index(m)) is not None]
+    if media := _once([_medium(capture) for capture in recorded] + indices):
         facts.append(("Medium", "; ".join(media)))
     if origins := _once([_origin(capture) for capture in recorded]):
         facts.append(("Images", "; ".join(origins)))
@@ -106,27 +116,30 @@ def explanations(rows: list[Row], reference: Reference | None) -> list[tuple[str
         (start, text) for start, text in _EXPLANATIONS.items() if any(row.quantity.startswith(start) for row in rows)
     ]
     if reference is not None:
-        found.append((
-            reference.title,
-            "Published values in mm for the same kind of measurement: errors where there is a calibrated value, else the "
-            "quantity itself; several values are several positions.",
-        ))  # fmt: skip
+        found.append((reference.title, _PUBLISHED))
     return found
 
 
 def _sensor(capture: GatheredCapture) -> str:
     sensor = capture.header.sensor
-    return f"{sensor.name}, {sensor.camera.width_px} x {sensor.camera.height_px} pixels, {sensor.laser.wavelength_nm:g} nm"
+    camera = sensor.camera
+    return f"{sensor.name}, {camera.width_px} x {camera.height_px} pixels, {sensor.laser.wavelength_nm:g} nm"
 
 
 def _medium(capture: GatheredCapture) -> str:
-    medium, wavelength = capture.header.medium, capture.header.sensor.laser.wavelength_nm
+    medium = capture.header.medium
     parts = [f"{medium.temperature_c:g} °C"] if medium.kind != "custom" else []
     if medium.kind == "sea":
         parts.append(f"{medium.salinity_g_kg:g} g/kg salt")
-    parts.append(f"n = {medium.refractive_index(wavelength):.5f} relative to air at {wavelength:g} nm")
     name = capture.header.medium_name
-    return f"{name if name == medium.kind else f'{name} ({medium.kind})'}, {', '.join(parts)}"
+    return ", ".join([name if name == medium.kind else f"{name} ({medium.kind})", *parts])
+
+
+def _index(measurement: Measurement) -> str | None:
+    """The index that the points were calculated with, which need not be the description's."""
+    recorded = {} if measurement.cloud is None else measurement.cloud.metadata
+    index = measurement.judged.medium_index if measurement.judged is not None else recorded.get("medium_index")
+    return f"points calculated with n = {index:.5f} relative to air" if is_number(index) else None
 
 
 def _origin(capture: GatheredCapture) -> str:

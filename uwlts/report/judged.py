@@ -44,6 +44,12 @@ class TruthFigures(_Stored):
     missed: Count
 
 
+class TruthComparisons(TruthFigures):
+    """The points as measured, and after the rigid motion that fits them best to the truth."""
+
+    after_best_fit: TruthFigures | None = None
+
+
 class Judged(_Stored):
     """An evaluation file; ``calibration`` is the digest of the one with which the cloud was made."""
 
@@ -54,7 +60,7 @@ class Judged(_Stored):
     calibration: str | None = None
     artefact: Artefact | None = None
     evaluation: ArtefactFigures | None = None
-    truth: TruthFigures | None = None
+    truth: TruthComparisons | None = None
 
 
 def read_judged(path: Path) -> Judged:

@@ -54,6 +54,13 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def typographic(text: str) -> str:
+    """A number as text with a proper minus sign; a dash for what is missing."""
+    if text == MISSING:
+        return "\N{EN DASH}"
+    return "\N{MINUS SIGN}" + text[1:] if text.startswith("-") else text
+
+
 def unit_for(spread_mm: float) -> tuple[str, float]:
     """Unit in which deviations of this spread are drawn, and how many of it are in a millimetre."""
     return ("µm", 1e3) if spread_mm < 0.5 else ("mm", 1.0)

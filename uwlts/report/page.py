@@ -15,11 +15,12 @@ from plotly.offline import get_plotlyjs
 import uwlts
 from uwlts.files import written_aside
 from uwlts.report.calibration_figures import residual_figures, seconds_figure, window_curve_figure
-from uwlts.report.calibration_table import parameter_table, residual_table
+from uwlts.report.calibration_table import Comparison, parameter_table, residual_table
 from uwlts.report.figures import Drawn, along_stripe_figure, cloud_figure, histogram_figure
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement
 from uwlts.report.headline import explanations, headline_tiles, introduction
-from uwlts.report.numbers import MISSING, fixed, is_number, small_length, unit_of, words_of
+from uwlts.report.judged import ArtefactFigures, TruthComparisons, TruthFigures
+from uwlts.report.numbers import fixed, is_number, small_length, typographic, unit_of, words_of
 from uwlts.report.pictures import cloud_png, data_uri, stripe_png
 from uwlts.report.published import Reference
 from uwlts.report.table import Row, summary_table, true_window_distance
@@ -48,7 +49,7 @@ def write_report(
 def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
     """The page as text."""
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["minus"] = _with_minus
+    environment.filters["minus"] = typographic
     template = environment.from_string(files("uwlts.report").joinpath("template.html.j2").read_text(encoding="utf-8"))
     collected = _Figures()
     rows = summary_table(campaign, reference)
@@ -107,11 +108,8 @@ def _measurement(measurement: Measurement, collected: _Figures) -> dict[str, Any
         "histogram": collected.add(histogram_figure(cloud.deviation_mm)) if coloured else None,
         "along": collected.add(along_stripe_figure(cloud)) if coloured else None,
         "deviation_from": "the artefact's fitted surface" if judged and judged.evaluation else "the true surface",
-        "figures": [] if judged is None or judged.evaluation is None else [
-            (name, small_length(value, signed="error" in name or "SSE" in name))
-            for name, value in judged.evaluation.figures_mm.items()
-        ],
-        "truth": [] if judged is None or judged.truth is None else _truth(measurement),
+        "figures": None if judged is None or judged.evaluation is None else _figure_table(judged.evaluation),
+        "truth": None if judged is None or judged.truth is None else _truth_table(judged.truth),
     }  # fmt: skip
 
 
@@ -131,19 +129,16 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
         found = judged.evaluation
         share = found.points_rejected / max(1, found.points_used + found.points_rejected)
         allowed = "within" if found.within_vdi_outliers else "more than"
-        facts.append((
-            "points evaluated",
-            f"{found.points_used:,}, and {found.points_rejected:,} left out as stray ({100 * share:.2f} %, {allowed} the "
-            "0.3 % of VDI/VDE 2634)",
-        ))  # fmt: skip
+        stray = f"{100 * share:.2f} %, {allowed} the 0.3 % of VDI/VDE 2634"
+        text = f"{found.points_used:,}, and {found.points_rejected:,} left out as stray ({stray})"
+        facts.append(("points evaluated", text))
     if measurement.digest is not None:
         known = measurement.calibration
         facts.append(("calibration", known.name if known else f"not in the folder (digest {measurement.digest})"))
     return facts
 
 
-def _truth(measurement: Measurement) -> list[tuple[str, str]]:
-    truth = measurement.judged.truth
+def _truth(truth: TruthFigures) -> list[tuple[str, str]]:
     return [
         (f"points within {1e3 * truth.tolerance_mm:g} µm", f"{100 * truth.share_within_tolerance:.2f} %"),
         ("mean distance", small_length(truth.mean_mm, signed=True)),
@@ -156,6 +151,21 @@ def _truth(measurement: Measurement) -> list[tuple[str, str]]:
         ("points where no stripe is visible", f"{truth.false_points:,}"),
         ("visible stripe points not found", f"{truth.missed:,}"),
     ]
+
+
+def _truth_table(truth: TruthComparisons) -> Comparison:
+    columns = {"as measured": truth} | ({"after best fit": truth.after_best_fit} if truth.after_best_fit else {})
+    described = [_truth(found) for found in columns.values()]
+    rows = tuple((entries[0][0], "", tuple(text for _, text in entries)) for entries in zip(*described, strict=True))
+    return Comparison(tuple(columns), rows)
+
+
+def _figure_table(evaluation: ArtefactFigures) -> Comparison:
+    rows = [
+        (name, "", (small_length(value, signed="error" in name or "SSE" in name),))
+        for name, value in evaluation.figures_mm.items()
+    ]
+    return Comparison(("value",), tuple(rows))
 
 
 def _calibration(campaign: Campaign, collected: _Figures) -> dict[str, Any] | None:
@@ -191,8 +201,8 @@ def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
 
 
 def _provenance(campaign: Campaign) -> list[tuple[str, str]]:
-    entries = [("report", f"uwlts {uwlts.__version__}, Python {platform.python_version()}, "
-                + ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]  # fmt: skip
+    libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+    entries = [("report", f"uwlts {uwlts.__version__}, Python {platform.python_version()}, {libraries}")]
     for found in campaign.calibrations:
         entries.append((f"calibration {found.name}", f"digest {found.digest}; {_pairs(found.calibration.provenance)}"))
     entries += [(f"capture {capture.path.name}", _recorded(capture)) for capture in campaign.captures]
@@ -201,7 +211,8 @@ def _provenance(campaign: Campaign) -> list[tuple[str, str]]:
 
 def _recorded(capture: GatheredCapture) -> str:
     header = capture.header
-    return f"'{header.name}', sensor '{header.sensor.name}', {header.medium_name}; {_pairs(header.provenance) or MISSING}"
+    of = f"'{header.name}', sensor '{header.sensor.name}', {header.medium_name}"
+    return f"{of}; {_pairs(header.provenance) or 'origin unknown'}"
 
 
 def _pairs(table: dict[str, Any]) -> str:
@@ -216,11 +227,6 @@ def _value(value: Any) -> str:
     if is_number(value):
         return f"{value:g}" if isinstance(value, float) else str(value)
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _with_minus(text: str) -> str:
-    """A number with the typographic minus."""
-    return f"−{text[1:]}" if text[:1] == "-" and text != MISSING else text.replace(MISSING, "–") if text == MISSING else text
 
 
 def _script(source: str) -> Markup:

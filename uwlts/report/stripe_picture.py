@@ -56,7 +56,8 @@ def stripe_picture(view: StripeView) -> np.ndarray:
     upper.mark(enlarged)
     for number, centre in zip(lines, centres, strict=True):
         dot(upper.picture, *upper.at(number, centre), radius=0.5, colour=ORANGE)
-    write(upper.picture, f"image {view.frame}: {len(lines)} stripe centres (orange); square root of grey values", _LEFT, 12)
+    title = f"image {view.frame}: {len(lines)} stripe centres (orange); square root of grey values"
+    write(upper.picture, title, _LEFT, 12)
 
     lower = _panel(enlarged.of(grey), enlarged, names, cv2.INTER_NEAREST)
     at = np.array([lower.at(n, c) for n, c in zip(lines[chosen], centres[chosen], strict=True)])

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,19 +99,24 @@ def _window(campaign: Campaign) -> dict[str, float | None]:
 def _truth(measurements: Iterable[Measurement]) -> dict[str, Any]:
     """Comparisons with truth: over the points of all measurements, and of each."""
     compared = {m.name: m.judged.truth for m in measurements if m.judged is not None and m.judged.truth is not None}
-    by_measurement = {name: truth.model_dump() for name, truth in compared.items()}
-    pooled: dict[str, float | None] = dict.fromkeys(("tolerance_mm", "share_within_tolerance", "rms_mm"))
-    all_of_them: list[TruthFigures] = list(compared.values())
-    if all_of_them and len({truth.tolerance_mm for truth in all_of_them}) == 1:
-        weight = [truth.matched for truth in all_of_them]
-        pooled = {
-            "tolerance_mm": all_of_them[0].tolerance_mm,
-            "share_within_tolerance": float(
-                np.average([truth.share_within_tolerance for truth in all_of_them], weights=weight)
-            ),
-            "rms_mm": float(np.sqrt(np.average([truth.rms_mm**2 for truth in all_of_them], weights=weight))),
-        }
-    return {**pooled, "by_measurement": by_measurement}
+    fitted = [truth.after_best_fit for truth in compared.values() if truth.after_best_fit is not None]
+    return {
+        **_pooled(list(compared.values())),
+        "after_best_fit": _pooled(fitted if len(fitted) == len(compared) else []),
+        "by_measurement": {name: truth.model_dump() for name, truth in compared.items()},
+    }
+
+
+def _pooled(compared: Sequence[TruthFigures]) -> dict[str, float | None]:
+    """Share and rms over all points; None without any, or where the tolerances differ."""
+    weights = [truth.matched for truth in compared]
+    if not sum(weights) or len({truth.tolerance_mm for truth in compared}) > 1:
+        return dict.fromkeys(("tolerance_mm", "share_within_tolerance", "rms_mm"))
+    return {
+        "tolerance_mm": compared[0].tolerance_mm,
+        "share_within_tolerance": float(np.average([t.share_within_tolerance for t in compared], weights=weights)),
+        "rms_mm": float(np.sqrt(np.average([truth.rms_mm**2 for truth in compared], weights=weights))),
+    }
 
 
 def _published(measurements: Iterable[Measurement], reference: Reference) -> dict[str, Any]:

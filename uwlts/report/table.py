@@ -93,13 +93,21 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
             if not _DETAILS.fullmatch(figure):
                 published = () if reference is None else reference.values(measurement.known_as, figure)
                 rows.append(_figure_row(measurement.name, figure, value, judged.artefact, published))
-    rows.sort(key=lambda row: next((n for n, start in enumerate(_ORDER) if row.quantity.startswith(start)), len(_ORDER)))
+    rows.sort(key=_place)
     if judged.truth is not None:
-        truth = judged.truth
-        within = f"points within {truth.tolerance_mm:.3f} of truth"
-        rows.append(Row(measurement.name, within, measured=truth.share_within_tolerance, unit="share"))
-        rows.append(Row(measurement.name, "rms distance to truth", measured=truth.rms_mm))
+        truth, fitted = judged.truth, judged.truth.after_best_fit
+        for name, found in (("of truth", truth), ("after best fit", fitted)):
+            if found is not None:
+                within = f"points within {found.tolerance_mm:.3f} {name}"
+                rows.append(Row(measurement.name, within, measured=found.share_within_tolerance, unit="share"))
+        for name, found in (("rms distance to truth", truth), ("rms distance after best fit", fitted)):
+            if found is not None:
+                rows.append(Row(measurement.name, name, measured=found.rms_mm))
     return rows
+
+
+def _place(row: Row) -> int:
+    return next((place for place, start in enumerate(_ORDER) if row.quantity.startswith(start)), len(_ORDER))
 
 
 def _figure_row(name: str, figure: str, value: float, artefact: Artefact | None, published: tuple[float, ...]) -> Row:

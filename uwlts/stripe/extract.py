@@ -15,6 +15,7 @@ from uwlts.stripe.candidates import (
     noise_from_contrast,
 )
 from uwlts.stripe.centre import place_centre
+from uwlts.stripe.ends import half_lit
 from uwlts.stripe.image import (
     as_profiles,
     average_lines,
@@ -38,7 +39,7 @@ _SEARCHED_BLOCKS = np.array([[-2], [-1], [0], [1], [2]])
 """Blocks that one window covers."""
 
 # NumPy compares with its own integers several times as fast as with an enumeration.
-_OK, _NO_STRIPE, _AMBIGUOUS, _BORDER, _SATURATED = (np.uint8(status) for status in StripeStatus)
+_OK, _NO_STRIPE, _AMBIGUOUS, _BORDER, _SATURATED, _END = (np.uint8(status) for status in StripeStatus)
 
 
 def extract_stripe(
@@ -96,6 +97,9 @@ def extract_stripe(
         if signal is not image:
             _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
         found.status[none & (low >= clip).any(axis=0)] = _SATURATED
+    if options.end_lines:
+        good = found.status == _OK
+        found.discard(half_lit(good, found.centre, lines=options.end_lines, jump_px=half / 2), _END)
     return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
 
 

@@ -41,6 +41,8 @@ class StripeStatus(IntEnum):
     """The pixels needed around the centre run over the image border."""
     SATURATED = 4
     """The clipped plateau is too wide for the window; moderate clipping is handled and stays OK."""
+    END = 5
+    """Next to a place where the stripe ends or jumps; see `StripeOptions.end_lines`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +75,9 @@ class StripeOptions:
         ``strongest`` two such stripes make the line ambiguous; ``first`` and ``last`` choose among them, and the line
         is ambiguous only if another reaches into the pixels used. Within one window peaks are separate only if the
         profile falls below half height between them, and shares below one half count as one half.
+    end_lines : int
+        Lines left out on either side of a place where the stripe ends, or jumps by more than half of `half_window_px`
+        from one line to the next: at an edge or a limb the sheet's width meets the surface only in part. 0 keeps them.
 
     Raises
     ------
@@ -89,6 +94,7 @@ class StripeOptions:
     threshold_floor: float = 3.0
     min_fwhm_px: float = 1.3
     ambiguous_ratio: float = 0.6
+    end_lines: int = 2
 
     def __post_init__(self) -> None:
         for name, kind in (("method", StripeMethod), ("peak", PeakRule)):
@@ -96,7 +102,7 @@ class StripeOptions:
             if value not in list(kind):
                 raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in kind)}")
             object.__setattr__(self, name, kind(value))
-        for name in ("half_window_px", "smoothing_lines"):
+        for name in ("half_window_px", "smoothing_lines", "end_lines"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise RangeError(f"{name} is {value!r}; expected a whole number")
@@ -105,6 +111,7 @@ class StripeOptions:
         _demand("smoothing_lines", self.smoothing_lines, 1, 101)
         if self.smoothing_lines % 2 == 0:
             raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
+        _demand("end_lines", self.end_lines, 0, 100)
         _demand("threshold_sigmas", self.threshold_sigmas, 1.0, 1e6)
         _demand("threshold_floor", self.threshold_floor, 0.0, 1e9)
         _demand("min_fwhm_px", self.min_fwhm_px, 0.0, self.half_window_px)

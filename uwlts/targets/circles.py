@@ -13,7 +13,7 @@ from uwlts.targets.ellipses import fit_ellipses
 def find_circles(image):
     """Find the images of circles of one polarity and similar size, bright on dark or dark on bright.
 
-    Follows G. S. de Matos (UFSC 2017, section 4.4: median filter, background-corrected threshold, hole filling,
+    Follows G. S. de Matos (UFSC 2017, section 4.5: median filter, background-corrected threshold, hole filling,
     removal of border and small particles, ellipse fit) up to the blobs; ellipse and centre come from the grey levels.
 
     Parameters

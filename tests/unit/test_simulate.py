@@ -1,0 +1,182 @@
+"""Virtual recordings: repeatable, resumable after an interruption, never overwriting unasked, nominal on the outside."""
+
+import numpy as np
+import pytest
+
+from tests.virtual_sensors import altered, plate, scene_of
+from twin.scene import Scene
+from twin.simulate import Options, simulate
+from uwlts.capture import Capture
+from uwlts.errors import CaptureError, OutputError
+from uwlts.sensor import Sensor
+from uwlts.truth import TruthStatus, read_truth, truth_path
+
+FRAMES = 6
+OPTIONS = Options(spp=2, seed=11)
+
+
+@pytest.fixture(scope="module")
+def small(thesis) -> Sensor:
+    """The thesis's view in 80 x 64 pixels."""
+    return altered(thesis, {"camera": {"width_px": 80, "height_px": 64, "pixel_size_um": 84.8}})
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A plate behind a sphere, a lamp and a laser image at three positions."""
+    sphere = {"kind": "sphere", "diameter_mm": 50.0, "position_mm": (0.0, 5.0, -10.0)}
+    motion = {"start_mm": -4.0, "step_mm": 4.0, "count": 3, "lights": ("lamp", "laser")}
+    return scene_of(sphere, plate(30.0), motion=motion)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(small, scene, tmp_path_factory):
+    """Path of a recording made in one go."""
+    path = tmp_path_factory.mktemp("undisturbed") / "scan.h5"
+    simulate(scene, small, path, options=OPTIONS)
+    return path
+
+
+def stop_after(frames: int):
+    """A progress callback during which the user interrupts."""
+
+    def progress(done: int, total: int) -> None:
+        assert total == FRAMES
+        if done == frames:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def assert_same(first, second) -> None:
+    """Captures, truth and headers of two recordings are equal in everything."""
+    with Capture(first) as a, Capture(second) as b:
+        assert len(a) == len(b) == FRAMES
+        assert a.header == b.header
+        for index in range(FRAMES):
+            np.testing.assert_array_equal(a.image(index), b.image(index))
+        for name in ("stage_mm", "pose", "laser_on", "exposure_ms", "time_s"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    (header_a, truth_a), (header_b, truth_b) = read_truth(truth_path(first)), read_truth(truth_path(second))
+    assert header_a == header_b
+    for name, value in vars(truth_a).items():
+        np.testing.assert_array_equal(value, getattr(truth_b, name))
+
+
+def test_a_recording_holds_every_shot_in_its_order(undisturbed, small, scene):
+    with Capture(undisturbed) as capture:
+        assert capture.finished
+        assert len(capture) == FRAMES
+        assert capture.laser_on.tolist() == [False, True] * 3
+        assert capture.stage_mm.tolist() == [-4.0, -4.0, 0.0, 0.0, 4.0, 4.0]
+        assert (np.diff(capture.time_s) > 0).all()
+        assert capture.header.sensor == small
+        assert capture.header.provenance["seed"] == 11
+        images = [capture.image(index) for index in range(FRAMES)]
+        exposure = capture.exposure_ms
+    assert all(image.shape == (64, 80) and image.dtype == np.uint8 for image in images)
+    # Automatic exposure brings the brightest to 0.8 of full scale; the shot noise of 8000 electrons is 1 % of it, and
+    # at two samples per pixel the stripe scatters by some 10 %.
+    assert all(150 <= image.max() <= 255 for image in images)
+    assert len(set(exposure[::2])) == len(set(exposure[1::2])) == 1
+    header, truth = read_truth(truth_path(undisturbed))
+    assert Scene.model_validate(header.scene) == scene
+    assert truth.centre_px.shape == (FRAMES, 80)
+    assert truth.point_mm.shape == (FRAMES, 80, 3)
+    assert (truth.status[::2] == TruthStatus.NO_STRIPE).all(), "lamp images show no stripe"
+    assert (truth.status[1::2] == TruthStatus.VISIBLE).mean() > 0.5
+    assert truth.depth_mm.shape == (64, 80)
+
+
+def test_the_stripe_is_bright_where_the_truth_has_it(undisturbed):
+    _, truth = read_truth(truth_path(undisturbed))
+    with Capture(undisturbed) as capture:
+        for index in (1, 3, 5):
+            image = capture.image(index)
+            lines = np.flatnonzero(truth.status[index] == TruthStatus.VISIBLE)
+            centre = np.rint(truth.centre_px[index, lines]).astype(int)
+            brightest = image[:, lines].argmax(axis=0)
+            # A pixel is 0.9 mm wide, wider than the stripe; near the edge of two pixels noise decides which is brighter.
+            assert (np.abs(brightest - centre) <= 1).mean() > 0.95
+
+
+def test_one_seed_gives_one_recording(undisturbed, small, scene, tmp_path):
+    simulate(scene, small, tmp_path / "scan.h5", options=OPTIONS)
+    assert_same(tmp_path / "scan.h5", undisturbed)
+
+
+def test_another_seed_gives_other_noise_and_the_same_truth(undisturbed, small, scene, tmp_path):
+    path = tmp_path / "scan.h5"
+    simulate(scene, small, path, options=Options(spp=2, seed=12))
+    with Capture(path) as other, Capture(undisturbed) as capture:
+        differ = [(other.image(index) != capture.image(index)).mean() for index in range(FRAMES)]
+    assert min(differ) > 0.1
+    np.testing.assert_array_equal(read_truth(truth_path(path))[1].centre_px, read_truth(truth_path(undisturbed))[1].centre_px)
+
+
+def test_ideal_recordings_have_no_noise(small, scene, tmp_path):
+    frames = []
+    for seed in (1, 2):
+        path = tmp_path / f"ideal-{seed}.h5"
+        simulate(scene, small, path, options=Options(spp=64, seed=seed, ideal=True))
+        with Capture(path) as capture:
+            frames.append([capture.image(index).astype(int) for index in range(FRAMES)])
+    for one, two in zip(*frames, strict=True):
+        # Only the samples differ. The dark parts, a grey value of 2 and no light, are equal everywhere.
+        assert (one == two).mean() > 0.8
+        assert one.min() == two.min() == 2
+
+
+@pytest.mark.parametrize("frames", [1, 4, 6])
+def test_an_interrupted_recording_goes_on_where_it_stopped(undisturbed, small, scene, tmp_path, frames):
+    path, part = tmp_path / "scan.h5", tmp_path / "scan.h5.part"
+    with pytest.raises(KeyboardInterrupt):
+        simulate(scene, small, path, options=OPTIONS, progress=stop_after(frames))
+    assert not path.exists()
+    assert not truth_path(path).exists()
+    with Capture(part) as unfinished, Capture(undisturbed) as whole:
+        assert not unfinished.finished
+        assert len(unfinished) == frames
+        for index in range(frames):
+            np.testing.assert_array_equal(unfinished.image(index), whole.image(index))
+    with pytest.raises(OutputError, match="resume"):
+        simulate(scene, small, path, options=OPTIONS)
+    with pytest.raises(CaptureError, match="belongs to another recording"):
+        simulate(scene, small, path, options=Options(spp=2, seed=12), resume=True)
+    simulate(scene, small, path, options=OPTIONS, resume=True)
+    assert not part.exists()
+    assert_same(path, undisturbed)
+
+
+def test_existing_files_are_replaced_only_when_asked(small, scene, tmp_path):
+    path = tmp_path / "scan.h5"
+    simulate(scene, small, path, options=OPTIONS)
+    with Capture(path) as capture:
+        before = capture.image(1)
+    truth = truth_path(path).read_bytes()
+    with pytest.raises(OutputError, match=r"scan.*h5 exists already"):
+        simulate(scene, small, path, options=Options(spp=2, seed=99))
+    truth_path(path).unlink()
+    with pytest.raises(OutputError, match=r"scan\.h5 exists already"):
+        simulate(scene, small, path, options=Options(spp=2, seed=99))
+    truth_path(path).write_bytes(truth)
+    with Capture(path) as capture:
+        np.testing.assert_array_equal(capture.image(1), before)
+    simulate(scene, small, path, options=Options(spp=2, seed=99), overwrite=True)
+    with Capture(path) as capture:
+        assert (capture.image(1) != before).any()
+
+
+def test_the_capture_states_the_drawings_and_the_truth_the_sensor_as_built(small, scene, tmp_path):
+    built = altered(small, {"camera": {"focal_length_mm": 12.9}, "laser": {"roll_deg": 0.3}})
+    path = tmp_path / "scan.h5"
+    simulate(scene, small, path, as_built=built, options=OPTIONS)
+    with Capture(path) as capture:
+        assert capture.header.sensor == small
+        assert capture.header.medium == small.media["water"]
+    assert read_truth(truth_path(path))[0].sensor == built
+
+
+def test_a_missing_folder_is_refused(small, scene, tmp_path):
+    with pytest.raises(OutputError, match="absent does not exist"):
+        simulate(scene, small, tmp_path / "absent" / "scan.h5", options=OPTIONS)
