@@ -12,33 +12,36 @@ from pathlib import Path
 
 FOLDER = Path("runs/demo")
 PLACEMENTS = ("near", "standoff", "far")
-SCANS = (*(f"spheres-{place}" for place in PLACEMENTS), "step-scan-standoff", "pipe-standoff")
+SPHERES = tuple(f"spheres-{place}" for place in PLACEMENTS)
 
 
 def commands(folder: Path) -> list[tuple[str, str]]:
     """Stage and command line of everything the demo does, in order."""
     as_built = "--sensor thesis --as-built thesis-as-built --overwrite"
     everywhere = f"--placement {' '.join(PLACEMENTS)}"
-    rows = [
-        ("render", f"twin simulate target {as_built} --out {folder}/target.h5"),
-        ("render", f"twin simulate step {everywhere} {as_built} --out {folder}/step-{{placement}}.h5"),
-        ("render", f"twin simulate spheres {everywhere} {as_built} --out {folder}/spheres-{{placement}}.h5"),
-        ("render", f"twin simulate step-scan {as_built} --out {folder}/step-scan-standoff.h5"),
-        ("render", f"twin simulate pipe {as_built} --out {folder}/pipe-standoff.h5"),
-    ]
+    recordings = {
+        "target": "target.h5",
+        "target-through-window": "target-through-window.h5",
+        f"step {everywhere}": "step-{placement}.h5",
+        f"spheres {everywhere}": "spheres-{placement}.h5",
+        "step-scan": "step-scan-standoff.h5",
+        "pipe": "pipe-standoff.h5",
+    }
+    rows = [("render", f"twin simulate {scene} {as_built} --out {folder}/{name}") for scene, name in recordings.items()]
     steps = " ".join(f"{folder}/step-{place}.h5" for place in PLACEMENTS)
-    calibration = f"{folder}/calibration.json"
-    rows.append(("calibrate", f"uwlts calibrate --air {folder}/target.h5 --step {steps} --out {calibration} --overwrite"))
-    for scan in SCANS:
-        path = f"{folder}/{scan}"
-        rows.append(("reconstruct", f"uwlts reconstruct {path}.h5 --calibration {calibration} --out {path}.ply --overwrite"))
-        rows.append(
-            (
-                "evaluate",
-                f"uwlts evaluate {path}.ply --truth {path}.truth.h5 --out {path}.evaluation.json "
-                f"--coloured {path}.ply --overwrite",
-            )
-        )
+    for target, refractions, name, suffix, scans in (
+        ("target", 2, "calibration", "", (*SPHERES, "step-scan-standoff", "pipe-standoff")),
+        ("target-through-window", 1, "calibration-one-refraction", "-one-refraction", SPHERES),
+    ):
+        calibration = f"{folder}/{name}.json"
+        air = f"--air {folder}/{target}.h5 --step {steps} --refractions {refractions}"
+        rows.append(("calibrate", f"uwlts calibrate {air} --out {calibration} --overwrite"))
+        for scan in scans:
+            capture, cloud = f"{folder}/{scan}", f"{folder}/{scan}{suffix}"
+            made = f"{capture}.h5 --calibration {calibration} --out {cloud}.ply --overwrite"
+            rows.append(("reconstruct", f"uwlts reconstruct {made}"))
+            judged = f"--out {cloud}.evaluation.json --coloured {cloud}.ply --overwrite"
+            rows.append(("evaluate", f"uwlts evaluate {cloud}.ply --truth {capture}.truth.h5 {judged}"))
     rows.append(("report", f"uwlts report {folder} --reference thesis --overwrite"))
     return rows
 

@@ -110,6 +110,7 @@ class CaptureWriter:
                     self._begin(unfinished)
             else:
                 self._begin(None)
+            # Nothing is locked: whoever looks at a running recording must not stop it.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
         except (OSError, RuntimeError) as error:
@@ -226,7 +227,7 @@ class CaptureWriter:
     def _storage_failed(self, error: OSError | RuntimeError) -> OutputError:
         number = getattr(error, "errno", None)
         reason = os.strerror(number) if number else " ".join(str(error).split())
-        kept = f"; complete frames are kept in {self._part.name}" if self._part.exists() else ""
+        kept = f"; complete frames are kept in {self._part.name}" if os.path.exists(self._part) else ""
         return OutputError(f"cannot write {self.path}: {reason}{kept}")
 
     def __enter__(self) -> "CaptureWriter":
@@ -269,9 +270,8 @@ class Capture:
         if not self.path.is_file():
             raise CaptureError(f"no capture at {self.path}")
         try:
-            # Reading must never be in the way of the writer, so nothing is locked.
             unfinished = not self.finished or has_writer(self.path)
-            self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r", locking=False)
+            self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
         except _DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 cannot open it ({error})") from error
         try:

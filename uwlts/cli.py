@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 
 import uwlts
 from uwlts.console import progress_bar, run
-from uwlts.errors import CaptureError, DescriptionError
+from uwlts.errors import CaptureError, DescriptionError, OutputError
 
 app = App(
     name="uwlts",
@@ -277,6 +277,10 @@ def report(
     write_summary(page.with_name("summary.json"), campaign, published, overwrite=overwrite)
     write_report(page, campaign, published, overwrite=overwrite)
     if pictures:
+        try:
+            pictures.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make the folder {pictures}: {error.strerror}") from error
         write_pictures(pictures, campaign, overwrite=overwrite)
     print_table(summary_table(campaign, published))
     print(f"wrote {page} and {page.with_name('summary.json')}")

@@ -45,7 +45,7 @@ def find(name_or_path: str | Path, folder: str = "") -> Path:
 
 def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
     """Table of a TOML file with its ``base`` filled in; nested tables are merged, everything else is replaced."""
-    if path in seen:
+    if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -56,9 +56,12 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     base = table.pop("base", None)
     if base is None:
         return table
-    beside = path.parent / f"{base}.toml"
-    base_path = beside if beside.is_file() and beside != path else find(base, folder)
-    return merged(read_table(base_path, folder, seen=(*seen, path)), table)
+    if not isinstance(base, str):
+        raise DescriptionError(f"{path}: base is {base!r}; expected the name or path of another description")
+    beside = path.parent / f"{base.removesuffix('.toml')}.toml"
+    # A description may be called like the shipped one on which it is based.
+    base_path = beside if beside.is_file() and beside.resolve() != path.resolve() else find(base, folder)
+    return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -59,10 +59,12 @@ def truth_path(capture: str | Path) -> Path:
 
 def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
     """Write a truth file whole or not at all; OutputError where that fails."""
-    with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w") as file:
+    # HDF5's latest format has checksums over all that the file says of itself.
+    with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
         write_label(file, format=FORMAT, version=VERSION, header=header)
         for field in fields(truth):
-            file.create_dataset(field.name, data=getattr(truth, field.name), compression="gzip", compression_opts=1)
+            values = getattr(truth, field.name)
+            file.create_dataset(field.name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:

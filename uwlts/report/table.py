@@ -96,13 +96,12 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
     rows.sort(key=_place)
     if judged.truth is not None:
         truth, fitted = judged.truth, judged.truth.after_best_fit
-        for name, found in (("of truth", truth), ("after best fit", fitted)):
-            if found is not None:
-                within = f"points within {found.tolerance_mm:.3f} {name}"
-                rows.append(Row(measurement.name, within, measured=found.share_within_tolerance, unit="share"))
-        for name, found in (("rms distance to truth", truth), ("rms distance after best fit", fitted)):
-            if found is not None:
-                rows.append(Row(measurement.name, name, measured=found.rms_mm))
+        rows.append(Row(measurement.name, "rms distance to truth", measured=truth.rms_mm))
+        if fitted is not None:
+            rows.append(Row(measurement.name, "rms distance after best fit", measured=fitted.rms_mm))
+        best, name = (truth, "of truth") if fitted is None else (fitted, "after best fit")
+        within = f"points within {best.tolerance_mm:.3f} {name}"
+        rows.append(Row(measurement.name, within, measured=best.share_within_tolerance, unit="share"))
     return rows
 
 
