@@ -1,10 +1,11 @@
 """What both commands share on the terminal: progress bars, and errors that speak instead of tracebacks."""
 
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from cyclopts import App
+from cyclopts import App, CycloptsError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -26,15 +27,27 @@ def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def run(app: App) -> int:
-    """Run a command line; errors of the user's making end with a message and exit code 2, Ctrl-C with 130."""
+    """Run a command line and return its exit code: 2 with a message for the user's errors, 130 for Ctrl-C.
+
+    A wrong command line is explained by cyclopts, on standard error like all errors.
+    """
+    # Ctrl-C would end the program before anything can be said.
+    app.suppress_keyboard_interrupt = False
     try:
-        app(sys.argv[1:], exit_on_error=True, print_error=True)
+        app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_none")
+        sys.stdout.flush()
+    except CycloptsError:
+        return USER_ERROR
     except UwltsError as error:
         print(f"error: {error}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
-        print("interrupted; complete frames are kept, give --resume to go on", file=sys.stderr)
+        print("interrupted; a recording keeps its complete frames in NAME.part, --resume goes on with it", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        return 0
+        # The reader has seen enough; what is left unwritten must not be tried again when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"error: {error.strerror or error}: {error.filename}", file=sys.stderr)
+        return USER_ERROR
     return 0

@@ -16,6 +16,7 @@ from uwlts.evaluate import read_evaluation
 from uwlts.library import load_sensor
 from uwlts.placement import check_design, view_of_sheet
 from uwlts.sensor import Camera, Sensor
+from uwlts.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
 def describe(name_or_path: str) -> str:
@@ -28,6 +29,8 @@ def describe(name_or_path: str) -> str:
     """
     path = Path(name_or_path)
     suffixes = [s for s in path.suffixes if s != ".part"]
+    if suffixes[-2:] == [".truth", ".h5"]:
+        return "\n".join(truth_lines(*read_truth(path)))
     if suffixes[-1:] == [".h5"]:
         with Capture(path) as capture:
             return "\n".join(capture_lines(capture))
@@ -45,12 +48,15 @@ def _json_lines(path: Path) -> list[str]:
         found = json.loads(path.read_text(encoding="utf-8")).get("format")
     except OSError as error:
         raise CaptureError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, AttributeError) as error:
+    except (ValueError, AttributeError, RecursionError) as error:
         raise CaptureError(f"{path} is not a file of this program, or is truncated") from error
-    if found == CALIBRATION_FORMAT:
-        return calibration_lines(read_calibration(path))
-    if found == EVALUATION_FORMAT:
-        return evaluation_lines(read_evaluation(path))
+    try:
+        if found == CALIBRATION_FORMAT:
+            return calibration_lines(read_calibration(path))
+        if found == EVALUATION_FORMAT:
+            return evaluation_lines(read_evaluation(path))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise CaptureError(f"{path} is damaged: something in it is missing or no number ({error})") from error
     raise CaptureError(f"{path} is neither a calibration nor an evaluation: format is {found!r}")
 
 
@@ -76,8 +82,20 @@ def capture_lines(capture: Capture) -> list[str]:
     return lines
 
 
+def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
+    """What a ground-truth file holds."""
+    frames, lines = truth.status.shape
+    visible = int(np.count_nonzero(truth.status == TruthStatus.VISIBLE))
+    return [
+        f"ground truth of the sensor '{header.sensor.name}' ({_medium(header.medium, header.sensor)})",
+        f"{frames} frames of {lines} profile lines, {visible} of them show the stripe",
+    ]
+
+
 def cloud_lines(cloud: PointCloud) -> list[str]:
     """What a cloud holds."""
+    if len(cloud) == 0:
+        return ["cloud without points", *(f"{key}: {value}" for key, value in cloud.metadata.items())]
     low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
     lines = [f"cloud of {len(cloud)} points from {len(np.unique(cloud.frame))} frames"]
     lines += [f"{axis}: {a:.3f} to {b:.3f} mm" for axis, a, b in zip("XYZ", low, high, strict=True)]
