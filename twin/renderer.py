@@ -8,6 +8,7 @@ objects stand still in the scene, so nothing is rebuilt or recompiled between fr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,7 +53,8 @@ class SensorPose:
 
     def ray(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Ray3f:
         """A ray of the OCS in the scene."""
-        return mi.Ray3f(self._to_scene @ origin, self._to_scene @ direction)
+        # A point plus a vector is a vector to Dr.Jit, and vectors are not moved.
+        return mi.Ray3f(self._to_scene @ mi.Point3f(origin), self._to_scene @ direction)
 
     def direction(self, direction: mi.Vector3f) -> mi.Vector3f:
         """A direction of the OCS in the scene."""
@@ -107,10 +109,10 @@ class Renderer:
             self._grids[spacing] = bundle, (rows, columns)
         return self._grids[spacing]
 
-    def irradiance(self, light: Literal["lamp", "laser"], scene_from_object: np.ndarray, *, spp: int, seed: int) -> np.ndarray:
+    def irradiance(self, light: Literal["lamp", "laser"], scene_from_object: np.ndarray, *, spp: int) -> np.ndarray:
         """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
 
-        ``spp`` samples are taken per lit pixel, low-discrepancy and shifted per pixel by ``seed``.
+        ``spp`` samples are taken per lit pixel, the same places in every pixel: equal arguments give equal images.
         """
         pose = SensorPose(scene_from_object)
         if light == "laser":
@@ -118,7 +120,7 @@ class Renderer:
         else:
             image, rows, columns = self._lamp_nodes(pose)
         if len(rows):
-            fine = self._fine(light, pose, rows, columns, spp=spp, seed=seed)
+            fine = self._fine(light, pose, rows, columns, spp=spp)
             # The stripe lies before the haze, which the nodes have rendered; a lamp image is replaced.
             image[rows, columns] = fine + image[rows, columns] if light == "laser" else fine
         return image
@@ -129,19 +131,19 @@ class Renderer:
         _, across = self._nodes_on_surface(pose, bundle)
         return self._pixels_of(_near_sheet(across.numpy().reshape(shape)))
 
-    def _nodes_on_surface(self, pose: SensorPose, bundle: Bundle) -> tuple[mi.Bool, mi.Float]:
-        """Whether rays meet a surface, and the sheet's distance across there in standard deviations."""
+    def _nodes_on_surface(self, pose: SensorPose, bundle: Bundle) -> tuple[mi.Float, mi.Float]:
+        """How far away rays meet a surface (infinity: nowhere), and the sheet's distance across there in sigmas."""
         hit = self.objects.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
         valid = hit.is_valid() & (bundle.weight > 0)
         light = self.sheet.at(bundle.origin + bundle.direction * dr.select(valid, hit.t, 1.0))
-        return valid, dr.select(valid, light.distance_mm / light.sigma_mm, dr.inf)
+        return dr.select(valid, hit.t, dr.inf), dr.select(valid, light.distance_mm / light.sigma_mm, dr.inf)
 
     def _laser_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Haze (H, W) in W/mm2 from the nodes, and rows and columns of the pixels close to the lit stripe."""
         bundle, shape = self._grid(NODE_SPACING_PX)
-        valid, across = self._nodes_on_surface(pose, bundle)
+        depth, across = self._nodes_on_surface(pose, bundle)
         if self._scatters:
-            haze = bundle.weight * self._haze(pose, bundle, valid, across)
+            haze = bundle.weight * self._haze(pose, bundle, depth, across)
             dr.eval(across, haze)
             image = self._spread(_corner_mean(haze.numpy().reshape(shape)))
         else:
@@ -171,23 +173,19 @@ class Renderer:
         full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
         return np.ascontiguousarray(full[: camera.height_px, : camera.width_px])
 
-    def _fine(
-        self, light: str, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, *, spp: int, seed: int
-    ) -> np.ndarray:
-        """Mean irradiance (P,) in W/mm2 over the area of pixels."""
+    def _fine(self, light: str, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, *, spp: int) -> np.ndarray:
+        """Mean irradiance (P,) in W/mm2 over the area of pixels.
+
+        The samples are a rank-1 lattice centred in the pixel: along either side they are evenly spaced, so that a
+        smooth stripe is integrated as by the midpoint rule, without the noise of random samples.
+        """
         count = len(rows)
         x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
-        number = to_jit(mi.UInt32, rows * self.sensor.camera.width_px + columns)
-        opaque_seed = dr.opaque(mi.UInt32, seed & 0xFFFFFFFF)
         index = dr.arange(mi.UInt32, count * spp)
-        pixel, sample = index // spp, mi.Float(index % spp)
-        shift_x, shift_y = mi.sample_tea_32(dr.gather(mi.UInt32, number, pixel), opaque_seed)
-        to_unit = 2.0**-32
-        # The R2 sequence (Roberts 2018): additive recurrence with powers of the plastic number.
-        u = sample * 0.7548776662 + mi.Float(shift_x) * to_unit
-        v = sample * 0.5698402910 + mi.Float(shift_y) * to_unit
+        pixel, sample = index // spp, index % spp
+        u, v = mi.Float(sample), mi.Float(sample * _lattice_step(spp) % spp)
         bundle = self.bundle(
-            dr.gather(mi.Float, x, pixel) + u - dr.floor(u) - 0.5, dr.gather(mi.Float, y, pixel) + v - dr.floor(v) - 0.5
+            dr.gather(mi.Float, x, pixel) + (u + 0.5) / spp - 0.5, dr.gather(mi.Float, y, pixel) + (v + 0.5) / spp - 0.5
         )
         values = self.laser(pose, bundle) if light == "laser" else self._lamp(pose, bundle)
         return dr.block_sum(values, spp).numpy() / spp
@@ -211,20 +209,21 @@ class Renderer:
         ray.maxt = exit_mm - 2e-2
         return self.objects.ray_test(ray, active)
 
-    def _haze(self, pose: SensorPose, bundle: Bundle, on_surface: mi.Bool, across: mi.Float) -> mi.Float:
+    def _haze(self, pose: SensorPose, bundle: Bundle, depth: mi.Float, across: mi.Float) -> mi.Float:
         """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
 
-        ``across`` is the sheet's distance at the ray's end on a surface, in standard deviations.
+        ``depth`` is how far rays go to a surface, ``across`` the sheet's distance there in standard deviations.
         """
         t = -bundle.origin.x / bundle.direction.x
         light = self.sheet.at(bundle.origin + bundle.direction * t)
         t -= light.distance_mm / dr.dot(bundle.direction, light.normal)
         light = self.sheet.at(bundle.origin + bundle.direction * t)
-        end = dr.select(on_surface, across * dr.sign(bundle.direction.x), dr.inf)
+        end = dr.select(dr.isfinite(depth), across * dr.sign(bundle.direction.x), dr.inf)
         scattered = single_scattering(
             self.medium, light, wavelength_nm=self.wavelength_nm, direction=bundle.direction, surface_sigmas=end
         )
-        ray = pose.ray(bundle.origin + bundle.direction * t, -light.direction)
+        # A surface just before the sheet's middle cuts the sheet's light, but does not shadow what lies before it.
+        ray = pose.ray(bundle.origin + bundle.direction * dr.minimum(t, depth), -light.direction)
         blocked = self._shadowed(ray.o, ray.d, light.exit_mm, scattered > 0)
         return dr.select((t > 0) & ~blocked, scattered * dr.exp(-self._extinction * t), 0.0)
 
@@ -259,3 +258,9 @@ def _near_sheet(across: np.ndarray) -> np.ndarray:
     nearest, _ = _corner_extremes(np.abs(across))
     low, high = _corner_extremes(across)
     return (nearest < LIT_SIGMAS) | ((low < 0) & (high > 0) & np.isfinite(high))
+
+
+def _lattice_step(count: int) -> int:
+    """Second generator of a rank-1 lattice of ``count`` points: the coprime number nearest to its golden section."""
+    golden = count * 0.5 * (math.sqrt(5.0) - 1.0)
+    return min((k for k in range(1, count + 1) if math.gcd(k, count) == 1), key=lambda k: abs(k - golden))

@@ -96,9 +96,9 @@ class Studio:
         transform[:3, 3] = shot.stage_mm * self.scene.motion.unit_direction()
         return transform
 
-    def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int) -> np.ndarray:
+    def electrons_per_ms(self, shot: Shot, *, spp: int) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) of a shot."""
-        irradiance = self.renderer.irradiance(shot.light, self.pose(shot), spp=spp, seed=seed)
+        irradiance = self.renderer.irradiance(shot.light, self.pose(shot), spp=spp)
         return electrons_per_ms(
             irradiance, self.sensor.camera, self.sensor.detector, wavelength_nm=self.sensor.laser.wavelength_nm
         )
@@ -106,9 +106,8 @@ class Studio:
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; the noise depends only on the seed and the frame's index."""
         rng = None if self.options.ideal else np.random.default_rng([self.options.seed, index])
-        frame_seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
         exposure = self.exposure_ms[shot.light]
-        light = exposure * self.electrons_per_ms(shot, spp=self.options.spp, seed=frame_seed)
+        light = exposure * self.electrons_per_ms(shot, spp=self.options.spp)
         return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng)
 
     def _exposure(self, light: Literal["lamp", "laser"]) -> float:
@@ -120,7 +119,7 @@ class Studio:
         axis = 0 if self.sensor.camera.stripe_along == "width" else 1
         brightest = 0.0
         for shot in {0: shots[0], 1: shots[len(shots) // 2], 2: shots[-1]}.values():
-            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP, seed=0).max(axis=axis)
+            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP).max(axis=axis)
             if (peaks > 0).any():
                 brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
         longest = self.sensor.exposure.longest_ms

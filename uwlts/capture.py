@@ -233,7 +233,9 @@ class CaptureWriter:
     def __enter__(self) -> "CaptureWriter":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             self._file.close()
             if kind is None:
@@ -252,6 +254,8 @@ class Capture:
     ----------
     header : CaptureHeader
         What holds for all frames.
+    dtype : dtype
+        Type of the images, uint8 or uint16.
     stage_mm, exposure_ms, time_s : (N,) float64
         Stage position in mm, exposure in ms, time in s of every frame; finite.
     laser_on : (N,) bool
@@ -273,7 +277,7 @@ class Capture:
             unfinished = not self.finished or has_writer(self.path)
             self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
         except _DAMAGE as error:
-            raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 cannot open it ({error})") from error
+            raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 says: {error}") from error
         try:
             self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
             self._read_frames()
@@ -288,8 +292,10 @@ class Capture:
         camera = self.header.sensor.camera
         images = self._dataset("frames", (camera.height_px, camera.width_px), "u")
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
-            raise CaptureError(f"{self.path} is damaged: frames are {images.dtype}, stored in chunks of {images.chunks}")
-        columns = {name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()}
+            raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
+        columns = {
+            name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()
+        }
         self.dtype = images.dtype
         self._count = min(len(images), *map(len, columns.values()))
         # HDF5 shows chunks that were never stored as zeros.
@@ -311,8 +317,8 @@ class Capture:
             raise CaptureError(f"{self.path} is damaged: it has no '{name}' for every frame")
         if dataset.shape[1:] != shape or dataset.dtype.kind != kind:
             raise CaptureError(
-                f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, expected "
-                f"{shape} of kind '{kind}'"
+                f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, "
+                f"expected {shape} of kind '{kind}'"
             )
         return dataset
 

@@ -87,8 +87,11 @@ def calibrate(
     from uwlts.calibration.procedure import calibrate as solve
     from uwlts.capture import Capture
     from uwlts.inventory import calibration_lines
+    from uwlts.scan import require_index
     from uwlts.stripe import StripeOptions
 
+    if index is not None:
+        require_index(index)
     options = CalibrationOptions(
         refractions=refractions, poses=poses, camera=CameraOptions(distortion=distortion), medium_index=index,
         stripe=StripeOptions(method=method) if method else StripeOptions(),

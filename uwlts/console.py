@@ -34,7 +34,7 @@ def run(app: App) -> int:
     # Ctrl-C would end the program before anything can be said.
     app.suppress_keyboard_interrupt = False
     try:
-        app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_none")
+        app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_value")
         sys.stdout.flush()
     except CycloptsError:
         return USER_ERROR
@@ -42,7 +42,7 @@ def run(app: App) -> int:
         print(f"error: {error}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
-        print("interrupted; a recording keeps its complete frames in NAME.part, --resume goes on with it", file=sys.stderr)
+        print("interrupted; a recording keeps its frames in NAME.part, --resume goes on with it", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         # The reader has seen enough; what is left unwritten must not be tried again when Python ends.

@@ -9,7 +9,7 @@ import numpy as np
 from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud
-from uwlts.errors import CalibrationError, CaptureError
+from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.refraction import RayStatus
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
@@ -55,6 +55,12 @@ def check_fits(capture: Capture, calibration: Calibration) -> None:
         )
 
 
+def require_index(index: float) -> None:
+    """Refuse a refractive index, relative to air, that no medium to measure in has; RangeError."""
+    if not 1 <= index < 2:
+        raise RangeError(f"the refractive index is {index:g}; expected that of a medium relative to air, from 1 to 2")
+
+
 def medium_index(capture: Capture, calibration: Calibration) -> float:
     """Refractive index of the capture's medium at the sensor's wavelength, relative to air."""
     return capture.header.medium.refractive_index(calibration.wavelength_nm)
@@ -79,12 +85,15 @@ def reconstruct_capture(
         The calibration does not fit the capture.
     CaptureError
         The capture holds no laser image, or none of them shows a stripe.
+    RangeError
+        The refractive index is none of a medium.
     """
     check_fits(capture, calibration)
     header = capture.header
     if not header.sensor.camera.window.mounted:
         calibration = calibration.model_copy(update={"window": None})
     index = medium_index(capture, calibration) if index is None else index
+    require_index(index)
     pixels, frames, lines, intensities = [], [], [], []
     statuses = np.zeros(len(StripeStatus), int)
     for number, image in capture.frames(laser_on=True):

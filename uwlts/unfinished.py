@@ -44,7 +44,7 @@ class UnfinishedFile(h5py.File):
 
 
 class _AsIfClosed(io.FileIO):
-    """The file with the superblock it would have if its writer had closed it, and with room for what is still written."""
+    """The file with the superblock it would have if its writer had closed it, and room for what is still written."""
 
     def __init__(self, path: str | Path):
         super().__init__(path, "r")

@@ -36,7 +36,8 @@ def a_truth() -> Truth:
 
 def a_header() -> TruthHeader:
     sensor = load_sensor("thesis-as-built")
-    return TruthHeader(sensor=sensor, medium=sensor.media["water"], scene={"title": "Kügel", "objects": [{"kind": "sphere"}]})
+    scene = {"title": "Kügel", "objects": [{"kind": "sphere"}]}
+    return TruthHeader(sensor=sensor, medium=sensor.media["water"], scene=scene)
 
 
 @pytest.fixture
@@ -61,11 +62,9 @@ def test_everything_comes_back(path: Path):
 
 
 def test_scan_without_any_stripe(tmp_path: Path):
-    nothing = np.full((2, 4), np.nan)
-    dark = Truth(
-        nothing, np.full((2, 4, 3), np.nan), np.full((2, 4, 3), np.nan), np.full((2, 4), TruthStatus.NO_STRIPE, np.uint8),
-        np.zeros((2, 4), np.uint8), nothing,
-    )  # fmt: skip
+    nothing, nowhere = np.full((2, 4), np.nan), np.full((2, 4, 3), np.nan)
+    hidden = np.full((2, 4), TruthStatus.NO_STRIPE, np.uint8)
+    dark = Truth(nothing, nowhere, nowhere, hidden, np.zeros((2, 4), np.uint8), nothing)
     write_truth(tmp_path / "a.truth.h5", a_header(), dark)
     assert (read_truth(tmp_path / "a.truth.h5")[1].status == TruthStatus.NO_STRIPE).all()
 

@@ -12,6 +12,7 @@ import math
 from functools import lru_cache
 from statistics import NormalDist
 
+import cv2
 import numpy as np
 
 _NOISE_SAMPLES = 1024
@@ -38,7 +39,12 @@ def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.nda
     count, lines = profiles.shape
     whole = count // block
     blocks = profiles[: whole * block].reshape(whole, block, lines)
-    high, low = blocks.max(axis=1), np.minimum(blocks[:, 0], blocks[:, block // 2])
+    # The two pixels of the background come first, so that they are fetched from memory only once.
+    first, *others = (blocks[:, k] for k in range(block))
+    middle = others.pop(block // 2 - 1)
+    high, low = cv2.max(first, middle), cv2.min(first, middle)
+    for pixel in others:
+        cv2.max(high, pixel, dst=high)
     if whole * block == count:
         return high, low
     rest = profiles[whole * block :]
@@ -54,8 +60,9 @@ def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.
     np.maximum(low[:-4], low[4:], out=surroundings[2:-2])
     surroundings[:2] = low[2:4]
     surroundings[-2:] = low[-4:-2]
-    np.minimum(high, surroundings, out=surroundings)
-    return np.subtract(high, surroundings, out=out)
+    # OpenCV's difference of unsigned integers stops at 0 by itself.
+    cv2.subtract(high, surroundings, dst=out)
+    return out if out.dtype.kind == "u" else np.maximum(out, 0, out=out)
 
 
 def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
@@ -64,7 +71,7 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
     The median contrast of all blocks, most of which hold no stripe, divided by its value for unit Gaussian noise. A
     background cut off at black is met better this way than by the deviation of single pixels.
     """
-    sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)]
+    sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)].copy()
     middle = np.partition(sample, sample.size // 2)[sample.size // 2]
     median = float(middle)
     if contrast.dtype.kind in "iu":
@@ -98,6 +105,11 @@ def first_true(mask: np.ndarray) -> np.ndarray:
 def last_true(mask: np.ndarray) -> np.ndarray:
     """(M,) int: row of the last True in each column of an (R, M) mask; -1 where there is none."""
     return (mask.view(np.uint8) * _row_numbers(mask.shape[0])).max(axis=0).astype(np.intp) - 1
+
+
+def count_true(mask: np.ndarray) -> np.ndarray:
+    """(M,) uint: number of True in each column of an (R, M) mask."""
+    return mask.view(np.uint8).sum(axis=0, dtype=_row_numbers(mask.shape[0]).dtype)
 
 
 @lru_cache(maxsize=16)

@@ -73,15 +73,13 @@ def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest
     rows = slice(max(0, math.floor(float(centre.min()) - reach)), min(size, math.ceil(float(centre.max()) + reach) + 1))
     t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] - centre
     t *= np.float32(1.0) / sigma
-    weighted = t * t
-    weighted *= np.float32(-0.5)
     # OpenCV's exponential is several times as fast as NumPy's.
-    weighted = cv2.exp(weighted)
+    weighted = cv2.exp(cv2.multiply(t, t, scale=-0.5))
     weighted *= lobe.window[rows] - lobe.base
-    moments = [weighted.sum(axis=0)]
+    moments = [cv2.reduce(weighted, 0, cv2.REDUCE_SUM)[0]]
     for _ in range(highest):
         weighted *= t
-        moments.append(weighted.sum(axis=0))
+        moments.append(cv2.reduce(weighted, 0, cv2.REDUCE_SUM)[0])
     return moments
 
 

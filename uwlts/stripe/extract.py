@@ -24,7 +24,7 @@ from uwlts.stripe.image import (
     saturation_of,
     subtract_background,
 )
-from uwlts.stripe.lobe import FLANK, Lobe, look, noise_gain, off_centre
+from uwlts.stripe.lobe import FLANK, Lobe, look, noise_gain, off_centre, peak_row
 from uwlts.stripe.result import FWHM_PER_SIGMA, PeakRule, Stripe, StripeOptions, StripeStatus
 
 _DEFAULTS = StripeOptions()
@@ -136,7 +136,7 @@ def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: Stri
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
     share = options.ambiguous_ratio * _COARSE_SLACK
     lines = np.arange(board.shape[1])
-    least = np.full(lines.size, coarse)
+    least = np.full(lines.size, coarse, np.float32)
 
     for _ in range(_LOOKS):
         lines, least, chosen, there = _next_blocks(board, lines, least, options.peak, share)
@@ -145,26 +145,31 @@ def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: Stri
         lobe = _look_centred(profiles, lines, (chosen - 2) * block, fine, options)
         verdict = _judge(lobe, profiles.shape[0], fine, options)
         stripe = verdict != _NO_STRIPE
-        again = found.status[lines] == _OK
+        status = found.status[lines]
+        again = status == _OK
         new = stripe & ~again
         if again.any():
             # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
             other = np.abs(lobe.start + lobe.middle - found.centre[lines]) > found.width[lines]
             rival = stripe & again & other & (lobe.height >= options.ambiguous_ratio * found.height[lines])
             found.discard(lines[rival], _AMBIGUOUS)
-        found.status[lines[new]] = verdict[new]
+            status[rival] = _AMBIGUOUS
+        status = np.where(new, verdict, status)
+        found.status[lines] = status
         _measure(found, lines, lobe, new & (verdict == _OK), options)
 
         # The window has been searched for rivals already; of what is no stripe only the block itself is done with.
         place = chosen * board.shape[1] + lines
-        board.ravel()[place] = 0
-        board.ravel()[(place if stripe.all() else place[stripe]) + _SEARCHED_BLOCKS * board.shape[1]] = 0
+        if not stripe.all():
+            board.ravel()[place] = 0
+            place = place[stripe]
+        board.ravel()[place + _SEARCHED_BLOCKS * board.shape[1]] = 0
         least = np.where(new, np.maximum(coarse, there * share), least)
-        status = found.status[lines]
         unsettled = status == _NO_STRIPE
         if options.peak is PeakRule.STRONGEST:
             unsettled |= status == _OK
-        lines, least = lines[unsettled], least[unsettled]
+        if not unsettled.all():
+            lines, least = lines[unsettled], least[unsettled]
     return found
 
 
@@ -202,10 +207,11 @@ def _look_centred(
         "whole": options.peak is PeakRule.STRONGEST,
     }
     lobe = look(profiles, lines, place, **settings)
-    shift, needed = off_centre(lobe)
+    offset, needed = off_centre(lobe)
     needed &= lobe.height >= fine
     if needed.any():
-        lobe = lobe.replaced(needed, look(profiles, lines[needed], (place + shift)[needed], **settings))
+        shifted = place[needed] + np.rint(offset[needed]).astype(np.intp)
+        lobe = lobe.replaced(needed, look(profiles, lines[needed], shifted, **settings))
     return lobe
 
 
@@ -217,9 +223,11 @@ def _judge(lobe: Lobe, count: int, fine: float, options: StripeOptions) -> np.nd
     verdict = np.where(stripe, _OK, _NO_STRIPE)
     if lobe.crowded.any():
         verdict[stripe & lobe.crowded] = _AMBIGUOUS
-    outside = (lobe.start < 0) | (lobe.start + size > count)
-    if outside.any():
-        middle, extent, peak = lobe.start + lobe.middle, lobe.reach + FLANK - 1, lobe.start + lobe.peak
+    if lobe.start.min() < 0 or lobe.start.max() + size > count:
+        outside = (lobe.start < 0) | (lobe.start + size > count)
+        middle, extent = lobe.start + lobe.middle, lobe.reach + FLANK - 1
+        half = options.half_window_px
+        peak = lobe.start + peak_row(lobe.smooth, half=half, block=half // 2)
         verdict[stripe & ((middle - extent < 0) | (middle + extent > count - 1))] = _BORDER
         # A peak whose far side is not in the image; one on the last pixel itself may be any rise towards the border.
         verdict[outside & ~lobe.closed & (peak > 1) & (peak < count - 2)] = _BORDER
@@ -231,7 +239,8 @@ def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, op
     """Enter centre, amplitude and width of the chosen lobes."""
     if not which.any():
         return
-    lines, lobe = lines[which], lobe.keep(which)
+    if not which.all():
+        lines, lobe = lines[which], lobe.keep(which)
     centre, amplitude = place_centre(options.method, lobe)
     found.centre[lines] = lobe.start + centre.astype(np.float64)
     found.amplitude[lines] = amplitude

@@ -9,12 +9,15 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from uwlts.stripe.candidates import first_true, last_true
+from uwlts.stripe.candidates import count_true, first_true, last_true
 from uwlts.stripe.result import FWHM_PER_SIGMA
 
 FLANK = 5
 _ONE = np.ones(1, np.float32)
 _INWARD = np.array([[1], [-1]])
+_INWARD_F = _INWARD.astype(np.float32)
+_FLANK_FROM = np.array([[1 - FLANK], [-1]], np.float32)
+"""First pixel of the flank on either side, counted from `reach` outside the middle."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Lobe:
     ----------
     start : (M,) int
         Position of the window's first pixel on its line.
-    window : (W, M) float32
+    window : (W, M) array of the image's type
         Grey levels; beyond the image border the border pixel repeats.
     smooth : (W, M) float32
         The window after the low-pass.
@@ -33,12 +36,10 @@ class Lobe:
         Midpoint of the half-height crossings.
     sigma : (M,) float32
         Half-height width over 2.355, the sigma of a Gaussian, px, with the low-pass taken out (variances add).
-    reach : (M,) int
-        Distance from `middle` to the first background pixel, px.
+    reach : (M,) float32
+        Whole number: distance from `middle` to the first background pixel, px.
     base, slope : (M,) float32
         Background at `middle`, grey levels, and its slope, grey levels per px, from the flanks beyond `reach`.
-    peak : (M,) int
-        Position of the highest pixel of `smooth`.
     height : (M,) float32
         Peak of `smooth` above `base`, or above the lowest surroundings where not `closed`.
     closed : (M,) bool
@@ -55,15 +56,12 @@ class Lobe:
     reach: np.ndarray
     base: np.ndarray
     slope: np.ndarray
-    peak: np.ndarray
     height: np.ndarray
     closed: np.ndarray
     crowded: np.ndarray
 
     def keep(self, which: np.ndarray) -> Lobe:
         """The windows chosen by a boolean mask."""
-        if which.all():
-            return self
         return Lobe(*(value[..., which] for value in vars(self).values()))
 
     def replaced(self, which: np.ndarray, by: Lobe) -> Lobe:
@@ -107,17 +105,11 @@ def look(
     """
     size = 2 * half + block
     start = place - half
-    cut = _cut(profiles, lines, start, size)
-    kernel = _kernel(smoothing)
-    smooth = cv2.sepFilter2D(cut, cv2.CV_32F, _ONE, kernel, borderType=cv2.BORDER_REPLICATE)
-    window = cut.astype(np.float32)
+    window = _cut(profiles, lines, start, size)
+    smooth = cv2.sepFilter2D(window, cv2.CV_32F, _ONE, _kernel(smoothing), borderType=cv2.BORDER_REPLICATE)
     columns = np.arange(lines.size)
 
-    first = half - block // 2
-    rows = np.arange(size, dtype=np.uint8 if size < 255 else np.uint16)[:, None]
-    sought = smooth[first : first + 2 * block]
-    peak = sought.max(axis=0)
-    peak_row = first + first_true(sought == peak)
+    peak = smooth[_sought(half, block)].max(axis=0)
     before, after = smooth[:block].min(axis=0), smooth[-block:].min(axis=0)
     # Repeated border pixels may belong to the stripe itself, so that only the other side tells the background.
     if start.min() < 0:
@@ -127,29 +119,28 @@ def look(
     ground = np.maximum(before, after)
     level = np.float32(0.5) * (peak + ground)
 
-    at = peak_row.astype(rows.dtype)
-    low = smooth < level
-    # The peak lies within `sought`, so that neither side needs all rows.
-    left = last_true(low[: first + 2 * block] & (rows[: first + 2 * block] < at))
-    right = first + first_true(low[first:] & (rows[first:] > at))
-    closed = (left >= 0) & (right < size)
-    x_left, x_right = _crossings(smooth, columns, np.stack([left, right]), level)
+    high = smooth >= level
+    edges = np.array([first_true(high) - 1, last_true(high) + 1])
+    crowded = count_true(high) != edges[1] - edges[0] - 1
+    several = np.flatnonzero(crowded)
+    if several.size:
+        crowd = smooth.take(several, axis=1)
+        edges[:, several] = _around(high.take(several, axis=1), peak_row(crowd, half=half, block=block))
+    closed = (edges[0] >= 0) & (edges[1] < size)
+    x_left, x_right = _crossings(smooth, columns, edges, level)
     middle = np.float32(0.5) * (x_left + x_right)
     smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
     sigma = np.sqrt(np.maximum(smooth_sigma * smooth_sigma - np.float32(smoothing * smoothing), np.float32(0.0)))
 
-    reach = np.minimum(np.ceil(np.float32(3.0) * smooth_sigma), half - FLANK).astype(np.intp)
-    near = np.rint(middle).astype(np.intp)
-    before, after = _flanks(smooth, columns, np.stack([near - reach - FLANK + 1, near + reach - 1]))
-    crowded = size - low.sum(axis=0, dtype=rows.dtype) != right - left - 1
-    if crowded.any():
-        first_row = np.zeros_like(near) if whole else near - reach - FLANK + 1
-        last_row = np.full_like(near, size) if whole else near + reach + FLANK - 1
-        floor = (ground + share * (peak - ground))[crowded]
-        limits = (limit[crowded] for limit in (left, right, first_row, last_row))
-        crowded[crowded] = _second_lobe(smooth[:, crowded] >= floor, *limits)
-    slope = (after - before) / (2 * reach + FLANK - 2).astype(np.float32)
-    base = np.float32(0.5) * (before + after) + slope * (middle - near).astype(np.float32)
+    reach = np.minimum(np.ceil(np.float32(3.0) * smooth_sigma), np.float32(half - FLANK))
+    near = np.rint(middle)
+    before, after = _flanks(smooth, columns, near - _INWARD_F * reach + _FLANK_FROM)
+    if several.size:
+        extent = np.float32(size) if whole else (reach + np.float32(FLANK - 1))[several]
+        floor = (ground + share * (peak - ground))[several]
+        crowded[several] = _second_lobe(crowd >= floor, edges[:, several], near[several], extent)
+    slope = (after - before) / (np.float32(2.0) * reach + np.float32(FLANK - 2))
+    base = np.float32(0.5) * (before + after) + slope * (middle - near)
     return Lobe(
         start=start,
         window=window,
@@ -159,32 +150,48 @@ def look(
         reach=reach,
         base=base,
         slope=slope,
-        peak=peak_row,
-        height=np.where(closed, peak - base, peak - ground),
+        height=peak - np.where(closed, base, ground),
         closed=closed,
         crowded=crowded,
     )
 
 
+def peak_row(smooth: np.ndarray, *, half: int, block: int) -> np.ndarray:
+    """(M,) int: row of the highest pixel of `Lobe.smooth`, sought where `look` seeks it."""
+    rows = _sought(half, block)
+    sought = smooth[rows]
+    return rows.start + first_true(sought == sought.max(axis=0))
+
+
 def off_centre(lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
-    """By how many pixels to move each window so that the lobe's middle is in its own, and which need it.
+    """How far the lobe's middle is from its window's, and which windows have to follow it.
 
     Returns
     -------
-    shift : (M,) int
+    offset : (M,) float32
+        Distance, px.
     needed : (M,) bool
         A half-height crossing or a flank lies outside the window.
     """
-    offset = lobe.middle - np.float32(0.5 * (lobe.window.shape[0] - 1))
-    needed = np.abs(offset) + lobe.reach > 0.5 * (lobe.window.shape[0] - 1) - FLANK + 0.5
-    return np.rint(offset).astype(np.intp), needed | ~lobe.closed
+    to_end = 0.5 * (lobe.window.shape[0] - 1)
+    offset = lobe.middle - np.float32(to_end)
+    needed = np.abs(offset) + lobe.reach > np.float32(to_end - FLANK + 0.5)
+    return offset, needed | ~lobe.closed
+
+
+def _sought(half: int, block: int) -> slice:
+    """Rows of a window in which the peak is sought."""
+    first = half - block // 2
+    return slice(first, first + 2 * block)
 
 
 def _cut(profiles: np.ndarray, lines: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
     """(size, M) array of the profiles' type: windows from them, the border pixel repeated beyond the border."""
     # Relative maps: row r of the window is r pixels after its start, column m is line m plus the difference.
     down = np.repeat(start.astype(np.float32)[None], size, axis=0)
-    right = np.repeat((lines - np.arange(lines.size)).astype(np.float32)[None], size, axis=0)
+    right = np.zeros(down.shape, np.float32)
+    if lines.size < profiles.shape[1]:
+        right += (lines - np.arange(lines.size)).astype(np.float32)
     nearest = cv2.INTER_NEAREST | cv2.WARP_RELATIVE_MAP
     return cv2.remap(profiles, right, down, nearest, borderMode=cv2.BORDER_REPLICATE)
 
@@ -203,12 +210,16 @@ def noise_gain(sigma: float) -> float:
     return float(np.sqrt(np.sum(_kernel(sigma) ** 2)))
 
 
-def _second_lobe(
-    high: np.ndarray, left: np.ndarray, right: np.ndarray, first: np.ndarray, last: np.ndarray
-) -> np.ndarray:
-    """(M,) bool: something in the (W, M) mask from `first` to `last` but not between `left` and `right`."""
+def _around(high: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M,) int each: the rows nearest to `at` on either side where the (W, M) mask is not set."""
     row = np.arange(high.shape[0])[:, None]
-    return (high & ((row <= left) | (row >= right)) & (row >= first) & (row <= last)).any(axis=0)
+    return last_true(~high & (row < at)), first_true(~high & (row > at))
+
+
+def _second_lobe(high: np.ndarray, edges: np.ndarray, near: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """(M,) bool: something in the (W, M) mask within `extent` of `near` but not between the (2, M) `edges`."""
+    row = np.arange(high.shape[0])[:, None]
+    return (high & ((row <= edges[0]) | (row >= edges[1])) & (np.abs(row - near) <= extent)).any(axis=0)
 
 
 def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -222,7 +233,7 @@ def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level:
     rise = smooth.take(index + width * _INWARD, mode="clip") - low
     part = (level - low) / np.maximum(rise, np.float32(1e-6))
     part = np.minimum(np.maximum(part, np.float32(0.0)), np.float32(1.0))
-    return rows.astype(np.float32) + _INWARD.astype(np.float32) * part
+    return rows.astype(np.float32) + _INWARD_F * part
 
 
 def _flanks(smooth: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -231,5 +242,6 @@ def _flanks(smooth: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.nd
     The lower of two low-passed values three pixels apart, so that a hot pixel in the run does not raise it.
     """
     size, width = smooth.shape
-    index = np.minimum(np.maximum(first, 0), size - FLANK) * width + columns
+    first = np.minimum(np.maximum(first, np.float32(0.0)), np.float32(size - FLANK))
+    index = first.astype(np.intp) * width + columns
     return np.minimum(smooth.take(index + width, mode="clip"), smooth.take(index + (FLANK - 1) * width, mode="clip"))
