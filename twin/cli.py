@@ -28,7 +28,7 @@ def simulate(
     sensor: str = "thesis",
     out: Path,
     as_built: str | None = None,
-    placement: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
+    placement: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     medium: str | None = None,
     spp: int = 16,
     seed: int = 0,

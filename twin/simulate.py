@@ -171,7 +171,7 @@ def simulate(
         A file exists already, or cannot be written.
     """
     path = Path(path)
-    if truth_path(path).exists() and not overwrite:
+    if truth_path(path).exists() and not (overwrite or resume):
         raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
     built = as_built or sensor
     studio = Studio(built, scene, options)

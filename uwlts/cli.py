@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 import uwlts
 from uwlts.console import progress_bar, run
 from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.files import refuse_unsuitable
 
 app = App(
     name="uwlts",
@@ -19,7 +20,10 @@ app = App(
 )
 
 Flag = Annotated[bool, Parameter(negative="")]
-Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True)]
+Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+Coefficients = Annotated[
+    tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
+]
 Method = Literal["centre-of-mass", "quadratic", "zero-crossing"]
 
 
@@ -47,7 +51,7 @@ def calibrate(
     out: Path,
     refractions: Literal[1, 2] = 2,
     poses: Literal["stage-normal", "stage", "free"] = "stage-normal",
-    distortion: tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...] = ("k1", "k2"),
+    distortion: Coefficients = ("k1", "k2"),
     index: float | None = None,
     method: Method | None = None,
     overwrite: Flag = False,
@@ -92,6 +96,7 @@ def calibrate(
 
     if index is not None:
         require_index(index)
+    refuse_unsuitable(out, overwrite=overwrite)
     options = CalibrationOptions(
         refractions=refractions, poses=poses, camera=CameraOptions(distortion=distortion), medium_index=index,
         stripe=StripeOptions(method=method) if method else StripeOptions(),
@@ -175,6 +180,7 @@ def reconstruct(
     from uwlts.scan import reconstruct_capture
     from uwlts.stripe import StripeOptions
 
+    refuse_unsuitable(out, overwrite=overwrite)
     options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
         scan = reconstruct_capture(opened, read_calibration(calibration), options=options, index=index, progress=progress)
@@ -221,6 +227,9 @@ def evaluate(
     from uwlts.inventory import evaluation_lines
     from uwlts.truth import read_truth
 
+    for path in (out, coloured):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
     points = read_cloud(cloud)
     table = _read_toml(artefact) if artefact else points.metadata.get("artefact")
     judgement = judge(

@@ -38,7 +38,7 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         OSError of the body or of the renaming.
     """
     target = Path(os.path.realpath(path))
-    _refuse_unsuitable(target, overwrite)
+    refuse_unsuitable(target, overwrite=overwrite)
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
     try:
         # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
@@ -48,7 +48,7 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     try:
         yield aside
         _flush(aside)
-        _refuse_unsuitable(target, overwrite)
+        refuse_unsuitable(target, overwrite=overwrite)
         os.replace(aside, target)
         _flush_folder(target.parent)
     except OSError as error:
@@ -57,13 +57,14 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         aside.unlink(missing_ok=True)
 
 
-def _refuse_unsuitable(target: Path, overwrite: bool) -> None:
+def refuse_unsuitable(target: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where nothing may be written; commands ask before the work and not only after it."""
     if not target.parent.is_dir():
         raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
     if target.exists() and not target.is_file():
         raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
     if target.exists() and not overwrite:
-        raise OutputError(f"{target} exists already; choose another name or allow overwriting")
+        raise OutputError(f"{target} exists already; give another name, or --overwrite to replace it")
 
 
 def _cannot_write(target: Path, error: OSError) -> str:
