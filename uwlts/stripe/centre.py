@@ -16,7 +16,7 @@ from uwlts.stripe.result import FWHM_PER_SIGMA, StripeMethod
 
 _ITERATIONS = 6
 
-_LEAST_KERNEL = np.float32(1.0)
+_LEAST_KERNEL = 1.0
 """Sigma of the narrowest weight, px. A narrower one rests on too few pixels: for a stripe of sigma 0.7 px the centre
 would err by 0.015 px with the pixel phase instead of 0.005."""
 
@@ -31,7 +31,7 @@ def place_centre(method: StripeMethod, lobe: Lobe) -> tuple[np.ndarray, np.ndarr
     amplitude : (M,) float32
         Height of the best-fitting Gaussian of the lobe's sigma at the centre, grey levels.
     """
-    sigma = np.maximum(lobe.sigma, np.float32(0.3))
+    sigma = np.maximum(lobe.sigma, 0.3)
     kernel = np.maximum(sigma, _LEAST_KERNEL)
     if method is StripeMethod.ZERO_CROSSING:
         centre, under = _zero_crossing(lobe, kernel)
@@ -39,7 +39,7 @@ def place_centre(method: StripeMethod, lobe: Lobe) -> tuple[np.ndarray, np.ndarr
         centre = _centre_of_mass(lobe) if method is StripeMethod.CENTRE_OF_MASS else _quadratic(lobe)
         (under,) = _gaussian_moments(lobe, centre, kernel, 0)
     # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
-    joint = np.float32(0.5 / math.pi) * (1 / (sigma * sigma) + 1 / (kernel * kernel))
+    joint = 0.5 / math.pi * (1 / (sigma * sigma) + 1 / (kernel * kernel))
     return centre, under * np.sqrt(joint)
 
 
@@ -56,12 +56,12 @@ def _zero_crossing(lobe: Lobe, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarra
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
     """
     zeroth, first, second = _gaussian_moments(lobe, lobe.middle, sigma, 2)
-    first -= lobe.slope * np.float32(math.sqrt(2.0 * math.pi)) * sigma * sigma
-    step = first / np.maximum(zeroth - second, np.float32(0.1) * np.abs(zeroth))
-    step = np.minimum(np.maximum(step, np.float32(-0.5)), np.float32(0.5))
-    step -= np.float32(0.5) * step * step * step
+    first -= lobe.slope * math.sqrt(2.0 * math.pi) * sigma * sigma
+    step = first / np.maximum(zeroth - second, 0.1 * np.abs(zeroth))
+    step = np.minimum(np.maximum(step, -0.5), 0.5)
+    step -= 0.5 * step * step * step
     # The sum under the Gaussian at its top, from its value a step away.
-    top = zeroth * (np.float32(1.0) + np.float32(0.25) * step**2)
+    top = zeroth * (1.0 + 0.25 * step**2)
     return lobe.middle + sigma * step, top
 
 
@@ -72,7 +72,7 @@ def _gaussian_moments(lobe: Lobe, centre: np.ndarray, sigma: np.ndarray, highest
     reach = 3.5 * float(sigma.max())
     rows = slice(max(0, math.floor(float(centre.min()) - reach)), min(size, math.ceil(float(centre.max()) + reach) + 1))
     t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] - centre
-    t *= np.float32(1.0) / sigma
+    t *= 1.0 / sigma
     # OpenCV's exponential is several times as fast as NumPy's.
     weighted = cv2.exp(cv2.multiply(t, t, scale=-0.5))
     weighted *= lobe.window[rows] - lobe.base
@@ -90,12 +90,12 @@ def _centre_of_mass(lobe: Lobe) -> np.ndarray:
     both agree, so that nothing is cut off more on one side than on the other. A wider window would collect noise.
     """
     x, signal = _above_background(lobe, lobe.window)
-    half = np.float32(2.25) * np.maximum(lobe.sigma, _LEAST_KERNEL)
+    half = 2.25 * np.maximum(lobe.sigma, _LEAST_KERNEL)
     centre = lobe.middle
     for _ in range(_ITERATIONS):
         u = x - centre
         share = signal * _part_inside(u, half)
-        step = (share * u).sum(axis=0) / np.maximum(share.sum(axis=0), np.float32(0.1) * lobe.height)
+        step = (share * u).sum(axis=0) / np.maximum(share.sum(axis=0), 0.1 * lobe.height)
         centre = centre + np.clip(step, -half, half)
     return centre
 
@@ -109,7 +109,7 @@ def _quadratic(lobe: Lobe) -> np.ndarray:
     -a1 / (2 a2).
     """
     x, signal = _above_background(lobe, lobe.smooth)
-    half = np.float32(0.5 * FWHM_PER_SIGMA) * np.maximum(lobe.sigma, _LEAST_KERNEL)
+    half = 0.5 * FWHM_PER_SIGMA * np.maximum(lobe.sigma, _LEAST_KERNEL)
     centre = lobe.middle
     for _ in range(_ITERATIONS):
         u = x - centre
@@ -119,7 +119,7 @@ def _quadratic(lobe: Lobe) -> np.ndarray:
         # Cramer's rule for a1 and a2; their common denominator drops out of the vertex.
         a1 = t1 * (s0 * s4 - s2 * s2) - t0 * (s1 * s4 - s2 * s3) - t2 * (s0 * s3 - s1 * s2)
         a2 = t2 * (s0 * s2 - s1 * s1) - t1 * (s0 * s3 - s1 * s2) + t0 * (s1 * s3 - s2 * s2)
-        step = -a1 / np.minimum(np.float32(2.0) * a2, np.float32(-1e-6) * np.abs(a1) - np.float32(1e-20))
+        step = -a1 / np.minimum(2.0 * a2, -1e-6 * np.abs(a1) - 1e-20)
         centre = centre + np.clip(step, -half, half)
     return centre
 
@@ -132,4 +132,4 @@ def _above_background(lobe: Lobe, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _part_inside(u: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Share of each pixel, u from the centre, that lies within `half` of it."""
-    return np.clip(half + np.float32(0.5) - np.abs(u), 0.0, 1.0)
+    return np.clip(half + 0.5 - np.abs(u), 0.0, 1.0)

@@ -96,7 +96,7 @@ def extract_stripe(
     if none.any():
         if signal is not image:
             _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
-        found.status[none & (low >= clip).any(axis=0)] = _SATURATED
+        found.status[none & (low.max(axis=0) >= clip)] = _SATURATED
     if options.end_lines:
         good = found.status == _OK
         found.discard(half_lit(good, found.centre, lines=options.end_lines, jump_px=half / 2), _END)
@@ -180,7 +180,7 @@ def _next_blocks(
 
     First and last are taken among the blocks with at least `share` of the highest contrast on their line.
     """
-    columns = board if lines.size == board.shape[1] else board[:, lines]
+    columns = board if lines.size == board.shape[1] else board.take(lines, axis=1)
     highest = columns.max(axis=0)
     stands_out = highest >= least
     if not stands_out.any():
@@ -188,7 +188,7 @@ def _next_blocks(
         return nothing, least[:0], nothing, highest[:0]
     if not stands_out.all():
         lines, least, highest = lines[stands_out], least[stands_out], highest[stands_out]
-        columns = columns[:, stands_out]
+        columns = columns.compress(stands_out, axis=1)
     wanted = columns == highest if rule is PeakRule.STRONGEST else columns >= np.maximum(least, share * highest)
     chosen = first_true(wanted) if rule is not PeakRule.LAST else last_true(wanted)
     there = highest if rule is PeakRule.STRONGEST else columns[chosen, np.arange(lines.size)]
@@ -219,7 +219,7 @@ def _judge(lobe: Lobe, count: int, fine: float, options: StripeOptions) -> np.nd
     """(M,) uint8 `StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
     size = lobe.window.shape[0]
     narrowest, widest = options.min_fwhm_px / FWHM_PER_SIGMA, options.half_window_px / FWHM_PER_SIGMA
-    stripe = lobe.closed & (lobe.sigma >= np.float32(narrowest)) & (lobe.sigma <= np.float32(widest))
+    stripe = lobe.closed & (lobe.sigma >= narrowest) & (lobe.sigma <= widest)
     verdict = np.where(stripe, _OK, _NO_STRIPE)
     if lobe.crowded.any():
         verdict[stripe & lobe.crowded] = _AMBIGUOUS
@@ -244,5 +244,5 @@ def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, op
     centre, amplitude = place_centre(options.method, lobe)
     found.centre[lines] = lobe.start + centre.astype(np.float64)
     found.amplitude[lines] = amplitude
-    found.width[lines] = lobe.sigma * np.float32(FWHM_PER_SIGMA)
+    found.width[lines] = lobe.sigma * FWHM_PER_SIGMA
     found.height[lines] = lobe.height

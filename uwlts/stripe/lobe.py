@@ -117,7 +117,7 @@ def look(
     if start.max() + size > profiles.shape[0]:
         after[start + size > profiles.shape[0]] = -np.inf
     ground = np.maximum(before, after)
-    level = np.float32(0.5) * (peak + ground)
+    level = 0.5 * (peak + ground)
 
     high = smooth >= level
     edges = np.array([first_true(high) - 1, last_true(high) + 1])
@@ -128,19 +128,19 @@ def look(
         edges[:, several] = _around(high.take(several, axis=1), peak_row(crowd, half=half, block=block))
     closed = (edges[0] >= 0) & (edges[1] < size)
     x_left, x_right = _crossings(smooth, columns, edges, level)
-    middle = np.float32(0.5) * (x_left + x_right)
-    smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
-    sigma = np.sqrt(np.maximum(smooth_sigma * smooth_sigma - np.float32(smoothing * smoothing), np.float32(0.0)))
+    middle = 0.5 * (x_left + x_right)
+    smooth_sigma = (x_right - x_left) * (1.0 / FWHM_PER_SIGMA)
+    sigma = np.sqrt(np.maximum(smooth_sigma * smooth_sigma - np.float32(smoothing * smoothing), 0.0))
 
-    reach = np.minimum(np.ceil(np.float32(3.0) * smooth_sigma), np.float32(half - FLANK))
+    reach = np.minimum(np.ceil(3.0 * smooth_sigma), np.float32(half - FLANK))
     near = np.rint(middle)
     before, after = _flanks(smooth, columns, near - _INWARD_F * reach + _FLANK_FROM)
     if several.size:
-        extent = np.float32(size) if whole else (reach + np.float32(FLANK - 1))[several]
+        extent = size if whole else (reach + (FLANK - 1))[several]
         floor = (ground + share * (peak - ground))[several]
         crowded[several] = _second_lobe(crowd >= floor, edges[:, several], near[several], extent)
-    slope = (after - before) / (np.float32(2.0) * reach + np.float32(FLANK - 2))
-    base = np.float32(0.5) * (before + after) + slope * (middle - near)
+    slope = (after - before) / (2.0 * reach + (FLANK - 2))
+    base = 0.5 * (before + after) + slope * (middle - near)
     return Lobe(
         start=start,
         window=window,
@@ -174,8 +174,8 @@ def off_centre(lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
         A half-height crossing or a flank lies outside the window.
     """
     to_end = 0.5 * (lobe.window.shape[0] - 1)
-    offset = lobe.middle - np.float32(to_end)
-    needed = np.abs(offset) + lobe.reach > np.float32(to_end - FLANK + 0.5)
+    offset = lobe.middle - to_end
+    needed = np.abs(offset) + lobe.reach > to_end - FLANK + 0.5
     return offset, needed | ~lobe.closed
 
 
@@ -231,8 +231,8 @@ def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level:
     index = rows * width + columns
     low = smooth.take(index, mode="clip")
     rise = smooth.take(index + width * _INWARD, mode="clip") - low
-    part = (level - low) / np.maximum(rise, np.float32(1e-6))
-    part = np.minimum(np.maximum(part, np.float32(0.0)), np.float32(1.0))
+    part = (level - low) / np.maximum(rise, 1e-6)
+    part = np.minimum(np.maximum(part, 0.0), 1.0)
     return rows.astype(np.float32) + _INWARD_F * part
 
 
@@ -242,6 +242,6 @@ def _flanks(smooth: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.nd
     The lower of two low-passed values three pixels apart, so that a hot pixel in the run does not raise it.
     """
     size, width = smooth.shape
-    first = np.minimum(np.maximum(first, np.float32(0.0)), np.float32(size - FLANK))
+    first = np.minimum(np.maximum(first, 0.0), size - FLANK)
     index = first.astype(np.intp) * width + columns
     return np.minimum(smooth.take(index + width, mode="clip"), smooth.take(index + (FLANK - 1) * width, mode="clip"))
