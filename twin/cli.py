@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 import uwlts
 from twin.scene import load_scene, scene_names
-from twin.variant import CPU, GPU, use_variant
+from twin.variant import CPU, use_variant
 from uwlts.console import progress_bar, run
 from uwlts.errors import DescriptionError
 from uwlts.library import load_sensor, names

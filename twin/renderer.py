@@ -161,7 +161,7 @@ class Renderer:
         return rows[kept], columns[kept]
 
     def _lamp_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lamp image (H, W) in W/mm2 from the pixels' corners, and rows and columns of the pixels in which it changes."""
+        """Lamp image (H, W) in W/mm2 from the pixels' corners; rows and columns of the pixels in which it changes."""
         bundle, shape = self._grid(1)
         nodes = self._lamp(pose, bundle).numpy().reshape(shape)
         low, high = _corner_extremes(nodes)

@@ -66,7 +66,9 @@ class Sheet:
         transmitted = path.weight.numpy().astype(float)
 
         def fitted(values: np.ndarray) -> np.ndarray:
-            return Polynomial.fit(slope, values, _DEGREE, domain=(-self.largest_slope, self.largest_slope)).convert().coef
+            return (
+                Polynomial.fit(slope, values, _DEGREE, domain=(-self.largest_slope, self.largest_slope)).convert().coef
+            )
 
         self._y0, self._x0, self._tilt = (fitted(v) for v in (o[1] - slope * o[2], o[0] - tilt * o[2], tilt))
         self._exit_z = fitted(o[2])

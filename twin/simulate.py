@@ -43,7 +43,9 @@ class Options:
 def medium_of(sensor: Sensor, scene: Scene) -> Medium:
     """The medium that a scene names, from the sensor's list."""
     if scene.medium not in sensor.media:
-        raise DescriptionError(f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{scene.medium}'")
+        raise DescriptionError(
+            f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{scene.medium}'"
+        )
     return sensor.media[scene.medium]
 
 
@@ -189,7 +191,13 @@ def simulate(
             if index >= done:
                 time_s = index * (sensor.stage.settling_s + 1e-3 * studio.exposure_ms[shot.light])
                 writer.append(
-                    Frame(studio.image(shot, index), shot.stage_mm, shot.light == "laser", studio.exposure_ms[shot.light], time_s)
+                    Frame(
+                        studio.image(shot, index),
+                        shot.stage_mm,
+                        shot.light == "laser",
+                        studio.exposure_ms[shot.light],
+                        time_s,
+                    )
                 )
             progress(index + 1, len(shots))
         truth_header = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))

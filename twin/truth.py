@@ -34,7 +34,9 @@ def no_stripe(lines: int) -> FrameTruth:
     """Truth of a frame without laser light."""
     nothing = np.full(lines, np.nan)
     empty = np.zeros(lines, np.uint8)
-    return FrameTruth(nothing, np.full((lines, 3), np.nan), np.full((lines, 3), np.nan), empty + TruthStatus.NO_STRIPE, empty)
+    return FrameTruth(
+        nothing, np.full((lines, 3), np.nan), np.full((lines, 3), np.nan), empty + TruthStatus.NO_STRIPE, empty
+    )
 
 
 def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth:
@@ -100,7 +102,9 @@ def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
     bundle = renderer.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
     hit = renderer.objects.ray_intersect_preliminary(SensorPose(scene_from_object).ray(bundle.origin, bundle.direction))
-    point = mi.Point3f(bundle.origin + bundle.direction * hit.t)  # a sum with a vector is a vector, which would not move
+    point = mi.Point3f(
+        bundle.origin + bundle.direction * hit.t
+    )  # a sum with a vector is a vector, which would not move
     point = mi.Transform4f(mi.Matrix4f(camera_from_object(renderer.sensor))) @ point
     depth = dr.select(hit.is_valid() & (bundle.weight > 0), point.z, dr.nan)
     return depth.numpy().reshape(camera.height_px, camera.width_px)

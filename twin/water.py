@@ -32,8 +32,9 @@ def single_scattering(
     """Radiance that the sheet scatters once into a camera ray where the ray crosses it, in W/mm2/sr.
 
     ``light`` is the sheet at the crossing, where the distance across is about zero; ``surface_sigmas`` the distance
-    across, in standard deviations and along the ray, of its end on a surface, which cuts the Gaussian off. The line integral of a Gaussian
-    across along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos| times the share of the Gaussian passed.
+    across, in standard deviations and along the ray, of its end on a surface, which cuts the Gaussian off.
+    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos| times the share of the
+    Gaussian that the ray has passed.
     """
     b = medium.scattering_per_mm(wavelength_nm)
     cosine = dr.maximum(dr.abs(dr.dot(direction, light.normal)), 1e-3)

@@ -49,7 +49,9 @@ class WindowFaces:
         Module frame in the camera frame: its origin (3,) and rotation (3, 3); the third column is the module's axis.
     """
 
-    def __init__(self, window: Window, medium: Medium, *, wavelength_nm: float, origin_mm: np.ndarray, rotation: np.ndarray):
+    def __init__(
+        self, window: Window, medium: Medium, *, wavelength_nm: float, origin_mm: np.ndarray, rotation: np.ndarray
+    ):
         index = medium.refractive_index(wavelength_nm)
         self.mounted = window.mounted
         if not window.mounted:
@@ -64,7 +66,11 @@ class WindowFaces:
         self._faces = []
         for centre, outside, inside in ((inner, 1.0, glass), (outer, glass, index)):
             to_world = np.eye(4)
-            to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (window.aperture_diameter_mm / 2, window.aperture_diameter_mm / 2, 1)
+            to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (
+                window.aperture_diameter_mm / 2,
+                window.aperture_diameter_mm / 2,
+                1,
+            )
             to_world[:3, 3] = centre
             bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
             self._faces.append(mi.load_dict({"type": "disk", "to_world": mi.ScalarTransform4f(to_world), "bsdf": bsdf}))

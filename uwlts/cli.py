@@ -85,8 +85,8 @@ def calibrate(
     """
     from contextlib import ExitStack
 
-    from uwlts.calibration.model import write_calibration
     from uwlts.calibration.intrinsics import CameraOptions
+    from uwlts.calibration.model import write_calibration
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.calibration.procedure import calibrate as solve
     from uwlts.capture import Capture
@@ -137,7 +137,9 @@ def nominal(sensor: str, *, medium: str, out: Path, overwrite: Flag = False) -> 
 
     described = load_sensor(sensor)
     if medium not in described.media:
-        raise DescriptionError(f"the sensor '{described.name}' knows the media {', '.join(described.media)}, not '{medium}'")
+        raise DescriptionError(
+            f"the sensor '{described.name}' knows the media {', '.join(described.media)}, not '{medium}'"
+        )
     write_calibration(out, nominal_calibration(described, described.media[medium]), overwrite=overwrite)
     print(f"wrote {out}")
 
@@ -183,7 +185,9 @@ def reconstruct(
     refuse_unsuitable(out, overwrite=overwrite)
     options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
-        scan = reconstruct_capture(opened, read_calibration(calibration), options=options, index=index, progress=progress)
+        scan = reconstruct_capture(
+            opened, read_calibration(calibration), options=options, index=index, progress=progress
+        )
     write_cloud(out, scan.cloud, overwrite=overwrite)
     lines = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in scan.lines_by_status.items() if count)
     print(f"profile lines: {lines}")

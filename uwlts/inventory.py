@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.calibration.model import FORMAT as CALIBRATION_FORMAT
+from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, read_cloud
 from uwlts.errors import CaptureError, DescriptionError
@@ -65,7 +65,8 @@ def capture_lines(capture: Capture) -> list[str]:
     header, camera = capture.header, capture.header.sensor.camera
     laser = int(capture.laser_on.sum())
     lines = [
-        f"capture of the sensor '{header.sensor.name}' in {header.medium_name} ({_medium(header.medium, header.sensor)})",
+        f"capture of the sensor '{header.sensor.name}' in {header.medium_name} "
+        f"({_medium(header.medium, header.sensor)})",
         f"{len(capture)} frames of {camera.width_px} x {camera.height_px} pixels, {laser} with the laser on"
         + ("" if capture.finished else "; the recording was interrupted"),
     ]
@@ -109,7 +110,8 @@ def calibration_lines(calibration: Calibration) -> list[str]:
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
     d = camera.distortion
     lines = [
-        f"calibration of the sensor '{calibration.sensor_name}' ({calibration.provenance.get('source', 'unknown source')})",
+        f"calibration of the sensor '{calibration.sensor_name}' "
+        f"({calibration.provenance.get('source', 'unknown source')})",
         f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
         f"k1 {d.k1:.5f}, k2 {d.k2:.5f}, p1 {d.p1:.5f}, p2 {d.p2:.5f}, k3 {d.k3:.5f}",
         f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
@@ -117,9 +119,17 @@ def calibration_lines(calibration: Calibration) -> list[str]:
     if window is None:
         lines.append("window: none; for use in air only")
     else:
-        glass = f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""
-        lines.append(f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}")
-    figures = {"camera": ("rms_px", "px"), "sheet": ("rms_mm", "mm"), "window": ("std_mm", "mm standard uncertainty of d")}
+        glass = (
+            f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""
+        )
+        lines.append(
+            f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
+        )
+    figures = {
+        "camera": ("rms_px", "px"),
+        "sheet": ("rms_mm", "mm"),
+        "window": ("std_mm", "mm standard uncertainty of d"),
+    }
     for step, (name, unit) in figures.items():
         value = calibration.residuals.get(step, {}).get(name)
         if value is not None:
@@ -152,8 +162,8 @@ def sensor_lines(sensor: Sensor) -> list[str]:
     for name, medium in sensor.media.items():
         view = check_design(sensor, medium)
         lines.append(
-            f"{name} ({_medium(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in view "
-            f"from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
+            f"{name} ({_medium(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
+            f"view from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
         )
         for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
             turned = sensor.model_copy(update={"camera": _turned(sensor.camera, along)})

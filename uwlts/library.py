@@ -39,7 +39,9 @@ def find(name_or_path: str | Path, folder: str = "") -> Path:
     shipped = library_folder() / folder / f"{name_or_path}.toml"
     if not shipped.is_file():
         known = ", ".join(names(folder))
-        raise DescriptionError(f"nothing is called '{name_or_path}'; known are {known}, or give the path of a .toml file")
+        raise DescriptionError(
+            f"nothing is called '{name_or_path}'; known are {known}, or give the path of a .toml file"
+        )
     return shipped
 
 
@@ -74,7 +76,7 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def validated(model: type[AnyDescription], table: dict[str, Any], source: str | Path) -> AnyDescription:
-    """The table as a description; raises DescriptionError naming each wrong key, what was found and what is expected."""
+    """The table as a description; DescriptionError names each wrong key, what was found and what is expected."""
     try:
         return model.model_validate(table)
     except ValidationError as error:

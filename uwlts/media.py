@@ -14,6 +14,7 @@ import numpy as np
 
 from uwlts.errors import DescriptionError, RangeError
 
+
 def check_range(name: str, value: float, lowest: float, highest: float, source: str) -> None:
     """Raise RangeError unless ``lowest <= value <= highest``."""
     if not (math.isfinite(value) and lowest <= value <= highest):
@@ -88,7 +89,9 @@ def find_glass(name: str) -> Glass:
 def glass_index(name: str, *, wavelength_nm: float) -> float:
     """Refractive index of a named glass relative to air; raises RangeError outside the formula's range."""
     glass = find_glass(name)
-    check_range("wavelength_nm", wavelength_nm, 1e3 * glass.lowest_um, 1e3 * glass.highest_um, f"{name} ({glass.source})")
+    check_range(
+        "wavelength_nm", wavelength_nm, 1e3 * glass.lowest_um, 1e3 * glass.highest_um, f"{name} ({glass.source})"
+    )
     return glass.index(1e-3 * wavelength_nm)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.errors import DesignError
-from uwlts.sensor import Camera, Laser, Medium, Sensor
+from uwlts.sensor import Camera, Medium, Sensor
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,10 @@ class View:
     farthest_mm: float
 
 
-def _half_width_mm(camera: Camera, medium_index: float, wavelength_nm: float, side_px: int, depth_mm: np.ndarray) -> np.ndarray:
-    """Half the width of the view of an image side at depths outside the window, by Snell's law at an untilted window."""
+def _half_width_mm(
+    camera: Camera, medium_index: float, wavelength_nm: float, side_px: int, depth_mm: np.ndarray
+) -> np.ndarray:
+    """Half the width of the view of an image side at depths outside an untilted window, by Snell's law."""
     window = camera.window
     sine = math.sin(math.atan(0.5 * side_px / camera.focal_length_px()))
     slopes = [s / math.sqrt(1 - s * s) for s in (sine, sine / window.index(wavelength_nm), sine / medium_index)]
@@ -146,7 +148,7 @@ def check_design(sensor: Sensor, medium: Medium) -> View:
     view = view_of_sheet(sensor, medium)
     if view.nearest_mm > sensor.volume.far_mm or view.farthest_mm < sensor.volume.near_mm:
         raise DesignError(
-            f"the camera sees the sheet from {view.nearest_mm:.0f} to {view.farthest_mm:.0f} mm outside the window, but "
-            f"the measuring volume reaches from {sensor.volume.near_mm:g} to {sensor.volume.far_mm:g} mm"
+            f"the camera sees the sheet from {view.nearest_mm:.0f} to {view.farthest_mm:.0f} mm outside the window, "
+            f"but the measuring volume reaches from {sensor.volume.near_mm:g} to {sensor.volume.far_mm:g} mm"
         )
     return view

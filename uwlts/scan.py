@@ -112,7 +112,9 @@ def reconstruct_capture(
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
         found = ", ".join(f"{count} {name}" for name, count in by_status.items() if count)
-        raise CaptureError(f"no stripe in any of the {len(pixels)} laser images of {capture.path.name} (lines: {found})")
+        raise CaptureError(
+            f"no stripe in any of the {len(pixels)} laser images of {capture.path.name} (lines: {found})"
+        )
     frame, line, intensity = (np.concatenate(parts) for parts in (frames, lines, intensities))
     found = reconstruct_pixels(
         calibration, np.concatenate(pixels), medium_index=index,

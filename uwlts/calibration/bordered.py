@@ -124,9 +124,7 @@ def fit_bordered(
     )
 
 
-def _assembled(
-    model: Model, shared: np.ndarray, own: list[np.ndarray], soft_limit: float | None
-) -> _Normal | None:
+def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_limit: float | None) -> _Normal | None:
     count, cost, observations, products = len(shared), 0.0, [], []
     for group, values in enumerate(own):
         observation = model(group, shared, values)

@@ -58,12 +58,15 @@ def solve_without_bias(
     for rounds in range(1, _ROUNDS + 1):
         centred = [replace(i, pixels=i.pixels - offset) for i, offset in zip(images, bias, strict=True)]
         solution = solve(centred, solution)
-        before, bias = bias, [
-            circle_centre_bias(
-                _projection(solution, index), image.points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y
-            )
-            for index, image in enumerate(images)
-        ]
+        before, bias = (
+            bias,
+            [
+                circle_centre_bias(
+                    _projection(solution, index), image.points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y
+                )
+                for index, image in enumerate(images)
+            ],
+        )
         if max(np.max(np.abs(b - a)) for a, b in zip(before, bias, strict=True)) <= tolerance_px:
             return UnbiasedSolution(solution, before, rounds)
     raise CalibrationError(

@@ -126,7 +126,7 @@ def read_calibration(path: str | Path) -> Calibration:
     except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path} is not a calibration, or is truncated: {error}") from error
     if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
-        raise CaptureError(f"{path} is JSON but not a calibration: expected \"format\": \"{FORMAT}\"")
+        raise CaptureError(f'{path} is JSON but not a calibration: expected "format": "{FORMAT}"')
     if (version := content.pop("version", None)) != VERSION:
         raise CaptureError(f"{path} has version {version}; this program reads {VERSION}")
     try:

@@ -15,8 +15,9 @@ _RAYS, _DEPTHS = 65, 9
 def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibration:
     """The calibration a sensor would have if it were built exactly as its description says.
 
-    Without a medium the sheet is the plane of the fan as it leaves the laser. In a medium it is the plane that fits the fan's rays best where the camera sees them, after they have passed the laser's
-    window: a window tilted across the sheet turns the sheet a little, one tilted along it bends it.
+    Without a medium the sheet is the plane of the fan as it leaves the laser. In a medium it is the
+    plane that fits the fan's rays best where the camera sees them, after they have passed the laser's window: a window
+    turned about the sheet's normal leaves the sheet as it is, one turned about the fan's direction turns and bends it.
     """
     camera, plate = sensor.camera, sensor.camera.window
     f, (cx, cy) = camera.focal_length_px(), camera.principal_point()

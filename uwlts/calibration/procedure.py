@@ -156,9 +156,7 @@ def calibrate(
         }
     )
     bias = None if unbiased is None else unbiased.bias_px
-    return CalibrationResult(
-        calibration, evidence, camera, bias, stripe_points, sheet, used, window, warnings
-    )
+    return CalibrationResult(calibration, evidence, camera, bias, stripe_points, sheet, used, window, warnings)
 
 
 def _common_sensor(captures: Sequence[Capture]) -> Sensor:
@@ -234,9 +232,14 @@ def _window(
         try:
             images.append(
                 label_step(
-                    calibration, window, step.pixels, height_mm=step.standard.height_mm, medium_index=step.medium_index,
-                    edge_mm=step.standard.edge_mm, reference=step.standard.reference,
-                )  # fmt: skip
+                    calibration,
+                    window,
+                    step.pixels,
+                    height_mm=step.standard.height_mm,
+                    medium_index=step.medium_index,
+                    edge_mm=step.standard.edge_mm,
+                    reference=step.standard.reference,
+                )
             )
             used.append(step)
         except EvaluationError as error:
@@ -262,9 +265,7 @@ def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: 
     return []
 
 
-def _turn_warnings(
-    camera: CameraSolution, sheet: SheetSolution, sensor: Sensor, air: Sequence[Capture]
-) -> list[str]:
+def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor, air: Sequence[Capture]) -> list[str]:
     warnings = []
     if sheet.turn_rad > _LARGEST_USUAL_TURN:
         warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")

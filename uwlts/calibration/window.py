@@ -202,9 +202,7 @@ def _inside(low: float, high: float) -> tuple[float, float]:
     return low + margin, high - margin
 
 
-def _heights(
-    calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float
-) -> np.ndarray:
+def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float) -> np.ndarray:
     """Height of the step in every image and its standard deviation, mm: (S, 2).
 
     NaN where a point of a tread has no reconstruction.

@@ -36,9 +36,7 @@ def write_upwards(picture: np.ndarray, text: str, x: float, y: float, *, size: f
     np.minimum(room, turned[: room.shape[0], : room.shape[1]], out=room)
 
 
-def line(
-    picture: np.ndarray, points: np.ndarray, *, colour: tuple[int, int, int] = INK, thickness: int = 1
-) -> None:
+def line(picture: np.ndarray, points: np.ndarray, *, colour: tuple[int, int, int] = INK, thickness: int = 1) -> None:
     """Smooth line through points (N, 2) at fractions of a pixel."""
     shifted = np.round(np.asarray(points) * 2**_SHIFT).astype(np.int32)
     cv2.polylines(picture, [shifted.reshape(-1, 1, 2)], False, colour, thickness, cv2.LINE_AA, _SHIFT)

@@ -211,5 +211,5 @@ def _seconds(path: Path) -> dict[str, float]:
         isinstance(value, int | float) and math.isfinite(value) and value >= 0 for value in content.values()
     )
     if not numbers:
-        raise CaptureError(f"{path} must hold the seconds of each stage by name: {{\"render\": 12.3, ...}}")
+        raise CaptureError(f'{path} must hold the seconds of each stage by name: {{"render": 12.3, ...}}')
     return {stage: float(value) for stage, value in content.items()}

@@ -41,7 +41,7 @@ def load_reference(name_or_path: str | Path) -> Reference:
 
 def _figures(path: Path, name: str, found: Any) -> dict[str, tuple[float, ...]]:
     if not isinstance(found, dict):
-        raise DescriptionError(f"{path}: {name} is {found!r}; expected a table [\"{name}\"] of figures")
+        raise DescriptionError(f'{path}: {name} is {found!r}; expected a table ["{name}"] of figures')
     return {figure: _numbers(f"{path}: {name}.{figure}", values) for figure, values in found.items()}
 
 
