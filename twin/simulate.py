@@ -71,8 +71,8 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     low, high = (np.array(corner) - offsets for corner in (box.min, box.max))
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
         raise DesignError(
-            f"the objects lie from Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm about the stand-off, outside the "
-            f"measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
+            f"the objects lie from Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm about the stand-off, "
+            f"outside the measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
         )
     if not ((low[:, 0] <= 0) & (high[:, 0] >= 0)).any():
         raise DesignError(
@@ -143,7 +143,8 @@ def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> Capture
         artefact=scene.artefact,
         provenance={
             "source": "twin", "seed": studio.options.seed, "spp": studio.options.spp, "ideal": studio.options.ideal,
-            "variant": mi.variant(), "mitsuba": version("mitsuba"), "drjit": version("drjit"), "uwlts": version("uwlts"),
+            "variant": mi.variant(), "mitsuba": version("mitsuba"), "drjit": version("drjit"),
+            "uwlts": version("uwlts"),
         },
     )  # fmt: skip
 
