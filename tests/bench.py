@@ -108,7 +108,9 @@ def pipeline() -> list[Row]:
         def extract(k: int, image: np.ndarray = image, along: str = along) -> object:
             return extract_stripe(image, stripe_along=along)
 
-        def measure(k: int, extract: Callable = extract, calibration: object = calibration, index: float = index) -> object:
+        def measure(
+            k: int, extract: Callable = extract, calibration: object = calibration, index: float = index
+        ) -> object:
             pixels = extract(k).pixels()
             return reconstruct_pixels(
                 calibration, pixels, medium_index=index, stage_mm=0.1 * k, stage_direction=np.array([1.0, 0.0, 0.0])
@@ -125,7 +127,9 @@ def demo() -> list[Row]:
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "twin.demo"], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", "twin.demo"], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL
+        )
         seconds = time.perf_counter() - start
     # ru_maxrss of the children is the largest single process; the demo runs one at a time.
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20

@@ -31,13 +31,17 @@ def scene_of(*objects: dict[str, Any], **rest: Any) -> Scene:
     return Scene.model_validate({"title": "test", "objects": list(objects)} | rest)
 
 
-def plate(z: float = 0.0, *, reflectance: float = 0.8, side: float = 400.0, x: float = 0.0, y: float = 0.0) -> dict[str, Any]:
+def plate(
+    z: float = 0.0, *, reflectance: float = 0.8, side: float = 400.0, x: float = 0.0, y: float = 0.0
+) -> dict[str, Any]:
     """A plate square to the laser's axis."""
     size = {"width_mm": side, "height_mm": side, "reflectance": reflectance}
     return {"kind": "plate", "position_mm": (x, y, z)} | size
 
 
-def block(size: tuple[float, float, float], position: tuple[float, float, float], *, reflectance: float = 0.0) -> dict[str, Any]:
+def block(
+    size: tuple[float, float, float], position: tuple[float, float, float], *, reflectance: float = 0.0
+) -> dict[str, Any]:
     """A block, black unless told otherwise."""
     return {"kind": "block", "size_mm": size, "position_mm": position, "reflectance": reflectance}
 
@@ -71,7 +75,9 @@ def laser_origin(sensor: Sensor) -> np.ndarray:
     return axes.T @ (sensor.laser.baseline_mm * towards - standoff)
 
 
-def oracle_window(window: Window, medium: Medium, *, wavelength_nm: float = 635.0) -> tuple[list[fermat.Face], list[float]]:
+def oracle_window(
+    window: Window, medium: Medium, *, wavelength_nm: float = 635.0
+) -> tuple[list[fermat.Face], list[float]]:
     """Faces and indices of a window before a module that looks along +z; none if it is taken off."""
     if not window.mounted:
         return [], [1.0]
@@ -127,7 +133,9 @@ def extinction(medium: Medium, *, wavelength_nm: float = 635.0) -> float:
     return medium.absorption_per_mm(wavelength_nm) + medium.scattering_per_mm(wavelength_nm)
 
 
-def window_transmittance(cosine: np.ndarray, window: Window, medium_index: float, *, absorption_per_mm: float) -> np.ndarray:
+def window_transmittance(
+    cosine: np.ndarray, window: Window, medium_index: float, *, absorption_per_mm: float
+) -> np.ndarray:
     """Both faces and the glass between them, for the cosine of the angle in air."""
     glass = window.index(635.0)
     in_glass = np.sqrt(1 - (1 - cosine**2) / glass**2)

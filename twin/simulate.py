@@ -20,7 +20,7 @@ from uwlts.sensor import Medium, Sensor
 from uwlts.truth import Truth, TruthHeader, truth_path, write_truth
 
 Progress = Callable[[int, int], None]
-PROBE_SPP = 4
+PROBE_SPP = 16
 BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
 

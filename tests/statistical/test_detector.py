@@ -12,7 +12,13 @@ PIXELS = SIDE * SIDE
 
 
 def detector(**changes: object) -> Detector:
-    plain = {"bits": 12, "quantum_efficiency": 0.5, "full_well_e": 10000.0, "read_noise_e": 22.0, "black_level_dn": 100.0}
+    plain = {
+        "bits": 12,
+        "quantum_efficiency": 0.5,
+        "full_well_e": 10000.0,
+        "read_noise_e": 22.0,
+        "black_level_dn": 100.0,
+    }
     return Detector.model_validate(plain | changes)
 
 

@@ -7,8 +7,21 @@ import pytest
 
 from tests.oracles import fermat
 from tests.virtual_sensors import (
-    altered, block, camera_axes, clear, cropped, extinction, gauss_legendre, laser_origin, lens_factor, oracle_fan,
-    oracle_paths, oracle_window, plate, scene_of, sensor_at,
+    altered,
+    block,
+    camera_axes,
+    clear,
+    cropped,
+    extinction,
+    gauss_legendre,
+    laser_origin,
+    lens_factor,
+    oracle_fan,
+    oracle_paths,
+    oracle_window,
+    plate,
+    scene_of,
+    sensor_at,
 )  # fmt: skip
 from twin.arrays import to_jit
 from twin.renderer import NODE_SPACING_PX, Renderer

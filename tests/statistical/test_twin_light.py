@@ -9,8 +9,20 @@ import pytest
 
 from tests.oracles.optics import fresnel_transmittance
 from tests.virtual_sensors import (
-    altered, clear, cropped, extinction, gauss_legendre, image_of, laser_origin, lens_factor, oracle_fan, oracle_paths,
-    plate, scene_of, sensor_at, window_transmittance,
+    altered,
+    clear,
+    cropped,
+    extinction,
+    gauss_legendre,
+    image_of,
+    laser_origin,
+    lens_factor,
+    oracle_fan,
+    oracle_paths,
+    plate,
+    scene_of,
+    sensor_at,
+    window_transmittance,
 )  # fmt: skip
 from twin.arrays import to_jit
 from twin.renderer import Renderer
@@ -26,7 +38,9 @@ ROUNDING = 2e-6
 
 
 @pytest.mark.parametrize("mode", ["camera", "laser"])
-@pytest.mark.parametrize(("glass", "absorption_per_m", "index"), [(1.52, None, 1.3312), (1.9, 40.0, 1.34), ("soda-lime", None, 1.0)])
+@pytest.mark.parametrize(
+    ("glass", "absorption_per_m", "index"), [(1.52, None, 1.3312), (1.9, 40.0, 1.34), ("soda-lime", None, 1.0)]
+)
 def test_a_window_passes_what_the_fields_continuity_allows(mode, glass, absorption_per_m, index):
     window = Window(
         distance_mm=20.0, thickness_mm=6.0, glass=glass, aperture_diameter_mm=200.0, absorption_per_m=absorption_per_m
@@ -47,14 +61,18 @@ def test_a_window_passes_what_the_fields_continuity_allows(mode, glass, absorpti
         expected = expected / index**2  # radiance over index squared is what stays along a ray
     # Towards 75 deg transmittance falls steeply with the angle: a rounding of 6e-8 there weighs ten times as much.
     np.testing.assert_allclose(path.weight.numpy(), expected, rtol=5 * ROUNDING)
-    backwards = fresnel_transmittance(np.cos(angle), n1=1.0, n2=window.index(635.0)) / (index**2 if mode == "camera" else 1)
+    backwards = fresnel_transmittance(np.cos(angle), n1=1.0, n2=window.index(635.0)) / (
+        index**2 if mode == "camera" else 1
+    )
     assert np.abs(path.weight.numpy() / backwards - 1).min() > 1e-3, "one face alone would be noticed"
 
 
 # --- sheet -----------------------------------------------------------------------------------------------------------
 
 
-def profile(sheet: Sheet, sensor: Sensor, medium: Medium, z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def profile(
+    sheet: Sheet, sensor: Sensor, medium: Medium, z: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Power per area of the plane Z = ``z`` (A, B) at nodes x (A,) across and y (B,) along, and the weights of y."""
     fan = oracle_fan(sensor, medium)
     edge = fan.y(np.array(fan.full_angle / 2), z - laser_origin(sensor)[2])
@@ -99,7 +117,11 @@ def test_the_profile_along_the_sheet_is_that_of_an_even_fan(thesis):
     power, x, y, _ = profile(Sheet(thesis, medium), thesis, medium, z)
     depth = z - laser_origin(thesis)[2]
     angle = fan.angle_through(y, depth)
-    expected = fan.power_per_angle(angle) / fan.y_per_angle(angle, depth) * np.exp(-fan.extinction * fan.way_in_medium(angle, depth))
+    expected = (
+        fan.power_per_angle(angle)
+        / fan.y_per_angle(angle, depth)
+        * np.exp(-fan.extinction * fan.way_in_medium(angle, depth))
+    )
     np.testing.assert_allclose(power.sum(axis=0) * (x[1] - x[0]), expected, rtol=2e-4)
     assert expected.max() / expected.min() > 1.05, "a flat profile would be noticed"
 
@@ -144,7 +166,9 @@ def stripe_sum(sensor: Sensor, medium: Medium, y: np.ndarray, z: float, *, refle
     angle = fan.angle_through(y, depth)
     power_per_mm = fan.power_per_angle(angle) / fan.y_per_angle(angle, depth)
     arriving = power_per_mm * np.exp(-fan.extinction * fan.way_in_medium(angle, depth))
-    return reflectance / math.pi * arriving * camera_factor(sensor, medium, points) * pixels_per_mm(sensor, medium, points)
+    return (
+        reflectance / math.pi * arriving * camera_factor(sensor, medium, points) * pixels_per_mm(sensor, medium, points)
+    )
 
 
 def test_the_stripes_irradiance_is_what_power_reflectance_and_lens_make_of_it(thesis):

@@ -37,7 +37,9 @@ def measured(path: Path, calibration: Calibration) -> Judgement:
     return judge(scan.cloud, artefact=artefact, truth=read_truth(truth_path(path))[1], source=path.name)
 
 
-def record(scene: str, path: Path, *, as_built: str | None = None, ideal: bool = False, seed: int = 0, **changes) -> Path:
+def record(
+    scene: str, path: Path, *, as_built: str | None = None, ideal: bool = False, seed: int = 0, **changes
+) -> Path:
     built = load_sensor(as_built) if as_built else None
     options = Options(spp=64 if ideal else 16, seed=seed, ideal=ideal)
     simulate(load_scene(scene, changes=changes), load_sensor("thesis"), path, as_built=built, options=options)
@@ -90,7 +92,12 @@ def test_calibration_finds_the_sensor_as_built(campaign: tuple[Path, Calibration
 def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationResult], placement: str):
     folder, result = campaign
     path = record(
-        "spheres", folder / f"spheres-{placement}.h5", as_built="thesis-as-built", seed=1, placement=placement, motion=PROFILES
+        "spheres",
+        folder / f"spheres-{placement}.h5",
+        as_built="thesis-as-built",
+        seed=1,
+        placement=placement,
+        motion=PROFILES,
     )
     figures = measured(path, result.calibration).content["evaluation"]["figures_mm"]
     assert abs(figures["SSE"]) <= 0.08

@@ -312,8 +312,10 @@ def test_info_on_files_of_another_kind(fails, folder: Path, tmp_path: Path, suff
     tried = 0
     for kind in KINDS:
         source = folder / kind
-        right = kind.endswith(suffix) and kind not in ("scene.toml", "artefact.toml", "truncated.h5") and (
-            suffix != ".h5" or not kind.endswith(".truth.h5")
+        right = (
+            kind.endswith(suffix)
+            and kind not in ("scene.toml", "artefact.toml", "truncated.h5")
+            and (suffix != ".h5" or not kind.endswith(".truth.h5"))
         )
         if source.is_file() and not right and (suffix, kind) != (".h5.part", "scan.h5"):
             shutil.copy(source, tmp_path / f"renamed{suffix}")

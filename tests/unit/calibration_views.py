@@ -38,9 +38,7 @@ def built_sensor() -> Sensor:
 
 def lens_of(sensor: Sensor) -> Lens:
     camera = sensor.camera
-    return Lens(
-        camera.focal_length_px(), *camera.principal_point(), camera.distortion.k1, camera.distortion.k2
-    )
+    return Lens(camera.focal_length_px(), *camera.principal_point(), camera.distortion.k1, camera.distortion.k2)
 
 
 def inside(pixels, sensor: Sensor):

@@ -82,9 +82,7 @@ def test_free_poses_tell_the_stages_direction():
 def test_either_way_of_the_stage_and_of_the_targets_axes(up, reverse):
     images, true_poses, direction = stage_images(SENSOR, positions=FEW)
     flip = np.diag([1.0, -1.0, -1.0]) if up else np.eye(3)
-    images = [
-        replace(i, points_mm=i.points_mm @ flip, stage_mm=-i.stage_mm if reverse else i.stage_mm) for i in images
-    ]
+    images = [replace(i, points_mm=i.points_mm @ flip, stage_mm=-i.stage_mm if reverse else i.stage_mm) for i in images]
     assert all(z_away(image) is not up for image in images)
     solution = solve_camera(images, **SIZE, approaching=not reverse)
     np.testing.assert_allclose(found(solution), TRUE, atol=1e-8)

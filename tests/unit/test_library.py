@@ -106,7 +106,7 @@ def test_cycle_by_detours(tmp_path: Path):
     refused(tmp_path / "a" / "one.toml", "its own base")
 
 
-@pytest.mark.parametrize("base", ["3", "[\"thesis\"]", "{ name = \"thesis\" }", "true"])
+@pytest.mark.parametrize("base", ["3", '["thesis"]', '{ name = "thesis" }', "true"])
 def test_base_must_be_a_name(tmp_path: Path, base: str):
     refused(written(tmp_path / "a.toml", f"base = {base}\n"), "a.toml: base is", "expected the name or path")
 

@@ -107,7 +107,9 @@ def test_a_laser_may_be_placed_by_origin_and_axis_instead(tmp_path, thesis):
     sensor = load_sensor(written(tmp_path, placed))
     scene = scene_of(plate())
     views = [Renderer(which, which.media["water"], scene).view for which in (sensor, thesis)]
-    np.testing.assert_allclose([views[0].standoff_mm, views[0].line_length_mm], [views[1].standoff_mm, views[1].line_length_mm])
+    np.testing.assert_allclose(
+        [views[0].standoff_mm, views[0].line_length_mm], [views[1].standoff_mm, views[1].line_length_mm]
+    )
 
 
 @pytest.mark.parametrize(
@@ -148,10 +150,19 @@ BAD_SCENES = {
     "no objects": ("title = 't'\nobjects = []", r"objects: .*at least 1"),
     "objects as a table": ("title = 't'\n[objects]\nkind = 'plate'", r"\[\[objects\]\]"),
     "unknown object": ("title = 't'\n[[objects]]\nkind = 'cube'", r"objects\.0: .*'cube'"),
-    "wrong unit": ("title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_m = 0.05", r"objects\.0\.sphere\.diameter_m: unknown key"),
-    "reflectance": ("base = 'plane'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nreflectance = 1.2", r"reflectance: .*1\.2"),
+    "wrong unit": (
+        "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_m = 0.05",
+        r"objects\.0\.sphere\.diameter_m: unknown key",
+    ),
+    "reflectance": (
+        "base = 'plane'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nreflectance = 1.2",
+        r"reflectance: .*1\.2",
+    ),
     "placement": ("base = 'plane'\nplacement = 'nearby'", r"placement 'nearby' is not one of near, standoff, far"),
-    "direction": ("base = 'plane'\n[motion]\ndirection = [0.0, 0.0, 0.0]", r"motion: direction \(0\.0, 0\.0, 0\.0\) has no length"),
+    "direction": (
+        "base = 'plane'\n[motion]\ndirection = [0.0, 0.0, 0.0]",
+        r"motion: direction \(0\.0, 0\.0, 0\.0\) has no length",
+    ),
     "no light": ("base = 'plane'\n[motion]\nlights = []", r"motion: lights is empty"),
     "unknown light": ("base = 'plane'\n[motion]\nlights = ['sun']", r"motion\.lights\.0: .*'sun'"),
     "no frames": ("base = 'plane'\n[motion]\ncount = 0", r"motion\.count: .*found 0"),
@@ -192,7 +203,7 @@ def test_a_mesh_that_is_missing_or_damaged_is_refused(tmp_path):
 
 @pytest.mark.parametrize("wrong", [{"spp": 0}, {"spp": 70000}, {"seed": -1}])
 def test_options_outside_their_range_are_refused(wrong):
-    (key, value), = wrong.items()
+    ((key, value),) = wrong.items()
     with pytest.raises(DescriptionError, match=f"{key} is {value}"):
         Options(**wrong)
 
@@ -200,7 +211,8 @@ def test_options_outside_their_range_are_refused(wrong):
 def test_a_pose_turns_about_the_scenes_x_then_y_then_z():
     pose = Pose(position_mm=(1.0, 2.0, 3.0), rotation_deg=(20.0, -30.0, 50.0)).matrix()
     about_x, about_y, about_z = (
-        Rotation.from_rotvec(np.radians(angle) * axis).as_matrix() for angle, axis in zip((20, -30, 50), np.eye(3), strict=True)
+        Rotation.from_rotvec(np.radians(angle) * axis).as_matrix()
+        for angle, axis in zip((20, -30, 50), np.eye(3), strict=True)
     )
     np.testing.assert_allclose(pose[:3, :3], about_z @ about_y @ about_x, atol=1e-15)
     np.testing.assert_array_equal(pose[:, 3], [1, 2, 3, 1])

@@ -62,9 +62,7 @@ def position_bound(*, sigma, amplitude, noise):
 # Largest error over the pixel phase without noise. Zero crossing: aliasing of the Gaussian weight, which falls as
 # exp(-2 pi^2 s^2), and at sigma 4 the flanks that still hold a few thousandths of the stripe; measured 0.005 at both
 # ends. The other two weigh pixels in part at the ends of a window where the profile is not zero.
-@pytest.mark.parametrize(
-    ("method", "limit"), [("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)]
-)
+@pytest.mark.parametrize(("method", "limit"), [("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)])
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
 def test_bias_over_the_pixel_phase(method, limit, sigma):
     centre = phases()

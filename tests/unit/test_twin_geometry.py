@@ -16,7 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from tests.oracles import fermat
 from tests.virtual_sensors import (
-    altered, camera_axes, laser_origin, oracle_fan, oracle_window, plate, scene_of, sensor_at,
+    altered,
+    camera_axes,
+    laser_origin,
+    oracle_fan,
+    oracle_window,
+    plate,
+    scene_of,
+    sensor_at,
 )  # fmt: skip
 from twin.arrays import to_jit, to_numpy
 from twin.camera import LensRays
@@ -24,7 +31,7 @@ from twin.renderer import Renderer, SensorPose
 from twin.sheet import Sheet
 from twin.windows import WindowFaces, frame_about
 from uwlts.placement import camera_from_object
-from uwlts.sensor import Camera, Distortion, Medium, Sensor, Window
+from uwlts.sensor import Camera, Medium, Sensor, Window
 
 RAY_MM = 3e-4
 
@@ -120,7 +127,9 @@ def test_a_slightly_wrong_window_would_be_noticed(thesis):
     wrongs = {"distance_mm": 62.83, "thickness_mm": 5.96, "glass": 1.522, "tilt_x_deg": 5.03, "tilt_y_deg": -5.03}
     for key, value in wrongs.items():
         other = altered(sensor, {"camera": {"window": {key: value}}})
-        assert np.linalg.norm(found - oracle_hits(other, renderer.medium, pixels, 0.0, found), axis=1).max() > 3 * RAY_MM, key
+        assert (
+            np.linalg.norm(found - oracle_hits(other, renderer.medium, pixels, 0.0, found), axis=1).max() > 3 * RAY_MM
+        ), key
 
 
 @pytest.mark.parametrize(
@@ -138,7 +147,9 @@ def test_the_lens_inverts_opencvs_distortion(thesis, distortion):
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, rtol=0, atol=2e-7)
 
 
-@pytest.mark.parametrize("changes", [{}, {"roll_deg": 12.0}, {"roll_deg": -30.0}], ids=["straight", "roll 12", "roll -30"])
+@pytest.mark.parametrize(
+    "changes", [{}, {"roll_deg": 12.0}, {"roll_deg": -30.0}], ids=["straight", "roll 12", "roll -30"]
+)
 @pytest.mark.parametrize("along", ["width", "height"])
 def test_the_object_frame_lies_where_the_description_says(thesis, along, changes):
     sensor = altered(thesis, {"camera": {"stripe_along": along}, "laser": changes})
@@ -211,8 +222,14 @@ def light_at(sheet: Sheet, points: np.ndarray) -> dict[str, np.ndarray]:
     """What the sheet says of points (N, 3), as NumPy arrays."""
     light = sheet.at(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
     dr.eval(light)
-    values = {name: getattr(light, name).numpy().astype(float) for name in ("distance_mm", "sigma_mm", "irradiance", "exit_mm")}
-    return values | {"direction": to_numpy(light.direction).astype(float), "normal": to_numpy(light.normal).astype(float)}
+    values = {
+        name: getattr(light, name).numpy().astype(float)
+        for name in ("distance_mm", "sigma_mm", "irradiance", "exit_mm")
+    }
+    return values | {
+        "direction": to_numpy(light.direction).astype(float),
+        "normal": to_numpy(light.normal).astype(float),
+    }
 
 
 ANGLES = np.radians(np.linspace(-22.4, 22.4, 57))

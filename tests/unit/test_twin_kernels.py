@@ -31,7 +31,9 @@ def sphere() -> dict[str, object]:
 
 def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels):
     # A focal length of its own makes sure that no other test has left these kernels in memory.
-    sensor = altered(thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2, "focal_length_mm": 12.61}})
+    sensor = altered(
+        thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2, "focal_length_mm": 12.61}}
+    )
     renderer = Renderer(sensor, clear(0.3, 0.5), scene_of(sphere(), plate(60.0, side=150.0, x=40.0)))
     new_kernels()
 
@@ -53,7 +55,9 @@ def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels
 
 
 def test_lamp_images_compile_nothing_after_the_first(thesis, new_kernels):
-    sensor = altered(thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2, "focal_length_mm": 12.62}})
+    sensor = altered(
+        thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2, "focal_length_mm": 12.62}}
+    )
     renderer = Renderer(sensor, clear(), load_scene("target"))
     new_kernels()
     renderer.irradiance("lamp", sensor_at(), spp=4)

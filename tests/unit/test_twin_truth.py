@@ -7,7 +7,17 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import (
-    altered, block, camera_axes, clear, cropped, laser_origin, oracle_fan, oracle_paths, plate, scene_of, sensor_at,
+    altered,
+    block,
+    camera_axes,
+    clear,
+    cropped,
+    laser_origin,
+    oracle_fan,
+    oracle_paths,
+    plate,
+    scene_of,
+    sensor_at,
 )  # fmt: skip
 from twin.renderer import Renderer
 from twin.truth import FrameTruth, depth_map, true_stripe
@@ -59,7 +69,10 @@ def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float)
 
 SENSORS = {
     "thesis": {},
-    "distorted": {"distortion": {"k1": -0.15, "k2": 0.1, "p1": 0.002, "p2": -0.003}, "principal_point_px": (640.3, 519.2)},
+    "distorted": {
+        "distortion": {"k1": -0.15, "k2": 0.1, "p1": 0.002, "p2": -0.003},
+        "principal_point_px": (640.3, 519.2),
+    },
     "upright": {"stripe_along": "height"},
 }
 
@@ -117,7 +130,9 @@ def true_points(renderer: Renderer, pose: np.ndarray, at_least: int) -> FrameTru
 
 def test_true_points_lie_on_a_sphere(thesis):
     centre = np.array([4.0, -12.0, 20.0])
-    renderer = Renderer(coarse(thesis), clear(), scene_of({"kind": "sphere", "diameter_mm": 50.12, "position_mm": tuple(centre)}))
+    renderer = Renderer(
+        coarse(thesis), clear(), scene_of({"kind": "sphere", "diameter_mm": 50.12, "position_mm": tuple(centre)})
+    )
     for x in (-6.0, 4.0, 15.0):
         truth = true_points(renderer, sensor_at(x=x), at_least=40)
         assert distance_to_sphere(truth.point_mm, centre, 50.12).max() < SURFACE_MM
@@ -128,7 +143,13 @@ def test_true_points_lie_on_a_sphere(thesis):
 def test_true_points_lie_on_a_turned_pipe_and_block(thesis):
     turned = (3.0, 8.0, 25.0)
     rotation = Rotation.from_euler("xyz", turned, degrees=True)
-    pipe = {"kind": "pipe", "diameter_mm": 60.0, "length_mm": 90.0, "position_mm": (0.0, -45.0, 30.0), "rotation_deg": turned}
+    pipe = {
+        "kind": "pipe",
+        "diameter_mm": 60.0,
+        "length_mm": 90.0,
+        "position_mm": (0.0, -45.0, 30.0),
+        "rotation_deg": turned,
+    }
     box = {"kind": "block", "size_mm": (50.0, 30.0, 20.0), "position_mm": (0.0, 40.0, 0.0), "rotation_deg": turned}
     renderer = Renderer(coarse(thesis), clear(), scene_of(pipe, box))
     truth = true_points(renderer, sensor_at(), at_least=120)
@@ -148,11 +169,20 @@ def test_true_points_lie_on_a_mesh(thesis, tmp_path):
     surface.vertices *= [30.0, 20.0, 10.0]
     surface.export(tmp_path / "potato.stl")
     place = {"position_mm": (0.0, 5.0, 10.0), "rotation_deg": (20.0, -10.0, 30.0), "scale": 1.5}
-    renderer = Renderer(coarse(thesis), clear(), scene_of({"kind": "mesh", "path": str(tmp_path / "potato.stl")} | place))
+    renderer = Renderer(
+        coarse(thesis), clear(), scene_of({"kind": "mesh", "path": str(tmp_path / "potato.stl")} | place)
+    )
     truth = true_points(renderer, sensor_at(x=3.0), at_least=40)
-    local = Rotation.from_euler("xyz", place["rotation_deg"], degrees=True).inv().apply(truth.point_mm - place["position_mm"]) / 1.5
+    local = (
+        Rotation.from_euler("xyz", place["rotation_deg"], degrees=True)
+        .inv()
+        .apply(truth.point_mm - place["position_mm"])
+        / 1.5
+    )
     pairs = len(local), len(surface.faces)
-    on_faces = trimesh.triangles.closest_point(np.tile(surface.triangles, (pairs[0], 1, 1)), np.repeat(local, pairs[1], axis=0))
+    on_faces = trimesh.triangles.closest_point(
+        np.tile(surface.triangles, (pairs[0], 1, 1)), np.repeat(local, pairs[1], axis=0)
+    )
     distance = np.linalg.norm(on_faces - np.repeat(local, pairs[1], axis=0), axis=1).reshape(pairs)
     assert distance.min(axis=1).max() * 1.5 < SURFACE_MM
     assert len(set(distance.argmin(axis=1))) > 20, "the stripe crosses many faces"
@@ -234,7 +264,12 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
 def test_of_two_crossings_on_a_line_the_brighter_is_given(thesis):
     # A thin block stands before another. As the laser stands aside, some of the camera's columns see past
     # the near block's edge and show both stripes.
-    laser = {"baseline_mm": None, "triangulation_angle_deg": None, "origin_mm": (-150.0, -265.0, 0.0), "axis": (150.0, 265.0, 378.5)}
+    laser = {
+        "baseline_mm": None,
+        "triangulation_angle_deg": None,
+        "origin_mm": (-150.0, -265.0, 0.0),
+        "axis": (150.0, 265.0, 378.5),
+    }
     sensor = altered(coarse(thesis), {"laser": laser})
     for near_reflectance, far_reflectance, brighter_z in ((0.9, 0.05, -20.0), (0.05, 0.9, 20.0)):
         near = block((6.0, 40.0, 10.0), (0.0, 20.0, -15.0), reflectance=near_reflectance)
