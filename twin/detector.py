@@ -1,11 +1,16 @@
 """From light to grey values, after EMVA 1288: photons, electrons, noise, full well, gain, quantisation."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from uwlts.sensor import Camera, Detector
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0
 """h c in J m (SI, exact)."""
+
+
+_BANDS = 8
 
 
 def electrons_per_ms(irradiance: np.ndarray, camera: Camera, detector: Detector, *, wavelength_nm: float) -> np.ndarray:
@@ -20,9 +25,19 @@ def grey_values(
 ) -> np.ndarray:
     """Image (H, W), uint8 or uint16, of mean photo-electrons (H, W); ``rng`` None leaves out all noise.
 
-    Shot noise of signal and dark current is Poisson's; the full well clips before read noise and gain.
+    Shot noise of signal and dark current is Poisson's; the full well clips before read noise and gain. Bands of rows
+    have random numbers of their own, so that the image does not depend on how many of them are made at a time.
     """
     mean = electrons + np.float32(1e-3 * detector.dark_current_e_per_s * exposure_ms)
+    if rng is None:
+        return _digitised(mean, detector, None)
+    bands = np.array_split(mean, _BANDS)
+    with ThreadPoolExecutor() as pool:
+        return np.concatenate(list(pool.map(_digitised, bands, [detector] * _BANDS, rng.spawn(_BANDS))))
+
+
+def _digitised(mean: np.ndarray, detector: Detector, rng: np.random.Generator | None) -> np.ndarray:
+    """Grey values of mean electrons of signal and dark current."""
     if rng is not None:
         mean = rng.poisson(mean).astype(np.float32)
     signal = np.minimum(mean, np.float32(detector.full_well_e))

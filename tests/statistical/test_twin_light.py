@@ -180,7 +180,7 @@ def test_the_stripes_irradiance_is_what_power_reflectance_and_lens_make_of_it(th
     columns = np.rint(centre).astype(int)[:, None] + np.arange(-20, 21)
     assert columns.min() > 0
     assert columns.max() < 1280
-    # The factors change by less than 1 % over 41 columns, evenly enough that their mean is the middle's within 1e-5; the
+    # The factors change by less than 1 % over 41 columns, so evenly that their mean is the middle's within 1e-5; the
     # half pixel of rounding shifts them by 1e-4. A sum over the 12 lit pixels of a column at 64 samples scatters by
     # 0.5 %, the mean of 41 columns by 0.08 %: five times that for the largest of 13, and 0.03 % for their mean.
     expected = stripe_sum(sensor, medium, y, 0.0, reflectance=reflectance)

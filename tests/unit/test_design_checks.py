@@ -126,7 +126,7 @@ def test_a_window_taken_off_in_water_is_refused(thesis, water):
 
 
 def test_objects_outside_the_measuring_volume_are_refused(thesis, water):
-    # The volume reaches 200 to 420 mm from the window's outer face, along Z / cos 35 deg about the stand-off at 309.7 mm.
+    # The volume reaches 200 to 420 mm from the window's outer face, along Z / cos 35 deg about 309.7 mm.
     outer = 265 / math.tan(math.radians(35)) - 68.73
     nearest, farthest = ((edge - outer) / math.cos(math.radians(35)) for edge in (200.0, 420.0))
     for z in (nearest - 0.1, farthest + 0.1):

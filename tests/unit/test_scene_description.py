@@ -62,7 +62,10 @@ BAD_SENSORS = {
     "glass of air": ("[camera.window]\nglass = 1.0", r"camera\.window\.glass"),
     "stripe": ("[camera]\nstripe_along = 'depth'", r"camera\.stripe_along: .*'depth'"),
     "bits": ("[detector]\nbits = 9", r"detector\.bits: .*found 9"),
-    "placed twice": ("[laser]\norigin_mm = [0.0, -265.0, 0.0]\naxis = [0.0, 0.6, 0.8]", r"laser: place the laser by baseline_mm"),
+    "placed twice": (
+        "[laser]\norigin_mm = [0.0, -265.0, 0.0]\naxis = [0.0, 0.6, 0.8]",
+        r"laser: place the laser by baseline_mm",
+    ),
     "placed half": ("[laser]\naxis = [0.0, 0.6, 0.8]", r"laser: place the laser by baseline_mm"),
     "custom without index": ("[media.oil]\nkind = 'custom'", r"media\.oil: a custom medium needs its index"),
     "salty fresh water": ("[media.lake]\nkind = 'fresh'\nsalinity_g_kg = 3.0", r"media\.lake: .*salinity 3 g/kg"),

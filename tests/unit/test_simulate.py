@@ -1,4 +1,4 @@
-"""Virtual recordings: repeatable, resumable after an interruption, never overwriting unasked, nominal on the outside."""
+"""Virtual recordings: repeatable, resumable after an interruption, never overwriting unasked, nominal outside."""
 
 import numpy as np
 import pytest
@@ -17,16 +17,16 @@ OPTIONS = Options(spp=16, seed=11)
 
 @pytest.fixture(scope="module")
 def small(thesis) -> Sensor:
-    """The thesis's view in 80 x 64 pixels."""
-    return altered(thesis, {"camera": {"width_px": 80, "height_px": 64, "pixel_size_um": 84.8}})
+    """The middle of the thesis's view in 80 x 64 pixels, four times as large as the real ones."""
+    return altered(thesis, {"camera": {"width_px": 80, "height_px": 64, "pixel_size_um": 21.2}})
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """A plate behind a sphere, a lamp and a laser image at three positions."""
-    sphere = {"kind": "sphere", "diameter_mm": 50.0, "position_mm": (0.0, 5.0, -10.0)}
+    sphere = {"kind": "sphere", "diameter_mm": 30.0, "position_mm": (0.0, 4.0, 3.0)}
     motion = {"start_mm": -4.0, "step_mm": 4.0, "count": 3, "lights": ("lamp", "laser")}
-    return scene_of(sphere, plate(30.0), motion=motion)
+    return scene_of(sphere, plate(15.0), motion=motion)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_the_stripe_is_bright_where_the_truth_has_it(undisturbed):
             lines = np.flatnonzero(truth.status[index] == TruthStatus.VISIBLE)
             centre = np.rint(truth.centre_px[index, lines]).astype(int)
             brightest = image[:, lines].argmax(axis=0)
-            # A pixel is 0.9 mm wide, wider than the stripe; near the edge of two pixels noise decides which is brighter.
+            # A pixel is 0.9 mm wide, wider than the stripe; near the edge of two pixels noise decides the brighter.
             assert (np.abs(brightest - centre) <= 1).mean() > 0.95
 
 
@@ -156,14 +156,14 @@ def test_existing_files_are_replaced_only_when_asked(small, scene, tmp_path):
         before = capture.image(1)
     truth = truth_path(path).read_bytes()
     with pytest.raises(OutputError, match=r"scan.*h5 exists already"):
-        simulate(scene, small, path, options=Options(spp=2, seed=99))
+        simulate(scene, small, path, options=Options(spp=4, seed=99))
     truth_path(path).unlink()
     with pytest.raises(OutputError, match=r"scan\.h5 exists already"):
-        simulate(scene, small, path, options=Options(spp=2, seed=99))
+        simulate(scene, small, path, options=Options(spp=4, seed=99))
     truth_path(path).write_bytes(truth)
     with Capture(path) as capture:
         np.testing.assert_array_equal(capture.image(1), before)
-    simulate(scene, small, path, options=Options(spp=2, seed=99), overwrite=True)
+    simulate(scene, small, path, options=Options(spp=4, seed=99), overwrite=True)
     with Capture(path) as capture:
         assert (capture.image(1) != before).any()
 

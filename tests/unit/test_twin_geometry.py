@@ -38,7 +38,10 @@ RAY_MM = 3e-4
 STRONG = {"k1": -0.25, "k2": 0.12, "k3": 0.05, "p1": 0.004, "p2": -0.006}
 SENSORS = {
     "thesis": ("water", {}),
-    "as-built": ("water", {"camera": {"focal_length_mm": 12.93, "principal_point_px": (646.2, 505.9)}, "laser": {"roll_deg": 4.0}}),
+    "as-built": (
+        "water",
+        {"camera": {"focal_length_mm": 12.93, "principal_point_px": (646.2, 505.9)}, "laser": {"roll_deg": 4.0}},
+    ),
     "tilted": ("water", {"camera": {"window": {"tilt_x_deg": 5.0, "tilt_y_deg": -5.0, "aperture_diameter_mm": 80.0}}}),
     "thick": ("water", {"camera": {"window": {"distance_mm": 15.0, "thickness_mm": 25.0, "glass": 1.75}}}),
     "distorted": ("water", {"camera": {"distortion": STRONG}}),
@@ -133,7 +136,9 @@ def test_a_slightly_wrong_window_would_be_noticed(thesis):
 
 
 @pytest.mark.parametrize(
-    "distortion", [{}, {"k1": -0.085, "k2": 0.09}, STRONG, {"k1": 0.4, "k2": -0.3, "p2": 0.01}], ids=["none", "mild", "strong", "pincushion"]
+    "distortion",
+    [{}, {"k1": -0.085, "k2": 0.09}, STRONG, {"k1": 0.4, "k2": -0.3, "p2": 0.01}],
+    ids=["none", "mild", "strong", "pincushion"],
 )  # fmt: skip
 def test_the_lens_inverts_opencvs_distortion(thesis, distortion):
     camera = altered(thesis, {"camera": {"distortion": distortion, "principal_point_px": (633.3, 517.7)}}).camera
