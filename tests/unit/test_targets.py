@@ -21,6 +21,7 @@ from uwlts.targets import (
     label_lattice,
     parse_target,
 )
+from uwlts.targets.blobs import _ellipse_like
 
 PLATE = CircleTarget(
     spacing_x_mm=9.375, spacing_y_mm=9.372, diameter_mm=5.0, marker_diameter_mm=2.0, columns=15, rows=13, origin=(6, 5)
@@ -531,3 +532,11 @@ def test_impossible_circle_targets_are_refused(change, message):
 def test_impossible_boards_are_refused(mapping, message):
     with pytest.raises(DescriptionError, match=message):
         parse_target(mapping)
+
+
+def test_a_line_of_pixels_in_the_noise_is_no_blob():
+    # Its outline runs there and back and encloses nothing.
+    mask = np.zeros((120, 160), np.uint8)
+    mask[30, 20:60] = mask[50:90, 100] = mask[np.arange(60, 90), np.arange(20, 50)] = 1
+    cv2.circle(mask, (120, 30), 12, 1, -1)
+    assert np.allclose(_ellipse_like(mask, bright=True).centres, [[120, 30]])

@@ -155,8 +155,8 @@ def _ellipse_like(mask, *, bright):
             continue
         moments = cv2.moments(contour)
         area = moments["m00"]
-        # The outline runs through pixel centres: it leaves out half a pixel all around.
-        if area + len(contour) / 2 < MIN_AREA_PX:
+        # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
+        if area <= 0 or area + len(contour) / 2 < MIN_AREA_PX:
             continue
         covariance = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
         determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
