@@ -27,6 +27,8 @@ from uwlts.placement import camera_from_object, check_design
 from uwlts.sensor import Medium, Sensor
 
 NODE_SPACING_PX = 2
+SAMPLES_AT_ONCE = 2**23
+"""More samples are rendered one part after the other; this many take some 100 MB."""
 LIT_SIGMAS = 4.5
 """The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
 CHANGE_SHARE = 2e-3
@@ -119,10 +121,11 @@ class Renderer:
             image, rows, columns = self._laser_nodes(pose)
         else:
             image, rows, columns = self._lamp_nodes(pose)
-        if len(rows):
-            fine = self._fine(light, pose, rows, columns, spp=spp)
+        for some in np.array_split(np.arange(len(rows)), -(-len(rows) * spp // SAMPLES_AT_ONCE)) if len(rows) else ():
+            at = rows[some], columns[some]
+            fine = self._fine(light, pose, *at, spp=spp)
             # The stripe lies before the haze, which the nodes have rendered; a lamp image is replaced.
-            image[rows, columns] = fine + image[rows, columns] if light == "laser" else fine
+            image[at] = fine + image[at] if light == "laser" else fine
         return image
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
