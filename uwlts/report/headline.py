@@ -28,7 +28,7 @@ _EXPLANATIONS = {
     "deviations range": "Largest less smallest distance of the points from the fitted surface.",
     "step height": "Mean distance of one tread's points from the plane fitted to the other tread.",
     "pipe diameter": "Diameter of the fitted cylinder.",
-    "points within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
+    "within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
     "rms distance": "Root mean square of those distances. Only rendered captures have a true surface. A best fit turns "
     "and shifts the whole cloud, as aligning it with a drawing would.",
     "window distance": "From the camera's entrance pupil to the window's inner face, found from the step standard in "

@@ -100,7 +100,7 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
         if fitted is not None:
             rows.append(Row(measurement.name, "rms distance after best fit", measured=fitted.rms_mm))
         best, name = (truth, "of truth") if fitted is None else (fitted, "after best fit")
-        within = f"points within {best.tolerance_mm:.3f} {name}"
+        within = f"within {best.tolerance_mm:.3f} {name}"
         rows.append(Row(measurement.name, within, measured=best.share_within_tolerance, unit="share"))
     return rows
 
