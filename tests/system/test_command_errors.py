@@ -563,8 +563,12 @@ def test_interrupted_simulation_is_kept_and_resumed(command, folder: Path, tmp_p
     scene.write_text(f'base = "plane"\n[motion]\nstart_mm = -30.0\nstep_mm = 0.2\ncount = {FRAMES}\n', encoding="utf-8")
     options = ["--sensor", str(folder / "sensor.toml"), "--spp", "2", "--seed", "5", "--out"]
     path = tmp_path / "a.h5"
+    # A shell that runs the tests in the background makes all its children ignore Ctrl-C; the program must not.
+    program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import twin.cli; twin.cli.main()"
+    )
     process = subprocess.Popen(
-        [sys.executable, "-m", "twin.cli", "simulate", str(scene), *options, str(path)],
+        [sys.executable, "-c", program, "simulate", str(scene), *options, str(path)],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
     )  # fmt: skip
     part, frames = part_path(path), 0
