@@ -92,6 +92,12 @@ class Studio:
         check_scene(self.renderer, scene)
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
 
+    @property
+    def period_s(self) -> float:
+        """Time from one shot to the next: the stage settles, then the camera exposes and reads out."""
+        exposure_s = 1e-3 * max(self.exposure_ms.values())
+        return self.sensor.stage.settling_s + max(exposure_s, 1 / self.sensor.detector.frame_rate_hz)
+
     def pose(self, shot: Shot) -> np.ndarray:
         """``T_scene_object`` (4, 4) of the sensor's OCS at a shot."""
         transform = np.eye(4)
@@ -190,14 +196,13 @@ def simulate(
             else:
                 truths.append(no_stripe(built.camera.lines()))
             if index >= done:
-                time_s = index * (sensor.stage.settling_s + 1e-3 * studio.exposure_ms[shot.light])
                 writer.append(
                     Frame(
                         studio.image(shot, index),
                         shot.stage_mm,
                         shot.light == "laser",
                         studio.exposure_ms[shot.light],
-                        time_s,
+                        index * studio.period_s,
                     )
                 )
             progress(index + 1, len(shots))

@@ -200,6 +200,7 @@ class Detector(Description):
     read_noise_e: NotNegative
     dark_current_e_per_s: NotNegative = 0.0
     black_level_dn: NotNegative = 0.0
+    frame_rate_hz: Positive = 60.0
 
     def full_scale_dn(self) -> int:
         """Largest grey value."""
