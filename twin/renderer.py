@@ -49,9 +49,8 @@ class SensorPose:
 
     def __init__(self, scene_from_object: np.ndarray):
         to_scene = mi.Matrix4f(scene_from_object)
-        to_object = mi.Matrix4f(np.linalg.inv(scene_from_object))
-        dr.make_opaque(to_scene, to_object)
-        self._to_scene, self._to_object = mi.Transform4f(to_scene), mi.Transform4f(to_object)
+        dr.make_opaque(to_scene)
+        self._to_scene = mi.Transform4f(to_scene)
 
     def ray(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Ray3f:
         """A ray of the OCS in the scene."""
@@ -61,10 +60,6 @@ class SensorPose:
     def direction(self, direction: mi.Vector3f) -> mi.Vector3f:
         """A direction of the OCS in the scene."""
         return self._to_scene @ direction
-
-    def normal(self, normal: mi.Normal3f) -> mi.Vector3f:
-        """A direction of the scene in the OCS."""
-        return self._to_object @ mi.Vector3f(normal)
 
 
 class Renderer:
@@ -87,7 +82,7 @@ class Renderer:
             sensor.camera.window, medium, wavelength_nm=self.wavelength_nm, origin_mm=np.zeros(3), rotation=np.eye(3)
         )
         self._to_object = np.linalg.inv(camera_from_object(sensor))
-        self._extinction = medium.absorption_per_mm(self.wavelength_nm) + medium.scattering_per_mm(self.wavelength_nm)
+        self._extinction = medium.extinction_per_mm(self.wavelength_nm)
         self._scatters = medium.scattering_per_mm(self.wavelength_nm) > 0
         self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
 

@@ -78,7 +78,7 @@ class Sheet:
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
         self._waist, self._rayleigh, self._waist_at = waist, rayleigh, laser.waist_distance_mm
-        self._extinction = medium.absorption_per_mm(laser.wavelength_nm) + medium.scattering_per_mm(laser.wavelength_nm)
+        self._extinction = medium.extinction_per_mm(laser.wavelength_nm)
 
     def at(self, p: mi.Point3f) -> SheetLight:
         """Light of the sheet at points in the OCS.

@@ -126,7 +126,7 @@ class Studio:
         shots = [shot for shot in self.scene.motion.shots() if shot.light == light]
         axis = 0 if self.sensor.camera.stripe_along == "width" else 1
         brightest = 0.0
-        for shot in {0: shots[0], 1: shots[len(shots) // 2], 2: shots[-1]}.values():
+        for shot in dict.fromkeys((shots[0], shots[len(shots) // 2], shots[-1])):
             peaks = self.electrons_per_ms(shot, spp=PROBE_SPP).max(axis=axis)
             if (peaks > 0).any():
                 brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))

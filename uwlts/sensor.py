@@ -190,6 +190,10 @@ class Medium(Description):
             return 0.0
         return 1e-3 * media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
 
+    def extinction_per_mm(self, wavelength_nm: float) -> float:
+        """Extinction coefficient c = a + b in 1/mm, by which a beam grows weaker."""
+        return self.absorption_per_mm(wavelength_nm) + self.scattering_per_mm(wavelength_nm)
+
 
 class Detector(Description):
     """Image sensor after EMVA 1288: photons to electrons to grey values. The gain maps the full well to full scale."""

@@ -9,12 +9,10 @@ from scipy.spatial import cKDTree
 from uwlts.errors import EvaluationError
 from uwlts.metrology.least_squares import (
     LARGEST_RELATIVE_STD,
-    accepted_points,
     covariance_of,
     evenly_thinned,
-    is_flat,
     minimised,
-    normalise,
+    prepared_round,
     principal_axes,
     require_convergence,
 )
@@ -83,14 +81,7 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
         small or noisy that it leaves the axis open.
     """
     what = "a cylinder fit"
-    points = accepted_points(points, least=6 if radius_mm is None else 5, what=what)
-    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
-        raise ValueError(f"a radius is positive, not {radius_mm}")
-    unit = normalise(points, what=what)
-    extents, _ = principal_axes(unit.points)
-    if is_flat(extents, 2):
-        raise EvaluationError(f"{what}: all {len(points)} points lie in one plane")
-    known = None if radius_mm is None else radius_mm / unit.scale_mm
+    points, unit, known = prepared_round(points, radius_mm, least=6, what=what)
     thinned = evenly_thinned(unit.points, _THINNED)
     trials = [_refined(thinned, frame, start, known) for frame, start in _starts(thinned, known, axis_start)]
     frame, start, _ = min(trials, key=lambda trial: trial[2])

@@ -1,6 +1,7 @@
 """What every evaluation of an artefact returns."""
 
 import dataclasses
+from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,7 +13,7 @@ TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Evaluation:
+class Evaluation(ABC):
     """Named figures and the account of the points.
 
     Attributes
@@ -43,9 +44,9 @@ class Evaluation:
         return self.rejected_share <= VDI_OUTLIER_SHARE
 
     @property
+    @abstractmethod
     def figures_mm(self) -> dict[str, float]:
         """The figures by which artefacts are judged, by name, mm."""
-        raise NotImplementedError
 
     def as_dict(self) -> dict[str, Any]:
         """Everything but the deviations of the single points, as plain JSON."""

@@ -57,6 +57,28 @@ def normalise(points: np.ndarray, *, what: str) -> Normalised:
     return Normalised(centred / scale, centroid, scale)
 
 
+def prepared_round(
+    points: Any, radius_mm: float | None, *, least: int, what: str
+) -> tuple[np.ndarray, Normalised, float | None]:
+    """Points (N, 3) for a fit of a round surface, the same normalised, and the known radius in their unit, if any.
+
+    A known radius saves one of the ``least`` points.
+
+    Raises
+    ------
+    EvaluationError
+        Too few points, points that are not finite, or all in one plane.
+    """
+    points = accepted_points(points, least=least if radius_mm is None else least - 1, what=what)
+    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
+        raise ValueError(f"a radius is positive, not {radius_mm}")
+    unit = normalise(points, what=what)
+    extents, _ = principal_axes(unit.points)
+    if is_flat(extents, 2):
+        raise EvaluationError(f"{what}: all {len(points)} points lie in one plane")
+    return points, unit, None if radius_mm is None else radius_mm / unit.scale_mm
+
+
 def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Root sums of squares (D,) along, and directions (D, D) in rows of, the principal axes, the longest first.
 

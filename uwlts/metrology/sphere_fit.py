@@ -8,12 +8,9 @@ import numpy as np
 from uwlts.errors import EvaluationError
 from uwlts.metrology.least_squares import (
     LARGEST_RELATIVE_STD,
-    accepted_points,
     covariance_of,
-    is_flat,
     minimised,
-    normalise,
-    principal_axes,
+    prepared_round,
     require_convergence,
 )
 from uwlts.metrology.round_starts import algebraic_centres, centre_of_known_radius
@@ -62,14 +59,7 @@ def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
         or noisy that the centre is uncertain by more than a fifth of the radius.
     """
     what = "a sphere fit"
-    points = accepted_points(points, least=5 if radius_mm is None else 4, what=what)
-    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
-        raise ValueError(f"a radius is positive, not {radius_mm}")
-    unit = normalise(points, what=what)
-    extents, _ = principal_axes(unit.points)
-    if is_flat(extents, 2):
-        raise EvaluationError(f"{what}: all {len(points)} points lie in one plane")
-    known = None if radius_mm is None else radius_mm / unit.scale_mm
+    points, unit, known = prepared_round(points, radius_mm, least=5, what=what)
     parameters, cost = minimised(
         lambda x: _residuals(x, unit.points, known),
         lambda x: _jacobian(x, unit.points),

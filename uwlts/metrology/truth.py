@@ -6,9 +6,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import EvaluationError
-
-VISIBLE = 0
-"""Status of a line of a frame whose stripe the camera sees."""
+from uwlts.truth import TruthStatus
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,7 @@ def compare_with_truth(
     """
     points = np.asarray(points, dtype=np.float64)
     frame, line = np.asarray(frame), np.asarray(line)
-    visible = np.asarray(status) == VISIBLE
+    visible = np.asarray(status) == TruthStatus.VISIBLE
     if points.shape != (len(points), 3) or frame.shape != (len(points),) or line.shape != frame.shape:
         raise ValueError(f"(N, 3) points and (N,) indices expected: {points.shape}, {frame.shape}, {line.shape}")
     if np.shape(point_mm) != (*visible.shape, 3) or np.shape(normal) != (*visible.shape, 3) or visible.ndim != 2:

@@ -4,19 +4,15 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 import cv2
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from uwlts.errors import DescriptionError
+from uwlts.sensor import Description, Positive
 
-Length = Annotated[float, Field(gt=0)]
 Place = tuple[int, int]
 
 
-class _Description(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class CircleTarget(_Description):
+class CircleTarget(Description):
     """A lattice of equal circles, three of them with a centred dot of the opposite brightness.
 
     Looking at the plate, X points right, Y down and Z away from the viewer into the plate; the origin is the centre of
@@ -32,10 +28,10 @@ class CircleTarget(_Description):
     """
 
     kind: Literal["circles"] = "circles"
-    spacing_x_mm: Length = 9.375
-    spacing_y_mm: Length = 9.372
-    diameter_mm: Length
-    marker_diameter_mm: Length
+    spacing_x_mm: Positive = 9.375
+    spacing_y_mm: Positive = 9.372
+    diameter_mm: Positive
+    marker_diameter_mm: Positive
     columns: Annotated[int, Field(ge=2)]
     rows: Annotated[int, Field(ge=2)]
     origin: Place
@@ -67,7 +63,7 @@ class CircleTarget(_Description):
         return self
 
 
-class ChessboardTarget(_Description):
+class ChessboardTarget(Description):
     """A chessboard, known by its inner corners.
 
     Looking at the board, X points right, Y down and Z into the board; the origin is the top left inner corner. Where
@@ -84,10 +80,10 @@ class ChessboardTarget(_Description):
     kind: Literal["chessboard"] = "chessboard"
     columns: Annotated[int, Field(ge=3)]
     rows: Annotated[int, Field(ge=3)]
-    square_mm: Length
+    square_mm: Positive
 
 
-class CharucoTarget(_Description):
+class CharucoTarget(Description):
     """A chessboard with ArUco markers in its white squares.
 
     Looking at the board, X points right, Y down and Z into the board; the origin is the top left corner of the board
@@ -104,8 +100,8 @@ class CharucoTarget(_Description):
     kind: Literal["charuco"] = "charuco"
     columns: Annotated[int, Field(ge=3)]
     rows: Annotated[int, Field(ge=3)]
-    square_mm: Length
-    marker_mm: Length
+    square_mm: Positive
+    marker_mm: Positive
     dictionary: str = "DICT_4X4_100"
     legacy: bool = False
 
