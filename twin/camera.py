@@ -1,4 +1,9 @@
-"""Rays of the camera: from image points through the entrance pupil, with the lens's distortion undone."""
+"""Rays of the camera: from image points through a finite entrance pupil, with the lens's distortion undone.
+
+The chief ray of an image point runs through the pupil's centre; all its other rays meet the chief ray in the focused
+plane, so that whatever lies before or behind it is blurred. That plane is where the bare lens in air is focused: behind
+a window and in water the sharp depth lies farther away, as the rays through the real faces show.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +20,25 @@ _NEWTON_STEPS = 6
 
 @dataclass(frozen=True)
 class LensRays:
-    """Ray generator of a camera. Rays start at the entrance pupil, the origin of the camera frame."""
+    """Ray generator of a camera; the entrance pupil is a disc about the origin of the camera frame, square to z."""
 
     camera: Camera
 
+    def pupil_radius_mm(self) -> float:
+        """Radius of the entrance pupil, D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant)."""
+        return 0.5 * self.camera.focal_length_mm / self._working_f_number()
+
+    def through_pupil(self, chief: mi.Vector3f, pupil: mi.Point2f) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
+
+        ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens).
+        """
+        origin = self.pupil_radius_mm() * mi.Point3f(pupil.x, pupil.y, 0.0)
+        focused = chief * (self.camera.focus_distance_mm / chief.z)
+        return origin, dr.normalize(mi.Vector3f(focused - origin))
+
     def directions(self, x: mi.Float, y: mi.Float) -> mi.Vector3f:
-        """Unit directions in the camera frame of image points; pixel (0, 0) is the centre of the first pixel."""
+        """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
         focal = self.camera.focal_length_px()
         cx, cy = self.camera.principal_point()
         seen = mi.Point2f((x - cx) / focal, (y - cy) / focal)
@@ -53,6 +71,8 @@ class LensRays:
         E = L (pi / 4) / (N (1 + m))^2 with the magnification m at the focus distance (Smith, Modern Optical
         Engineering, 4th ed., Eqs. 8.7 and 8.10).
         """
+        return math.pi / 4 / self._working_f_number() ** 2
+
+    def _working_f_number(self) -> float:
         focal = self.camera.focal_length_mm
-        magnification = focal / (self.camera.focus_distance_mm - focal)
-        return math.pi / 4 / (self.camera.f_number * (1 + magnification)) ** 2
+        return self.camera.f_number * (1 + focal / (self.camera.focus_distance_mm - focal))

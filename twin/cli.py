@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 import uwlts
+from twin.effects import ALL, NONE
+from twin.options import Options
 from twin.scene import load_scene, scene_names
 from twin.variant import CPU, use_variant
 from uwlts.console import progress_bar, run
@@ -32,6 +34,8 @@ def simulate(
     medium: str | None = None,
     spp: int = 16,
     seed: int = 0,
+    water: str | None = None,
+    without: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     ideal: Annotated[bool, Parameter(negative="")] = False,
     resume: Annotated[bool, Parameter(negative="")] = False,
     overwrite: Annotated[bool, Parameter(negative="")] = False,
@@ -60,8 +64,14 @@ def simulate(
         Samples per lit pixel.
     seed
         Seed of all noise; the same seed gives the same capture.
+    water
+        What floats in the water, in place of the medium's own: pure, clear, coastal, harbour, jerlov-I to jerlov-9C,
+        or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
+    without
+        Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
+        fixed-pattern, noise.
     ideal
-        Leave out all noise of the detector.
+        Leave out all of these effects: a pinhole's sharp image without noise.
     resume
         Go on with an interrupted run.
     overwrite
@@ -74,7 +84,8 @@ def simulate(
         raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
     recordings = []
     for place in places:
-        changes = {key: value for key, value in (("placement", place), ("medium", medium)) if value is not None}
+        wanted = {"placement": place, "medium": medium, "water": _water(water)}
+        changes = {key: value for key, value in wanted.items() if value is not None}
         description = load_scene(scene, changes=changes)
         recordings.append((description, out.with_name(out.name.replace("{placement}", description.placement))))
     nominal = load_sensor(sensor)
@@ -82,11 +93,10 @@ def simulate(
     shared = {"width_px", "height_px", "stripe_along"}
     if built and built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
         raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{sensor}'")
+    options = Options(spp=spp, seed=seed, effects=NONE if ideal else ALL.without(*without))
     use_variant(variant)
-    from twin.simulate import Options
     from twin.simulate import simulate as record
 
-    options = Options(spp=spp, seed=seed, ideal=ideal)
     for description, path in recordings:
         with progress_bar(f"{description.title}, {description.placement}") as progress:
             record(
@@ -94,6 +104,14 @@ def simulate(
                 overwrite=overwrite, resume=resume, progress=progress,
             )  # fmt: skip
         print(f"wrote {path}")
+
+
+def _water(text: str | None) -> str | float | None:
+    """A turbidity if it reads as a number, else a name."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
 
 
 @app.command

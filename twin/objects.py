@@ -2,19 +2,224 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
+from twin.arrays import to_jit
+from twin.finish import albedo_parts, finish_bsdf, square_on
 from twin.pattern import register_circle_pattern
-from twin.scene import AnyObject, Block, CirclePlate, Mesh, Pipe, Scene, Sphere
+from twin.scene import AnyObject, Block, Mesh, Pipe, Scene, Sphere
 from uwlts.errors import DescriptionError
 
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
+_BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
+"""Right-handed axes (3, 3) of a block's faces, the third one pointing outwards."""
 _CYLINDER_AXIS_TO_X = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+# At a cosine of 0 no light is sampled; the albedo's limit there is that of a small one.
+_ALBEDO_COSINES = np.maximum(np.linspace(0.0, 1.0, 65), 1e-3)
+
+
+@dataclass(frozen=True)
+class MirrorFace:
+    """A flat face that reflects ``share`` of the light as a mirror does.
+
+    ``pose`` (4, 4) takes the face's frame to the scene's: origin in the face's middle, z along its outward normal, x
+    and y along its sides, of which ``half_size_mm`` (2,) are the halves.
+    """
+
+    pose: np.ndarray
+    half_size_mm: np.ndarray
+    share: float
+
+
+@dataclass(frozen=True)
+class Objects:
+    """All objects in scene coordinates, and what Mitsuba's shapes do not tell of a place that a ray hits.
+
+    ``scene`` holds what scatters light; ``mirrors`` are the faces that reflect beside that. Tables give a fact of each
+    shape at its number in Dr.Jit's registry, which counts through all scenes of the process.
+    """
+
+    scene: mi.Scene
+    mirrors: tuple[MirrorFace, ...]
+    _facts: dict[str, mi.Float]
+
+    def mirror_share(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """Share of light that the place hit reflects as a mirror; 0 on backs and where nothing is hit."""
+        return dr.select(si.wi.z > 0, self._fact("mirror", si), 0.0)
+
+    def polarisation(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """Degree of polarisation of laser light that the object hit scatters, 0 where nothing is hit."""
+        return self._fact("polarisation", si)
+
+    def roughness_um(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """Rms height of the object hit, 0 where nothing is hit."""
+        return self._fact("roughness_um", si)
+
+    def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
+        """Radiance towards the viewer from surfaces under a sky of radiance 1 all around, mirror images aside.
+
+        It is the share of light from the viewer's direction that the surface scatters: a diffuse surface's reflectance;
+        of a gloss it depends on the direction. 0 on the back of surfaces that have only a front.
+        """
+        active = active & si.is_valid() & ((si.wi.z > 0) | (self._fact("two_sided", si) > 0))
+        reflectance = si.bsdf().eval_diffuse_reflectance(square_on(si), active)[0]
+        last = len(_ALBEDO_COSINES) - 1
+        place = dr.minimum(dr.abs(si.wi.z), 1.0) * last
+        below = mi.UInt32(dr.minimum(dr.floor(place), last - 1))
+        start = dr.reinterpret_array(mi.UInt32, si.shape) * (last + 1) + below
+        black, per_unit = (
+            dr.lerp(
+                dr.gather(mi.Float, self._facts[key], start, active),
+                dr.gather(mi.Float, self._facts[key], start + 1, active),
+                place - below,
+            )
+            for key in ("albedo_black", "albedo_per_unit")
+        )
+        return dr.select(active, black + per_unit * reflectance, 0.0)
+
+    def _fact(self, key: str, si: mi.SurfaceInteraction3f) -> mi.Float:
+        return dr.gather(mi.Float, self._facts[key], dr.reinterpret_array(mi.UInt32, si.shape), si.is_valid())
+
+
+def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
+    """All objects of a scene in a medium, seen in the laser's light; without ``gloss`` diffuse and without mirrors.
+
+    Raises
+    ------
+    DescriptionError
+        A mesh or texture file is missing, unreadable or empty.
+    RangeError
+        The wavelength lies outside the table of a metal.
+    """
+    register_circle_pattern()
+    optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
+    things, poses = scene.objects, scene.object_poses()
+    shapes = [
+        _shape(thing, pose, finish_bsdf(thing, gloss=gloss, **optics))
+        for thing, pose in zip(things, poses, strict=True)
+    ]
+    flat = np.zeros_like(_ALBEDO_COSINES), np.ones_like(_ALBEDO_COSINES)
+    parts = [
+        albedo_parts(thing, _ALBEDO_COSINES, **optics) if gloss and thing.finish != "diffuse" else flat
+        for thing in things
+    ]
+    facts = {
+        "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
+        "polarisation": [thing.polarisation() for thing in things],
+        "roughness_um": [thing.rms_height_um() for thing in things],
+        "two_sided": [isinstance(thing, Mesh) for thing in things],
+        "albedo_black": [black for black, _ in parts],
+        "albedo_per_unit": [per_unit for _, per_unit in parts],
+    }
+    # Optimised, Mitsuba would merge meshes of equal BSDF into one shape, whatever else differs between the objects.
+    whole = mi.load_dict({"type": "scene"} | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
+    return Objects(
+        scene=whole,
+        mirrors=tuple(
+            face for thing, pose in zip(things, poses, strict=True) if gloss for face in _mirror_faces(thing, pose)
+        ),
+        _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
+    )
+
+
+def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> mi.Float:
+    """Values (objects,) or (objects, N) at the places of the objects' shapes in Dr.Jit's registry."""
+    number = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+    table = np.zeros((max(number) + 1, *values.shape[1:]), np.float32)
+    table[number] = values
+    flat = to_jit(mi.Float, table)
+    dr.eval(flat)
+    return flat
+
+
+def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape:
+    """An object at its pose (4, 4) in the scene."""
+    match thing:
+        case Sphere():
+            matrix = pose @ _scaled(*[thing.diameter_mm / 2] * 3)
+            kind = "sphere"
+        case Block():
+            matrix = pose @ _scaled(*(side / 2 for side in thing.size_mm))
+            kind = "cube"
+        case Pipe():
+            along = _CYLINDER_AXIS_TO_X @ _scaled(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
+            along[0, 3] = -thing.length_mm / 2
+            matrix = pose @ along
+            kind = "cylinder"
+        case Mesh():
+            return _mesh(thing, pose, {"type": "twosided", "bsdf": bsdf})
+        case _:
+            matrix = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1)
+            kind = "rectangle"
+    return mi.load_dict({"type": kind, "to_world": _to_world(matrix), "bsdf": bsdf})
+
+
+def _mesh(thing: Mesh, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
+    """A surface from a file with its vertices already in scene coordinates."""
+    vertices, faces, uv = _surface(thing.path)
+    if len(faces) == 0 or not np.isfinite(vertices).all():
+        raise DescriptionError(f"{thing.path} holds no usable surface: {len(faces)} faces")
+    if thing.texture is not None and uv is None:
+        raise DescriptionError(
+            f"{thing.path} has no texture coordinates for {thing.texture}: add them, or leave it out"
+        )
+    vertices = thing.scale * vertices @ pose[:3, :3].T + pose[:3, 3]
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh(Path(thing.path).stem, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    parameters["faces"] = np.ravel(faces).astype(np.uint32)
+    if uv is not None:
+        parameters["vertex_texcoords"] = np.ravel(uv).astype(np.float32)
+    parameters.update()
+    return mesh
+
+
+def _surface(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of all parts of a file.
+
+    The parts are joined here, as trimesh copies their materials to join them, which needs an imaging library.
+    """
+    if not Path(path).is_file():
+        raise DescriptionError(f"no mesh at {path}")
+    try:
+        loaded = trimesh.load(path, force="scene")
+    except (ValueError, NotImplementedError, OSError) as error:
+        raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
+    vertices, faces, uv, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros((0, 2))], 0
+    for node in loaded.graph.nodes_geometry:
+        transform, name = loaded.graph[node]
+        part = loaded.geometry[name]
+        if isinstance(part, trimesh.Trimesh):
+            vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
+            faces.append(part.faces + count)
+            uv.append(getattr(part.visual, "uv", None))
+            count += len(part.vertices)
+    textured = all(coordinates is not None for coordinates in uv)
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv) if textured else None
+
+
+def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
+    """The mirrors of one object at its pose (4, 4) in the scene."""
+    if thing.mirror_share() == 0:
+        return
+    if isinstance(thing, Block):
+        half = np.array(thing.size_mm) / 2
+        for axes in _BLOCK_FACES:
+            face = np.eye(4)
+            face[:3, :3], face[:3, 3] = axes, axes[:, 2] * half
+            yield MirrorFace(pose @ face, np.abs(axes.T @ half)[:2], thing.mirror_share())
+    else:
+        yield MirrorFace(pose @ _FACING_SENSOR, np.array([thing.width_mm, thing.height_mm]) / 2, thing.mirror_share())
 
 
 def _to_world(matrix: np.ndarray) -> mi.ScalarTransform4f:
@@ -23,62 +228,3 @@ def _to_world(matrix: np.ndarray) -> mi.ScalarTransform4f:
 
 def _scaled(x: float, y: float, z: float) -> np.ndarray:
     return np.diag([x, y, z, 1.0])
-
-
-def _mesh(thing: Mesh, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
-    """A trimesh surface with its vertices already in scene coordinates."""
-    if not Path(thing.path).is_file():
-        raise DescriptionError(f"no mesh at {thing.path}")
-    try:
-        surface = trimesh.load(thing.path, force="mesh")
-    except (ValueError, NotImplementedError, OSError) as error:
-        raise DescriptionError(f"trimesh cannot read {thing.path}: {error}") from error
-    if len(surface.faces) == 0 or not np.isfinite(surface.vertices).all():
-        raise DescriptionError(f"{thing.path} holds no usable surface: {len(surface.faces)} faces")
-    vertices = thing.scale * np.asarray(surface.vertices) @ pose[:3, :3].T + pose[:3, 3]
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh(Path(thing.path).stem, len(vertices), len(surface.faces), properties)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
-    parameters["faces"] = np.ravel(surface.faces).astype(np.uint32)
-    parameters.update()
-    return mesh
-
-
-def _shape(thing: AnyObject, pose: np.ndarray) -> Any:
-    """Mitsuba's description of one object at its pose (4, 4) in the scene."""
-    bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": thing.reflectance}
-    match thing:
-        case Sphere():
-            matrix = pose @ _scaled(*[thing.diameter_mm / 2] * 3)
-            return {"type": "sphere", "to_world": _to_world(matrix), "bsdf": bsdf}
-        case Block():
-            matrix = pose @ _scaled(*(side / 2 for side in thing.size_mm))
-            return {"type": "cube", "to_world": _to_world(matrix), "bsdf": bsdf}
-        case Pipe():
-            along = _CYLINDER_AXIS_TO_X @ _scaled(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
-            along[0, 3] = -thing.length_mm / 2
-            return {"type": "cylinder", "to_world": _to_world(pose @ along), "bsdf": bsdf}
-        case Mesh():
-            return _mesh(thing, pose, {"type": "twosided", "bsdf": bsdf})
-        case CirclePlate():
-            bsdf = {"type": "diffuse", "reflectance": {"type": "circle_pattern", "plate": thing.model_dump_json()}}
-    matrix = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1)
-    return {"type": "rectangle", "to_world": _to_world(matrix), "bsdf": bsdf}
-
-
-def build_objects(scene: Scene) -> mi.Scene:
-    """Mitsuba scene of all objects in scene coordinates.
-
-    Raises
-    ------
-    DescriptionError
-        A mesh file is missing, unreadable or empty.
-    """
-    register_circle_pattern()
-    shapes = {
-        f"object_{index}": _shape(thing, pose)
-        for index, (thing, pose) in enumerate(zip(scene.objects, scene.object_poses(), strict=True))
-    }
-    return mi.load_dict({"type": "scene"} | shapes)

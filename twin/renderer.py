@@ -1,65 +1,74 @@
 """Renders what reaches the image sensor: laser and lamp images as irradiance, only where there is light.
 
-A frame is made in two passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe (or, under
-the lamp, the pixels in which the picture changes); only these are rendered with many samples, all others take the mean
-of their nodes. The windows stand still before the camera, so the nodes' rays behind the window are traced once; the
-objects stand still in the scene, so nothing is rebuilt or recompiled between frames.
+A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
+the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure; random walks
+add the light that came on longer ways, which is smooth: cell by cell within the stripe's pixels, in large cells
+elsewhere. The windows stand still before the camera, so the nodes' rays behind the window are traced once; the objects
+stand still in the scene, so nothing is rebuilt or recompiled between frames.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from twin.arrays import to_jit
-from twin.camera import LensRays
+from twin.cells import NODE_SPACING_PX, corner_extremes, corner_mean, near_sheet, widened
+from twin.effects import ALL, Effects
+from twin.legs import Leg, legs
+from twin.light import Light, Source, lights
 from twin.objects import build_objects
+from twin.pose import SensorPose, Travel
+from twin.samples import lattice
 from twin.scene import Scene
 from twin.sheet import Sheet
-from twin.water import single_scattering
-from twin.windows import WindowFaces
+from twin.view import Bundle, View
+from twin.walk import Walker
+from twin.water import Scattering, single_scattering
 from uwlts.placement import camera_from_object, check_design
-from uwlts.sensor import Medium, Sensor
+from uwlts.sensor import Laser, Medium, Sensor
 
-NODE_SPACING_PX = 2
+WALK_CELL_PX = 8
+"""Side of the cells of multiply scattered light away from the stripe."""
 SAMPLES_AT_ONCE = 2**23
 """More samples are rendered one part after the other; this many take some 100 MB."""
-LIT_SIGMAS = 4.5
-"""The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
 CHANGE_SHARE = 2e-3
 """Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
+_MIRRORS = 2
+"""How many mirrors the camera looks into one after the other."""
+_WALKS_PER_SAMPLE = 0.25
+"""Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
+_TRAVEL_STEP_MM = 0.2
+"""While the sensor travels, the lit pixels are looked for at places this far apart."""
 
 
 @dataclass(frozen=True)
-class Bundle:
-    """Camera rays in the medium, in the sensor's OCS: origins, unit directions, and sensor irradiance per radiance."""
+class LaserFrame:
+    """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
 
-    origin: mi.Point3f
-    direction: mi.Vector3f
-    weight: mi.Float
+    ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light that came straight from the lit
+    surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
+    """
 
+    scattered: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    stripe: np.ndarray
+    polarisation: np.ndarray
+    roughness_um: np.ndarray
 
-class SensorPose:
-    """Where the sensor's OCS stands in the scene, kept opaque so that moving it never recompiles a kernel."""
-
-    def __init__(self, scene_from_object: np.ndarray):
-        to_scene = mi.Matrix4f(scene_from_object)
-        dr.make_opaque(to_scene)
-        self._to_scene = mi.Transform4f(to_scene)
-
-    def ray(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Ray3f:
-        """A ray of the OCS in the scene."""
-        # A point plus a vector is a vector to Dr.Jit, and vectors are not moved.
-        return mi.Ray3f(self._to_scene @ mi.Point3f(origin), self._to_scene @ direction)
-
-    def direction(self, direction: mi.Vector3f) -> mi.Vector3f:
-        """A direction of the OCS in the scene."""
-        return self._to_scene @ direction
+    def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
+        """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
+        image = self.scattered.copy()
+        image[self.rows, self.columns] += self.stripe * factors
+        return image
 
 
 class Renderer:
@@ -71,194 +80,272 @@ class Renderer:
         The sensor cannot work in the medium, or an object cannot be built.
     """
 
-    def __init__(self, sensor: Sensor, medium: Medium, scene: Scene):
-        self.view = check_design(sensor, medium)
-        self.sensor, self.medium = sensor, medium
-        self.wavelength_nm = sensor.laser.wavelength_nm
-        self.objects = build_objects(scene)
-        self.sheet = Sheet(sensor, medium)
-        self.lens = LensRays(sensor.camera)
-        self._faces = WindowFaces(
-            sensor.camera.window, medium, wavelength_nm=self.wavelength_nm, origin_mm=np.zeros(3), rotation=np.eye(3)
+    def __init__(self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL):
+        self.design = check_design(sensor, medium)
+        self.sensor, self.medium, self.effects = sensor, medium, effects
+        wavelength = sensor.laser.wavelength_nm
+        self.objects = build_objects(
+            scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
         )
-        self._to_object = np.linalg.inv(camera_from_object(sensor))
-        self._extinction = medium.extinction_per_mm(self.wavelength_nm)
-        self._scatters = medium.scattering_per_mm(self.wavelength_nm) > 0
-        self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
+        self.view = View(sensor, medium)
+        self.scattering = Scattering(medium, wavelength)
+        self.sheet = Sheet(sensor, medium)
+        self._sources = [Source(self.sheet), *(_further(sensor, laser, medium) for laser in sensor.more_lasers)]
+        self._mirrors = self.objects.mirrors if effects.secondary_light else ()
+        # Through the water to the stand-off and back, light is scattered so many times.
+        scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
+        self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 8 * scatterings)
+        self._reach_mm = 4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3]))
 
-    def bundle(self, x: mi.Float, y: mi.Float) -> Bundle:
-        """Rays behind the window of image points; pixel (0, 0) is the centre of the first pixel."""
-        directions = self.lens.directions(x, y)
-        path = self._faces.through(mi.Point3f(0.0), directions, mode=mi.TransportMode.Radiance)
-        transform = mi.Transform4f(mi.Matrix4f(self._to_object))
-        cosine = dr.square(dr.square(directions.z))
-        weight = dr.select(path.valid, path.weight * cosine * self.lens.irradiance_on_axis(), 0.0)
-        return Bundle(transform @ path.origin, transform @ path.direction, weight)
-
-    def _grid(self, spacing: int) -> tuple[Bundle, tuple[int, int]]:
-        """Rays of the nodes at pixel corners every ``spacing`` pixels, and the grid's shape (rows, columns)."""
-        if spacing not in self._grids:
-            camera = self.sensor.camera
-            columns, rows = -(-camera.width_px // spacing) + 1, -(-camera.height_px // spacing) + 1
-            x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
-            bundle = self.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
-            dr.eval(bundle.origin, bundle.direction, bundle.weight)
-            self._grids[spacing] = bundle, (rows, columns)
-        return self._grids[spacing]
-
-    def irradiance(self, light: Literal["lamp", "laser"], scene_from_object: np.ndarray, *, spp: int) -> np.ndarray:
+    def irradiance(
+        self, light: Literal["lamp", "laser"], scene_from_object: np.ndarray, *,
+        spp: int, seed: int = 0, travel: Travel | None = None,
+    ) -> np.ndarray:  # fmt: skip
         """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
 
-        ``spp`` samples are taken per lit pixel, the same places in every pixel: equal arguments give equal images.
+        ``spp`` samples are taken per lit pixel, the same places in every pixel; ``seed`` chooses the random walks.
+        Equal arguments give equal images.
         """
-        pose = SensorPose(scene_from_object)
         if light == "laser":
-            image, rows, columns = self._laser_nodes(pose)
-        else:
-            image, rows, columns = self._lamp_nodes(pose)
-        for some in np.array_split(np.arange(len(rows)), -(-len(rows) * spp // SAMPLES_AT_ONCE)) if len(rows) else ():
-            at = rows[some], columns[some]
-            fine = self._fine(light, pose, *at, spp=spp)
-            # The stripe lies before the haze, which the nodes have rendered; a lamp image is replaced.
-            image[at] = fine + image[at] if light == "laser" else fine
-        return image
+            return self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
+        return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp)
+
+    def laser_frame(
+        self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+    ) -> LaserFrame:
+        """The light of the laser, and of the day if there is any, on the image sensor; see `irradiance`."""
+        pose = SensorPose(scene_from_object, travel)
+        direct, mirrored = lights(self._sources, pose, self._mirrors)
+        lit, image = self._laser_nodes(pose, direct, mirrored)
+        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
+        self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
+        if self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0:
+            image += self._lamp_frame(pose, spp=spp, ambient=True)
+        rows, columns = self._pixels_of(lit)
+        facts = [self._fine(self._stripe_sums, pose, r, c, direct + mirrored, spp=spp)
+                 for r, c in _parts(rows, columns, spp=spp)]  # fmt: skip
+        stripe, polarised, rough = np.concatenate([np.zeros((3, 0), np.float32), *facts], axis=1)
+        bright = np.maximum(stripe, np.finfo(np.float32).tiny)
+        return LaserFrame(image, rows, columns, stripe, np.clip(polarised / bright, 0, 1), rough / bright)
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the pixels close to the lit stripe."""
-        bundle, shape = self._grid(NODE_SPACING_PX)
-        _, across = self._nodes_on_surface(pose, bundle)
-        return self._pixels_of(_near_sheet(across.numpy().reshape(shape)))
+        """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
+        bundle, shape = self.view.grid(NODE_SPACING_PX)
+        direct, _ = lights(self._sources[:1], pose)
+        near = [near_sheet(self._sigmas(light, next(self._legs(moment, bundle, None))).numpy().reshape(shape))
+                for moment, (light, *_) in self._moments(pose, direct)]  # fmt: skip
+        return self._pixels_of(np.any(near, axis=0))
 
-    def _nodes_on_surface(self, pose: SensorPose, bundle: Bundle) -> tuple[mi.Float, mi.Float]:
-        """How far away rays meet a surface (infinity: nowhere), and the sheet's distance across there in sigmas."""
-        hit = self.objects.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
-        valid = hit.is_valid() & (bundle.weight > 0)
-        light = self.sheet.at(bundle.origin + bundle.direction * dr.select(valid, hit.t, 1.0))
-        return dr.select(valid, hit.t, dr.inf), dr.select(valid, light.distance_mm / light.sigma_mm, dr.inf)
+    def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None = None) -> mi.Float:
+        """Irradiance of laser light per ray, in W/mm2: the lit surface seen straight, without the light around it."""
+        direct, _ = lights(self._sources, pose)
+        leg = next(self._legs(pose, bundle, travel_mm))
+        return leg.weight * self._radiance(pose, leg, direct, travel_mm)
 
-    def _laser_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Haze (H, W) in W/mm2 from the nodes, and rows and columns of the pixels close to the lit stripe."""
-        bundle, shape = self._grid(NODE_SPACING_PX)
-        depth, across = self._nodes_on_surface(pose, bundle)
-        if self._scatters:
-            haze = bundle.weight * self._haze(pose, bundle, depth, across)
-            dr.eval(across, haze)
-            image = self._spread(_corner_mean(haze.numpy().reshape(shape)))
-        else:
-            image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return image, *self._pixels_of(_near_sheet(across.numpy().reshape(shape)))
+    # --- the lit surface ----------------------------------------------------------------------------------------------
+
+    def _legs(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None) -> Iterator[Leg]:
+        mirrors = _MIRRORS if self._mirrors else 0
+        return legs(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
+
+    def _sigmas(self, light: Light, leg: Leg) -> mi.Float:
+        """The light's distance across at the legs' ends in standard deviations; infinity where there is no surface."""
+        here = light.at(leg.end())
+        return dr.select(leg.valid & light.may_reach(here), here.distance_mm / here.sigma_mm, dr.inf)
+
+    def _radiance(self, pose: SensorPose, leg: Leg, sources: list[Light], travel_mm: mi.Float | None) -> mi.Float:
+        """Radiance in W/mm2/sr that lit surfaces send back along legs, as it arrives at their beginning."""
+        radiance, end, bsdf = mi.Float(0.0), leg.end(), leg.si.bsdf()
+        for light in sources:
+            here = light.at(end)
+            lit = light.reaches(self.objects.scene, end, here, travel_mm, leg.valid & (here.irradiance > 0))
+            towards = leg.si.to_local(pose.direction(-here.direction))
+            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), leg.si, towards, lit)[0] * here.irradiance, 0.0)
+        return radiance * dr.exp(-self.scattering.extinction * dr.select(leg.valid, leg.si.t, 0.0))
+
+    # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
+
+    def _laser_nodes(
+        self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Cells (rows, columns) close to the lit stripe, and the haze (H, W) in W/mm2."""
+        bundle, shape = self.view.grid(NODE_SPACING_PX)
+        lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
+        reach = np.zeros_like(lit, np.float32)
+        for moment, sources in self._moments(pose, direct + mirrored):
+            haze = mi.Float(0.0)
+            for index, leg in enumerate(self._legs(moment, bundle, None)):
+                across = [self._sigmas(light, leg) for light in sources]
+                straight = mi.Point3f(bundle.origin + bundle.direction * (leg.way + leg.si.t))
+                depth = dr.select(leg.valid, self.view.depth_mm(straight), dr.nan)
+                if index == 0 and moment is pose and self.effects.haze and self.scattering.coefficient > 0:
+                    for light, sigmas in zip(sources, across, strict=True):
+                        haze += bundle.weight * self._haze(light, leg, sigmas)
+                dr.eval(depth, haze, *across)
+                near = np.any([near_sheet(sigmas.numpy().reshape(shape)) for sigmas in across], axis=0)
+                if self.effects.defocus and near.any():
+                    blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
+                    reach = np.maximum(reach, np.where(near, corner_extremes(blur)[1], 0))
+                lit |= near
+            if moment is pose:
+                image = self._spread(haze, shape)
+        return widened(lit, reach), image
+
+    def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
+        """The pose, and more of them over the exposure if the sensor travels, with the lights there."""
+        yield pose, sources
+        if pose.travel is not None:
+            first, last = pose.travel.ends(self.sensor.camera.height_px)
+            for travel_mm in np.linspace(first, last, 2 + int((last - first) / _TRAVEL_STEP_MM)):
+                moved = pose.moved(float(travel_mm))
+                direct, mirrored = lights(self._sources, moved, self._mirrors)
+                yield moved, direct + mirrored
+
+    def _haze(self, light: Light, leg: Leg, sigmas: mi.Float) -> mi.Float:
+        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
+
+        ``sigmas`` is the sheet's distance where the rays end on a surface, in standard deviations.
+        """
+        origin, direction = light.in_own_frame(leg.origin, leg.direction)
+        t, here = light.crossing(origin, direction)
+        end = dr.select(leg.valid, sigmas * dr.sign(dr.dot(direction, here.normal)), dr.inf)
+        scattered = single_scattering(self.scattering, here, direction=direction, surface_sigmas=end)
+        # A surface just before the sheet's middle cuts the sheet's light, but does not shadow what lies before it.
+        place = mi.Point3f(leg.origin + leg.direction * dr.minimum(t, dr.select(leg.valid, leg.si.t, dr.inf)))
+        reached = light.reaches(self.objects.scene, place, light.at(place), None, (t > 0) & (scattered > 0))
+        return dr.select(reached, scattered * dr.exp(-self.scattering.extinction * t), 0.0)
+
+    # --- light on longer ways -----------------------------------------------------------------------------------------
+
+    def _add_walks(self, image: np.ndarray, lit: np.ndarray, walker: Walker, *, seed: int, walks: int) -> None:
+        """Add multiply scattered and secondary light to an image (H, W), in large cells but for those in ``lit``."""
+        camera = self.sensor.camera
+        rows, columns = -(-camera.height_px // WALK_CELL_PX), -(-camera.width_px // WALK_CELL_PX)
+        row, column = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+        large = self._walked(walker, row, column, WALK_CELL_PX, seed=2 * seed, walks=walks).reshape(rows, columns)
+        size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
+        smooth = cv2.resize(large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
+        row, column = np.nonzero(lit)
+        if len(row):
+            small = np.zeros(lit.shape, np.float32)
+            small[row, column] = self._walked(walker, row, column, NODE_SPACING_PX, seed=2 * seed + 1, walks=4 * walks)
+            smooth = np.where(self._repeated(lit), self._repeated(small), smooth)
+        image += smooth
+
+    def _walked(
+        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, size_px: int, *, seed: int, walks: int
+    ) -> np.ndarray:
+        """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
+        count = len(rows) * walks
+        cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, walks)
+        u, v = (mi.sample_tea_float32(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, (2 * seed + k) % 2**32)) for k in (0, 1))
+        x, y = (dr.gather(mi.Float, to_jit(mi.Float, place * size_px), cell) for place in (columns, rows))
+        bundle = self.view.bundle(x + u * size_px - 0.5, y + v * size_px - 0.5)
+        return walker.radiance(bundle, cell, len(rows), seed=seed) / walks
+
+    # --- lamp ---------------------------------------------------------------------------------------------------------
+
+    def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
+        """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
+        bundle, shape = self.view.grid(1)
+        value = self._evenly_lit(pose, bundle, None, ambient=ambient)
+        leg = next(self._legs(pose, bundle, None))
+        depth = dr.select(leg.valid, self.view.depth_mm(leg.end()), dr.nan)
+        dr.eval(value, depth)
+        nodes = value.numpy().reshape(shape)
+        low, high = corner_extremes(nodes)
+        changes = high - low > CHANGE_SHARE * nodes.max()
+        if self.effects.defocus:
+            blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
+            changes = widened(changes, corner_extremes(blur)[1], cell_px=1)
+        image = corner_mean(nodes)
+        for rows, columns in _parts(*np.nonzero(changes), spp=spp):
+            image[rows, columns] = self._fine(self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp)[0]
+        return image
+
+    def _evenly_lit_sums(
+        self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None, ambient: bool
+    ) -> tuple[mi.Float]:
+        return (self._evenly_lit(pose, bundle, travel_mm, ambient=ambient),)
+
+    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None, *, ambient: bool) -> mi.Float:
+        """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
+
+        A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
+        water scatters the same radiance E / pi into every ray; the lamp shines from the sensor's side, and only what
+        is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
+        extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
+        """
+        leg = next(self._legs(pose, bundle, travel_mm))
+        lamp = self.sensor.lamp
+        level = 1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2)
+        facing = leg.valid & (leg.si.wi.z > 0)
+        left = dr.exp(-self.scattering.extinction * dr.select(leg.valid, leg.si.t, dr.inf))
+        radiance = dr.select(facing, self.objects.albedo(leg.si) * left, 0.0)
+        if self.effects.haze and self.scattering.coefficient > 0:
+            scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
+            radiance += scattered / self.scattering.extinction * (1 - left)
+        return leg.weight * level * radiance
+
+    # --- pixels -------------------------------------------------------------------------------------------------------
+
+    def _stripe_sums(
+        self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None, sources: list[Light]
+    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
+        total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
+        for leg in self._legs(pose, bundle, travel_mm):
+            value = leg.weight * self._radiance(pose, leg, sources, travel_mm)
+            total += value
+            polarised += value * self.objects.polarisation(leg.si)
+            rough += value * self.objects.roughness_um(leg.si)
+        return total, polarised, rough
+
+    def _fine(
+        self, light: Callable[..., tuple[mi.Float, ...]], pose: SensorPose, rows: np.ndarray, columns: np.ndarray,
+        *rest: object, spp: int,
+    ) -> np.ndarray:  # fmt: skip
+        """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray."""
+        x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
+        index = dr.arange(mi.UInt32, len(rows) * spp)
+        pixel, sample = index // spp, index % spp
+        axes = 2 + 2 * self.effects.defocus + (pose.travel is not None)
+        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp, axes)]
+        row = dr.gather(mi.Float, y, pixel)
+        pupil = None
+        if self.effects.defocus:
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(places[2], places[3]))
+        travel_mm = None if pose.travel is None else pose.travel.at(row, places[-1])
+        bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
+        values = light(pose, bundle, travel_mm, *rest)
+        dr.eval(values)  # together: each sum on its own would trace the rays anew
+        return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
 
     def _pixels_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels in the marked grid cells."""
-        row, column = np.nonzero(cells)
-        inside = np.arange(NODE_SPACING_PX)
-        rows = (row[:, None, None] * NODE_SPACING_PX + inside[:, None] + 0 * inside).ravel()
-        columns = (column[:, None, None] * NODE_SPACING_PX + 0 * inside[:, None] + inside).ravel()
-        camera = self.sensor.camera
-        kept = (rows < camera.height_px) & (columns < camera.width_px)
-        return rows[kept], columns[kept]
+        return np.nonzero(self._repeated(cells))
 
-    def _lamp_nodes(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lamp image (H, W) in W/mm2 from the pixels' corners; rows and columns of the pixels in which it changes."""
-        bundle, shape = self._grid(1)
-        nodes = self._lamp(pose, bundle).numpy().reshape(shape)
-        low, high = _corner_extremes(nodes)
-        return _corner_mean(nodes), *np.nonzero(high - low > CHANGE_SHARE * nodes.max())
+    def _spread(self, values: mi.Float, shape: tuple[int, int]) -> np.ndarray:
+        """Values of nodes given to the pixels between them, (H, W); zero if they are one number."""
+        if dr.width(values) == 1:
+            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        return self._repeated(corner_mean(values.numpy().reshape(shape)))
 
-    def _spread(self, cells: np.ndarray) -> np.ndarray:
+    def _repeated(self, cells: np.ndarray) -> np.ndarray:
         """Values of grid cells given to their pixels, (H, W)."""
         camera = self.sensor.camera
         full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
         return np.ascontiguousarray(full[: camera.height_px, : camera.width_px])
 
-    def _fine(self, light: str, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, *, spp: int) -> np.ndarray:
-        """Mean irradiance (P,) in W/mm2 over the area of pixels.
 
-        The samples are a rank-1 lattice centred in the pixel: along either side they are evenly spaced, so that a
-        smooth stripe is integrated as by the midpoint rule, without the noise of random samples.
-        """
-        count = len(rows)
-        x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
-        index = dr.arange(mi.UInt32, count * spp)
-        pixel, sample = index // spp, index % spp
-        u, v = mi.Float(sample), mi.Float(sample * _lattice_step(spp) % spp)
-        bundle = self.bundle(
-            dr.gather(mi.Float, x, pixel) + (u + 0.5) / spp - 0.5, dr.gather(mi.Float, y, pixel) + (v + 0.5) / spp - 0.5
-        )
-        values = self.laser(pose, bundle) if light == "laser" else self._lamp(pose, bundle)
-        return dr.block_sum(values, spp).numpy() / spp
-
-    def laser(self, pose: SensorPose, bundle: Bundle) -> mi.Float:
-        """Irradiance of laser light per ray, in W/mm2: the lit surface seen through the water, without the haze."""
-        ray = pose.ray(bundle.origin, bundle.direction)
-        si = self.objects.ray_intersect(ray)
-        valid = si.is_valid() & (bundle.weight > 0)
-        point = bundle.origin + bundle.direction * si.t
-        light = self.sheet.at(point)
-        towards = pose.direction(-light.direction)
-        lit = valid & (light.irradiance > 0) & ~self._shadowed(si.p, towards, light.exit_mm, valid)
-        reflected = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(towards), lit)[0]
-        radiance = dr.select(lit, reflected * light.irradiance * dr.exp(-self._extinction * si.t), 0.0)
-        return bundle.weight * radiance
-
-    def _shadowed(self, p: mi.Point3f, towards: mi.Vector3f, exit_mm: mi.Float, active: mi.Bool) -> mi.Bool:
-        """Whether an object stands between points of the scene and the laser's window."""
-        ray = mi.Ray3f(p + towards * 1e-2, towards)
-        ray.maxt = exit_mm - 2e-2
-        return self.objects.ray_test(ray, active)
-
-    def _haze(self, pose: SensorPose, bundle: Bundle, depth: mi.Float, across: mi.Float) -> mi.Float:
-        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
-
-        ``depth`` is how far rays go to a surface, ``across`` the sheet's distance there in standard deviations.
-        """
-        t = -bundle.origin.x / bundle.direction.x
-        light = self.sheet.at(bundle.origin + bundle.direction * t)
-        t -= light.distance_mm / dr.dot(bundle.direction, light.normal)
-        light = self.sheet.at(bundle.origin + bundle.direction * t)
-        end = dr.select(dr.isfinite(depth), across * dr.sign(bundle.direction.x), dr.inf)
-        scattered = single_scattering(
-            self.medium, light, wavelength_nm=self.wavelength_nm, direction=bundle.direction, surface_sigmas=end
-        )
-        # A surface just before the sheet's middle cuts the sheet's light, but does not shadow what lies before it.
-        ray = pose.ray(bundle.origin + bundle.direction * dr.minimum(t, depth), -light.direction)
-        blocked = self._shadowed(ray.o, ray.d, light.exit_mm, scattered > 0)
-        return dr.select((t > 0) & ~blocked, scattered * dr.exp(-self._extinction * t), 0.0)
-
-    def _lamp(self, pose: SensorPose, bundle: Bundle) -> mi.Float:
-        """Irradiance of lamp light per ray in W/mm2: every surface evenly lit, seen through the water."""
-        si = self.objects.ray_intersect(pose.ray(bundle.origin, bundle.direction))
-        valid = si.is_valid() & (bundle.weight > 0)
-        # A diffuse surface reflects the irradiance E as the radiance albedo E / pi; looking at it square on, the
-        # BSDF's value times cosine is albedo / pi.
-        straight = mi.SurfaceInteraction3f(si)
-        straight.wi = mi.Vector3f(0.0, 0.0, 1.0)
-        facing = valid & (si.wi.z > 0)
-        albedo = si.bsdf().eval(mi.BSDFContext(), straight, mi.Vector3f(0.0, 0.0, 1.0), facing)[0]
-        lamp = 1e-6 * self.sensor.lamp.irradiance_w_per_m2
-        return dr.select(facing, bundle.weight * albedo * lamp * dr.exp(-self._extinction * si.t), 0.0)
+def _further(sensor: Sensor, laser: Laser, medium: Medium) -> Source:
+    """Another laser of the sensor, whose sheet has an OCS of its own."""
+    other = sensor.model_copy(update={"laser": laser})
+    return Source(Sheet(other, medium), np.linalg.inv(camera_from_object(other)) @ camera_from_object(sensor))
 
 
-def _corner_mean(nodes: np.ndarray) -> np.ndarray:
-    """Mean (rows - 1, columns - 1) of the four corners of every grid cell."""
-    beside = nodes[:, :-1] + nodes[:, 1:]
-    return 0.25 * (beside[:-1] + beside[1:])
-
-
-def _corner_extremes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest (rows - 1, columns - 1) of the four corners of every grid cell."""
-    low, high = np.minimum(nodes[:, :-1], nodes[:, 1:]), np.maximum(nodes[:, :-1], nodes[:, 1:])
-    return np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
-
-
-def _near_sheet(across: np.ndarray) -> np.ndarray:
-    """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes."""
-    nearest, _ = _corner_extremes(np.abs(across))
-    low, high = _corner_extremes(across)
-    return (nearest < LIT_SIGMAS) | ((low < 0) & (high > 0) & np.isfinite(high))
-
-
-def _lattice_step(count: int) -> int:
-    """Second generator of a rank-1 lattice of ``count`` points: the coprime number nearest to its golden section."""
-    golden = count * 0.5 * (math.sqrt(5.0) - 1.0)
-    return min((k for k in range(1, count + 1) if math.gcd(k, count) == 1), key=lambda k: abs(k - golden))
+def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pixels in parts of at most `SAMPLES_AT_ONCE` samples; nothing if there are none."""
+    if len(rows):
+        count = -(-len(rows) * spp // SAMPLES_AT_ONCE)
+        yield from zip(np.array_split(rows, count), np.array_split(columns, count), strict=True)

@@ -18,6 +18,12 @@ from uwlts.library import find, names, read_table, validated
 from uwlts.sensor import Description, NotNegative, Positive, Vector
 
 Reflectance = Annotated[float, Field(ge=0, le=1)]
+Finish = Literal["diffuse", "painted", "pvc", "metal"]
+
+TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
+"""GGX roughness: a satin paint, an extruded pipe, ground steel."""
+TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
+"""Rms heights in um. Light out of a diffuse body has run through some um of it, whatever its surface."""
 
 
 class Pose(Description):
@@ -35,9 +41,68 @@ class Pose(Description):
 
 
 class Placed(Pose):
-    """Base of all objects: a pose and a diffuse reflectance."""
+    """Base of all objects: a pose and a finish.
+
+    ``finish`` says how the surface reflects: "diffuse" as Lambert's law says; "painted" and "pvc" as a diffuse body
+    under a clear, slightly rough coat; "metal" as rough steel. ``reflectance`` is the diffuse reflectance, that of the
+    body under a coat, and scales the reflection of a metal. The grey values (0 to 1) of picture ``texture`` multiply
+    it, laid out by the shape's own uv coordinates with the picture's last row at v = 0; a relative path starts at the
+    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um`` the surface's
+    rms height.
+    """
 
     reflectance: Reflectance = 0.8
+    finish: Finish = "diffuse"
+    alpha: Annotated[float, Field(ge=0.02, le=1)] | None = None
+    roughness_um: NotNegative | None = None
+    texture: str | None = None
+
+    @model_validator(mode="after")
+    def _alpha_has_a_gloss(self) -> "Placed":
+        if self.finish == "diffuse" and self.alpha is not None:
+            raise ValueError(f"alpha {self.alpha:g} roughens a gloss, but finish 'diffuse' has none: leave alpha out")
+        return self
+
+    def gloss_alpha(self) -> float:
+        """GGX roughness, the finish's usual one unless given."""
+        return TYPICAL_ALPHA[self.finish] if self.alpha is None else self.alpha
+
+    def rms_height_um(self) -> float:
+        """Rms height of the surface in um, the finish's usual one unless given."""
+        return TYPICAL_ROUGHNESS_UM[self.finish] if self.roughness_um is None else self.roughness_um
+
+    def mirror_share(self) -> float:
+        """Share of light that is reflected as by a plane mirror."""
+        return 0.0
+
+    def polarisation(self) -> float:
+        """Degree of polarisation of scattered laser light: 1 from a metal or mirror, 0 out of a diffuse body."""
+        return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
+
+
+class Flat(Placed):
+    """Base of objects with flat faces, which may be mirrors.
+
+    ``mirror`` is the share of light that the faces reflect as plane mirrors do, beside what they scatter: the weak
+    stripe on a mirror comes from a small ``reflectance``.
+    """
+
+    mirror: Reflectance = 0.0
+
+    @model_validator(mode="after")
+    def _reflects_at_most_all(self) -> "Flat":
+        if self.reflectance + self.mirror > 1:
+            raise ValueError(
+                f"reflectance {self.reflectance:g} and mirror {self.mirror:g} add up to more than all light: "
+                f"lower one of them"
+            )
+        if self.mirror > 0 and self.finish in ("painted", "pvc"):
+            raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
+        return self
+
+    def mirror_share(self) -> float:
+        """Share of light that is reflected as by a plane mirror."""
+        return self.mirror
 
 
 class Sphere(Placed):
@@ -47,7 +112,7 @@ class Sphere(Placed):
     diameter_mm: Positive
 
 
-class Plate(Placed):
+class Plate(Flat):
     """A flat rectangle in its own x-y plane, facing -z (towards the sensor)."""
 
     kind: Literal["plate"]
@@ -55,7 +120,7 @@ class Plate(Placed):
     height_mm: Positive
 
 
-class Block(Placed):
+class Block(Flat):
     """A box about its own origin."""
 
     kind: Literal["block"]
@@ -83,7 +148,7 @@ class CirclePlate(Placed):
 
     The lattice has ``columns`` along x and ``rows`` along y; ``origin`` is the marked origin's column and row, and
     ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two. The origin circle lies at the
-    plate's own origin. ``reflectance`` is the ground's.
+    plate's own origin. ``reflectance`` is the ground's; the lattice takes the place of a ``texture``.
     """
 
     kind: Literal["circle_plate"]
@@ -101,6 +166,12 @@ class CirclePlate(Placed):
     circle_reflectance: Reflectance = 0.85
     marker_reflectance: Reflectance = 0.05
 
+    @model_validator(mode="after")
+    def _has_one_pattern(self) -> "CirclePlate":
+        if self.texture is not None:
+            raise ValueError(f"texture {self.texture} on a circle_plate, which has its lattice: put it on a plate")
+        return self
+
 
 AnyObject = Annotated[Sphere | Plate | Block | Pipe | Mesh | CirclePlate, Field(discriminator="kind")]
 
@@ -109,7 +180,8 @@ class Motion(Description):
     """Stage positions of a scan: ``count`` of them from ``start_mm`` in steps of ``step_mm`` along ``direction``.
 
     ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
-    position the images in ``lights`` are taken in turn.
+    position the images in ``lights`` are taken in turn. ``speed_mm_per_s`` is how fast the stage moves along
+    ``direction`` while an image is exposed; at 0 it stands still.
     """
 
     start_mm: float = 0.0
@@ -118,6 +190,7 @@ class Motion(Description):
     direction: Vector = (1.0, 0.0, 0.0)
     nominal_direction: Vector | None = None
     lights: tuple[Literal["lamp", "laser"], ...] = ("laser",)
+    speed_mm_per_s: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _has_direction(self) -> "Motion":
@@ -156,12 +229,15 @@ class Scene(Description):
     """A scene as read from TOML.
 
     ``placements`` are named poses of the whole set of objects (near, standoff, far); ``placement`` is the one in use.
+    ``medium`` is one of the sensor's; ``water`` replaces what is dissolved and floats in it, by the name of a water or
+    a turbidity from 0 (pure) to 3 (harbour).
     ``artefact`` and ``target`` are what an operator would note about the things before the sensor: calibrated values,
     lattice; they travel in the capture.
     """
 
     title: str
     medium: str = "water"
+    water: str | Annotated[float, Field(ge=0, le=3)] | None = None
     motion: Motion = Motion()
     objects: Annotated[tuple[AnyObject, ...], Field(min_length=1)]
     placements: dict[str, Pose] = {"standoff": Pose()}
@@ -194,8 +270,10 @@ def load_scene(name_or_path: str | Path, *, changes: dict[str, Any] | None = Non
     objects = table.get("objects", [])
     if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
-    table["objects"] = [
-        thing | {"path": str(path.parent / thing["path"])} if thing.get("kind") == "mesh" and "path" in thing else thing
-        for thing in objects
-    ]
+    table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
     return validated(Scene, table, path)
+
+
+def _with_paths_from(folder: Path, thing: dict[str, Any]) -> dict[str, Any]:
+    """An object's table with relative paths of mesh and texture starting at a folder."""
+    return thing | {key: str(folder / thing[key]) for key in ("path", "texture") if isinstance(thing.get(key), str)}

@@ -2,7 +2,8 @@
 
 Everything is in the sensor's object coordinate system (OCS), in which the nominal sheet is X = 0, Y runs along the
 stripe and Z along the laser's axis. A fan ray is the straight line Y = y0(m) + m Z, X = x0(m) + k(m) Z, with its slope
-m = dY/dZ as the parameter of the surface.
+m = dY/dZ as the parameter of the surface. A tilted window or a bow curve the surface; across it, along its normal, the
+light is a Gaussian.
 """
 
 from __future__ import annotations
@@ -13,21 +14,26 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.polynomial import Polynomial
+from numpy.polynomial import Chebyshev
 
+from twin.fan import PowerTable, directions, half_angle, lit_angles, power_per_angle
 from twin.windows import WindowFaces, frame_about
 from uwlts.errors import DesignError
 from uwlts.placement import camera_from_object, laser_pose
-from uwlts.sensor import Medium, Sensor
+from uwlts.sensor import Laser, Medium, Sensor
 
-_RAYS, _DEGREE, _NEWTON_STEPS = 1025, 11, 3
+_RAYS, _NODES, _NEWTON_STEPS = 1025, 4097, 3
+_LARGEST_DEGREE, _LARGEST_MISS_MM = 27, 1e-3
+_SERIES_MM, _SERIES_SLOPE = 5e-5, 1e-7
+"""What the terms left out of a series may sum up to: about the roundings of the traced rays."""
 
 
 @dataclass(frozen=True)
 class SheetLight:
     """The sheet's light at points: signed distance across, width, irradiance in W/mm2 across the ray, its direction.
 
-    ``distance_mm`` and ``sigma_mm`` are measured along X; ``exit_mm`` is the way back to the laser's window.
+    ``distance_mm`` and ``sigma_mm`` are measured along ``normal``, the unit normal of the lit surface on the side of X;
+    ``exit_mm`` is the way back to the laser's window.
     """
 
     distance_mm: mi.Float
@@ -38,42 +44,50 @@ class SheetLight:
     exit_mm: mi.Float
 
 
+@dataclass(frozen=True)
+class SheetRays:
+    """Rays of the sheet's light in the OCS, each of equal power: where they leave the window, and unit directions."""
+
+    origin: mi.Point3f
+    direction: mi.Vector3f
+
+
 class Sheet:
-    """The lit surface of one sensor in one medium."""
+    """The lit surface of one sensor's laser in one medium.
+
+    Attributes
+    ----------
+    power_w
+        Power behind the window, before the medium takes any.
+    begins_at_z_mm
+        Smallest Z of the window's outer face in the OCS; there is no light before it.
+
+    Raises
+    ------
+    DesignError
+        A part of the fan does not pass the window, or is bent too much by it.
+    """
 
     def __init__(self, sensor: Sensor, medium: Medium):
-        laser, pose = sensor.laser, laser_pose(sensor)
-        to_object = np.linalg.inv(camera_from_object(sensor))
-        rotation = frame_about(pose.axis, pose.normal)
-        faces = WindowFaces(
-            laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
-        )
-        half = math.radians(laser.fan_angle_deg / 2)
-        angle = np.linspace(-half, half, _RAYS)
-        directions = pose.axis[:, None] * np.cos(angle) + pose.fan[:, None] * np.sin(angle)
-        path = faces.through(mi.Point3f(pose.origin_mm), mi.Vector3f(directions), mode=mi.TransportMode.Importance)
-        if not bool(dr.all(path.valid)):
-            raise DesignError(
-                f"part of the laser's {laser.fan_angle_deg:g} deg fan does not pass its window of "
-                f"{laser.window.aperture_diameter_mm:g} mm: enlarge the window or bring it closer"
-            )
-        o = to_object[:3, :3] @ path.origin.numpy().astype(float) + to_object[:3, 3:]
-        d = to_object[:3, :3] @ path.direction.numpy().astype(float)
+        laser = sensor.laser
+        self._origin, fan = _traced(sensor, medium)
+        o, d = fan.origin, fan.direction
         slope, tilt = d[1] / d[2], d[0] / d[2]
-        self.largest_slope = float(np.abs(slope).max())
-        self._lowest, self._highest = float(slope.min()), float(slope.max())
-        self._origin = to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3]
-        transmitted = path.weight.numpy().astype(float)
-
-        def fitted(values: np.ndarray) -> np.ndarray:
-            return (
-                Polynomial.fit(slope, values, _DEGREE, domain=(-self.largest_slope, self.largest_slope)).convert().coef
+        self._y0 = _series(slope, o[1] - slope * o[2], _SERIES_MM)
+        self._x0 = _series(slope, o[0] - tilt * o[2], _SERIES_MM)
+        self._tilt, self._exit_z = _series(slope, tilt, _SERIES_SLOPE), _series(slope, o[2], _SERIES_MM)
+        self.begins_at_z_mm = float(o[2].min())
+        far = o + 1e3 * d
+        miss = np.hypot(
+            self._y0(slope) + slope * far[2] - far[1], self._x0(slope) + self._tilt(slope) * far[2] - far[0]
+        ).max()
+        if miss > _LARGEST_MISS_MM:
+            raise DesignError(
+                f"the laser's window bends the {laser.fan_angle_deg:g} deg fan so unevenly that its rays are followed "
+                f"to {miss:.3f} mm only, not to {_LARGEST_MISS_MM:g} mm: make the fan narrower or tilt the window less"
             )
-
-        self._y0, self._x0, self._tilt = (fitted(v) for v in (o[1] - slope * o[2], o[0] - tilt * o[2], tilt))
-        self._exit_z = fitted(o[2])
-        density = Polynomial(fitted(angle)).deriv()(slope) * transmitted / (2 * half)
-        self._power = fitted(1e-3 * laser.power_mw * density)
+        self._dy0, self._dx0, self._dtilt = self._y0.deriv(), self._x0.deriv(), self._tilt.deriv()
+        self._power, self.power_w = _power_along(laser, slope, fan)
         waist = laser.waist_radius_mm
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
@@ -85,31 +99,120 @@ class Sheet:
 
         The slope of the fan ray through a point solves y0(m) + m Z = Y (Newton). Between two fan rays flows the power
         P'(m) dm; across it spreads as a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
-        (Siegman, Lasers, Eqs. 17.5, and 17.6 for zR, with M2).
+        (Siegman, Lasers, Eqs. 17.5, and 17.6 for zR, with M2), s being the distance from the laser.
         """
         m = p.y / (p.z - float(self._origin[2]))
-        derivative = [k * c for k, c in enumerate(self._y0)][1:]
+        low, high = self._y0.domain
         for _ in range(_NEWTON_STEPS):
-            m -= (_horner(self._y0, m) + m * p.z - p.y) / (_horner(derivative, m) + p.z)
-            m = dr.clip(m, -1.05 * self.largest_slope, 1.05 * self.largest_slope)
-        tilt = _horner(self._tilt, m)
-        distance = p.x - (_horner(self._x0, m) + tilt * p.z)
+            t = self._normalised(m)
+            m -= (_value(self._y0, t) + m * p.z - p.y) / (_value(self._dy0, t) + p.z)
+            m = dr.clip(m, low - 0.05 * (high - low), high + 0.05 * (high - low))
+        t = self._normalised(m)
+        tilt, normal = _value(self._tilt, t), self._normal(m, t, p.z)
+        distance = (p.x - _value(self._x0, t) - tilt * p.z) * normal.x
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
-        exit_mm = (p.z - _horner(self._exit_z, m)) * stretch
-        travelled = dr.norm(p - mi.Point3f(self._origin))
-        radius = self._waist * dr.sqrt(1 + dr.square((travelled - self._waist_at) / self._rayleigh))
-        sigma = 0.5 * radius
+        exit_mm = (p.z - _value(self._exit_z, t)) * stretch
+        away = dr.norm(p - mi.Point3f(self._origin)) - self._waist_at
+        sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
         gauss = dr.exp(-0.5 * dr.square(distance / sigma)) / (sigma * math.sqrt(2 * math.pi))
-        density = _horner(self._power, m) / (_horner(derivative, m) + p.z)
+        # A plane Z = const is crossed by P'(m) dm / dY per length along Y, spread along X as the Gaussian is cut there.
+        density = self._power.at(m) / (_value(self._dy0, t) + p.z) * normal.x
         irradiance = density * gauss * stretch * dr.exp(-self._extinction * exit_mm)
-        inside = (m >= self._lowest) & (m <= self._highest) & (exit_mm > 0)
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
-        normal = dr.normalize(mi.Vector3f(1.0, 0.0, -tilt))
-        return SheetLight(distance, sigma, dr.select(inside, irradiance, 0.0), direction, normal, exit_mm)
+        return SheetLight(distance, sigma, dr.select(exit_mm > 0, irradiance, 0.0), direction, normal, exit_mm)
+
+    def sample(self, u: mi.Point3f) -> SheetRays:
+        """Rays behind the window, drawn in proportion to power with three numbers from 0 to 1 each.
+
+        ``u.x`` chooses the fan ray, ``u.y`` and ``u.z`` how far beside and how much turned against it: with the
+        standard deviations w0 / 2 at the waist and w0 / (2 zR), independent of each other, straight rays spread by
+        w(s) / 2 at every s.
+        """
+        m = self._power.draw(u.x)
+        t = self._normalised(m)
+        tilt, z = _value(self._tilt, t), _value(self._exit_z, t)
+        stretch = dr.sqrt(1 + m * m + tilt * tilt)
+        along = mi.Vector3f(tilt, m, 1.0)
+        leaves = mi.Point3f(_value(self._x0, t) + tilt * z, _value(self._y0, t) + m * z, z)
+        # Where the ray is as far from the laser as the waist.
+        from_laser = leaves - mi.Point3f(self._origin)
+        ahead = dr.dot(from_laser, along) / stretch
+        to_waist = dr.safe_sqrt(ahead * ahead - dr.squared_norm(from_laser) + self._waist_at**2) - ahead
+        waist_z = z + to_waist / stretch
+        sigma = 0.5 * self._waist / self._normal(m, t, waist_z).x
+        beside, turned = sigma * _standard_normal(u.y), sigma / self._rayleigh * _standard_normal(u.z)
+        leaves.x += beside - turned * to_waist
+        along.x += turned * stretch
+        return SheetRays(leaves, dr.normalize(along))
+
+    def _normalised(self, m: mi.Float) -> mi.Float:
+        offset, scale = self._y0.mapparms()
+        return dr.fma(m, scale, offset)
+
+    def _normal(self, m: mi.Float, t: mi.Float, z: mi.Float) -> mi.Vector3f:
+        """Unit normal of the surface X(Y, Z): its derivatives are X_Y = (x0' + k' Z) / (y0' + Z), X_Z = k - m X_Y."""
+        by_y = (_value(self._dx0, t) + _value(self._dtilt, t) * z) / (_value(self._dy0, t) + z)
+        return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - _value(self._tilt, t)))
 
 
-def _horner(coefficients: np.ndarray | list[float], x: mi.Float) -> mi.Float:
-    value = mi.Float(float(coefficients[-1]))
-    for coefficient in reversed(coefficients[:-1]):
-        value = dr.fma(value, x, float(coefficient))
-    return value
+@dataclass(frozen=True)
+class _FanBehindWindow:
+    """Fan rays where they leave the window: angles (N,), origins and unit directions (3, N), transmittances (N,)."""
+
+    angle: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+    transmitted: np.ndarray
+
+
+def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindow]:
+    """The laser's origin (3,) and its fan traced through the window's faces, all in the OCS."""
+    laser, pose = sensor.laser, laser_pose(sensor)
+    to_object = np.linalg.inv(camera_from_object(sensor))
+    rotation = frame_about(pose.axis, pose.normal)
+    faces = WindowFaces(
+        laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
+    )
+    # Denser towards the edges, where a series would otherwise swing.
+    angle = -half_angle(laser) * np.cos(np.linspace(0, math.pi, _RAYS))
+    fan = mi.Vector3f(rotation @ directions(laser, angle))
+    path = faces.through(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
+    if not bool(dr.all(path.valid)):
+        raise DesignError(
+            f"part of the laser's {laser.fan_angle_deg:g} deg fan does not pass its window of "
+            f"{laser.window.aperture_diameter_mm:g} mm: enlarge the window or bring it closer"
+        )
+    d = to_object[:3, :3] @ path.direction.numpy().astype(float)
+    o = np.broadcast_to(to_object[:3, :3] @ path.origin.numpy().astype(float) + to_object[:3, 3:], d.shape)
+    passed = np.broadcast_to(path.weight.numpy().astype(float), angle.shape)
+    return to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3], _FanBehindWindow(angle, o, d, passed)
+
+
+def _power_along(laser: Laser, slope: np.ndarray, fan: _FanBehindWindow) -> tuple[PowerTable, float]:
+    """Power behind the window per slope, and in total in W."""
+    lit = lit_angles(laser)
+    nodes = np.linspace(*np.interp(lit[[0, -1]], fan.angle, slope), _NODES)
+    angle_of, passes = _series(slope, fan.angle, _SERIES_SLOPE), _series(slope, fan.transmitted, 1e-6)
+    density = power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
+    between = np.union1d(lit, fan.angle[(fan.angle > lit[0]) & (fan.angle < lit[-1])])
+    total = np.trapezoid(power_per_angle(laser, between) * np.interp(between, fan.angle, fan.transmitted), between)
+    return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=float(total)), float(total)
+
+
+def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
+    """Chebyshev series in the slope through values, without the terms at its end that sum up to less than allowed."""
+    fit = Chebyshev.fit(slope, values, _LARGEST_DEGREE, domain=(slope.min(), slope.max()))
+    left = np.cumsum(np.abs(fit.coef[::-1]))[::-1]
+    return fit.truncate(max(1, np.count_nonzero(left > tolerance)))
+
+
+def _value(series: Chebyshev, t: mi.Float) -> mi.Float:
+    """The series at its variable brought to -1 to 1, by Clenshaw's recurrence, which keeps 32 bits exact."""
+    ahead, beyond = mi.Float(0.0), mi.Float(0.0)
+    for coefficient in series.coef[:0:-1]:
+        ahead, beyond = dr.fma(2 * t, ahead, float(coefficient) - beyond), ahead
+    return dr.fma(t, ahead, float(series.coef[0]) - beyond)
+
+
+def _standard_normal(u: mi.Float) -> mi.Float:
+    return math.sqrt(2.0) * dr.erfinv(dr.clip(2 * u - 1, -1 + 1e-7, 1 - 1e-7))

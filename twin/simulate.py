@@ -1,7 +1,7 @@
 """A virtual recording: renders a scene's shots into a capture, with the ground truth in a file beside it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
@@ -10,11 +10,16 @@ import mitsuba as mi
 import numpy as np
 
 from twin.detector import electrons_per_ms, grey_values
-from twin.renderer import Renderer
+from twin.fixed_pattern import fixed_pattern
+from twin.options import Options
+from twin.pose import Travel
+from twin.renderer import LaserFrame, Renderer
 from twin.scene import Scene, Shot
+from twin.speckle import Speckle, coherence
 from twin.truth import FrameTruth, depth_map, no_stripe, true_stripe
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import DescriptionError, DesignError, OutputError
+from uwlts.library import validated
 from uwlts.placement import camera_from_object
 from uwlts.sensor import Medium, Sensor
 from uwlts.truth import Truth, TruthHeader, truth_path, write_truth
@@ -25,28 +30,18 @@ BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
 
 
-@dataclass(frozen=True)
-class Options:
-    """How to render: samples per lit pixel, seed, and whether the detector is ideal (noise-free)."""
-
-    spp: int = 16
-    seed: int = 0
-    ideal: bool = False
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.spp <= 65536:
-            raise DescriptionError(f"spp is {self.spp}; take 1 to 65536 samples per lit pixel")
-        if self.seed < 0:
-            raise DescriptionError(f"seed is {self.seed}; it must not be negative")
-
-
 def medium_of(sensor: Sensor, scene: Scene) -> Medium:
-    """The medium that a scene names, from the sensor's list."""
+    """The medium that a scene names, from the sensor's list, with the scene's water if it has one of its own."""
     if scene.medium not in sensor.media:
         raise DescriptionError(
             f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{scene.medium}'"
         )
-    return sensor.media[scene.medium]
+    medium = sensor.media[scene.medium]
+    if scene.water is None:
+        return medium
+    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
+    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
+    return validated(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
@@ -65,8 +60,8 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     """
     volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
     # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
-    nearest, farthest = ((edge - renderer.view.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
-    box = renderer.objects.bbox()
+    nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
+    box = renderer.objects.scene.bbox()
     offsets = np.array([shot.stage_mm * scene.motion.unit_direction() for shot in scene.motion.shots()])
     low, high = (np.array(corner) - offsets for corner in (box.min, box.max))
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
@@ -88,35 +83,93 @@ class Studio:
         self.sensor = with_window(sensor, mounted=sensor.camera.window.mounted and scene.window_mounted)
         self.scene, self.options = scene, options
         self.medium = medium_of(sensor, scene)
-        self.renderer = Renderer(self.sensor, self.medium, scene)
+        self.renderer = Renderer(self.sensor, self.medium, scene, effects=options.effects)
         check_scene(self.renderer, scene)
+        camera, laser = self.sensor.camera, self.sensor.laser
+        self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
+        self._pattern = (
+            fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
+            if options.effects.fixed_pattern
+            else None
+        )
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
+        self._check_motion()
 
     @property
     def period_s(self) -> float:
-        """Time from one shot to the next: the stage settles, then the camera exposes and reads out."""
-        exposure_s = 1e-3 * max(self.exposure_ms.values())
-        return self.sensor.stage.settling_s + max(exposure_s, 1 / self.sensor.detector.frame_rate_hz)
+        """Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out."""
+        motion = self.scene.motion
+        if motion.speed_mm_per_s > 0:
+            return abs(motion.step_mm) / motion.speed_mm_per_s
+        return self.sensor.stage.settling_s + self._shortest_period_s()
+
+    def _shortest_period_s(self) -> float:
+        return max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
+
+    def _check_motion(self) -> None:
+        """Refuse a travel that is too fast for the camera."""
+        motion = self.scene.motion
+        if motion.speed_mm_per_s > 0 and motion.count > 1 and self.period_s < self._shortest_period_s() * (1 - 1e-9):
+            raise DesignError(
+                f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached after "
+                f"{1e3 * self.period_s:.3g} ms, but the camera needs {1e3 * self._shortest_period_s():.3g} ms from "
+                "frame to frame: travel more slowly, in longer steps, or with shorter exposures"
+            )
 
     def pose(self, shot: Shot) -> np.ndarray:
-        """``T_scene_object`` (4, 4) of the sensor's OCS at a shot."""
+        """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
         transform = np.eye(4)
         transform[:3, 3] = shot.stage_mm * self.scene.motion.unit_direction()
         return transform
 
-    def electrons_per_ms(self, shot: Shot, *, spp: int) -> np.ndarray:
+    def travel(self, light: Literal["lamp", "laser"]) -> Travel | None:
+        """How the sensor travels during an exposure; None where it stands still."""
+        motion, detector = self.scene.motion, self.sensor.detector
+        if motion.speed_mm_per_s == 0 or not self.options.effects.motion:
+            return None
+        speed = motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
+        row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
+        return Travel(
+            direction=motion.unit_direction(),
+            exposure_mm=speed * 1e-3 * self.exposure_ms.get(light, 0.0),
+            row_mm=speed * row_s,
+            middle_row=(self.sensor.camera.height_px - 1) / 2,
+        )
+
+    def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) of a shot."""
-        irradiance = self.renderer.irradiance(shot.light, self.pose(shot), spp=spp)
+        if shot.light == "lamp":
+            irradiance = self.renderer.irradiance("lamp", self.pose(shot), spp=spp, travel=travel)
+        else:
+            frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
+            irradiance = frame.irradiance(self._grain(frame, shot) if self.options.effects.speckle else 1.0)
         return electrons_per_ms(
             irradiance, self.sensor.camera, self.sensor.detector, wavelength_nm=self.sensor.laser.wavelength_nm
         )
 
+    def _grain(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
+        """Speckle factors (P,) of the stripe's pixels."""
+        laser = self.sensor.laser
+        contrast = coherence(
+            frame.roughness_um, linewidth_nm=laser.linewidth_nm, wavelength_nm=laser.wavelength_nm,
+            index=self.medium.refractive_index(laser.wavelength_nm),
+        )  # fmt: skip
+        return self._speckle.factors(
+            frame.rows, frame.columns, travel_mm=shot.stage_mm, polarisation=frame.polarisation, coherence=contrast
+        )
+
     def image(self, shot: Shot, index: int) -> np.ndarray:
-        """Grey values (H, W) of a shot; the noise depends only on the seed and the frame's index."""
-        rng = None if self.options.ideal else np.random.default_rng([self.options.seed, index])
+        """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
+        rng = np.random.default_rng([self.options.seed, index]) if self.options.effects.noise else None
         exposure = self.exposure_ms[shot.light]
-        light = exposure * self.electrons_per_ms(shot, spp=self.options.spp)
-        return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng)
+        light = exposure * self.electrons_per_ms(
+            shot, spp=self.options.spp, seed=self._seed(index), travel=self.travel(shot.light)
+        )
+        return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng, pattern=self._pattern)
+
+    def _seed(self, index: int) -> int:
+        """Seed of a frame's random walks."""
+        return int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
 
     def _exposure(self, light: Literal["lamp", "laser"]) -> float:
         """Exposure in ms as described, or so that the first, middle or last shot just reaches the wanted level."""
@@ -127,7 +180,7 @@ class Studio:
         axis = 0 if self.sensor.camera.stripe_along == "width" else 1
         brightest = 0.0
         for shot in dict.fromkeys((shots[0], shots[len(shots) // 2], shots[-1])):
-            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP).max(axis=axis)
+            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP, seed=0).max(axis=axis)
             if (peaks > 0).any():
                 brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
         longest = self.sensor.exposure.longest_ms
@@ -148,7 +201,8 @@ def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> Capture
         target=scene.target,
         artefact=scene.artefact,
         provenance={
-            "source": "twin", "seed": studio.options.seed, "spp": studio.options.spp, "ideal": studio.options.ideal,
+            "source": "twin", "seed": studio.options.seed, "spp": studio.options.spp,
+            "effects": studio.options.effects.names(),
             "variant": mi.variant(), "mitsuba": version("mitsuba"), "drjit": version("drjit"),
             "uwlts": version("uwlts"),
         },
@@ -192,7 +246,7 @@ def simulate(
         done = len(writer)
         for index, shot in enumerate(shots):
             if shot.light == "laser":
-                truths.append(true_stripe(studio.renderer, studio.pose(shot)))
+                truths.append(true_stripe(studio.renderer, studio.pose(shot), travel=studio.travel("laser")))
             else:
                 truths.append(no_stripe(built.camera.lines()))
             if index >= done:

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from twin.arrays import to_jit, to_numpy
-from twin.renderer import Renderer, SensorPose
-from uwlts.placement import camera_from_object
+from twin.pose import SensorPose, Travel
+from twin.renderer import Renderer
 from uwlts.truth import TruthStatus
 
 _FALSE_POSITIONS = 5
@@ -39,10 +39,13 @@ def no_stripe(lines: int) -> FrameTruth:
     )
 
 
-def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth:
-    """True stripe of a frame, by false position on Mitsuba's own hit points along every profile line."""
+def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
+    """True stripe of a frame, by false position on Mitsuba's own hit points along every profile line.
+
+    It is what chief rays see in the middle of the exposure.
+    """
     camera = renderer.sensor.camera
-    pose = SensorPose(scene_from_object)
+    pose = SensorPose(scene_from_object, travel)
     along_width = camera.stripe_along == "width"
     rows, columns = renderer.lit_pixels(pose)
     line, cell = (columns, rows) if along_width else (rows, columns)
@@ -53,9 +56,13 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth
     def position(across: mi.Float, at: mi.Float) -> tuple[mi.Float, mi.Float]:
         return (at, across) if along_width else (across, at)
 
+    def travelled(across: mi.Float, at: mi.Float) -> mi.Float | None:
+        return None if travel is None else travel.at(position(across, at)[1], 0.5)
+
     def distance(across: mi.Float, at: mi.Float) -> mi.Float:
-        bundle = renderer.bundle(*position(across, at))
-        hit = renderer.objects.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
+        bundle = renderer.view.bundle(*position(across, at))
+        ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
+        hit = renderer.objects.scene.ray_intersect_preliminary(ray)
         light = renderer.sheet.at(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
         return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
 
@@ -79,9 +86,9 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray) -> FrameTruth
         dr.eval(low, high, below, above)  # one small kernel five times instead of a large one
     centre = low + (high - low) * below / (below - above)
     dr.eval(centre)
-    bundle = renderer.bundle(*position(centre, at))
-    brightness = renderer.laser(pose, bundle)
-    si = renderer.objects.ray_intersect(pose.ray(bundle.origin, bundle.direction))
+    bundle = renderer.view.bundle(*position(centre, at))
+    brightness = renderer.laser(pose, bundle, travelled(centre, at))
+    si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction, travelled(centre, at)))
     offset = distance(centre, at)
     dr.eval(centre, brightness, si.p, si.n, offset)
     brightness = brightness.numpy()
@@ -100,11 +107,8 @@ def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
     """Camera-frame z in mm (H, W), float32, of the surface that every pixel's centre sees; NaN where there is none."""
     camera = renderer.sensor.camera
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
-    bundle = renderer.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
-    hit = renderer.objects.ray_intersect_preliminary(SensorPose(scene_from_object).ray(bundle.origin, bundle.direction))
-    point = mi.Point3f(
-        bundle.origin + bundle.direction * hit.t
-    )  # a sum with a vector is a vector, which would not move
-    point = mi.Transform4f(mi.Matrix4f(camera_from_object(renderer.sensor))) @ point
-    depth = dr.select(hit.is_valid() & (bundle.weight > 0), point.z, dr.nan)
-    return depth.numpy().reshape(camera.height_px, camera.width_px)
+    bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+    ray = SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
+    hit = renderer.objects.scene.ray_intersect_preliminary(ray)
+    depth = renderer.view.depth_mm(mi.Point3f(bundle.origin + bundle.direction * hit.t))
+    return dr.select(hit.is_valid() & (bundle.weight > 0), depth, dr.nan).numpy().reshape(x.shape)

@@ -96,22 +96,23 @@ def glass_index(name: str, *, wavelength_nm: float) -> float:
 
 
 @cache
-def _table(name: str) -> np.ndarray:
-    """Columns of a table in ``uwlts/tables``, (columns, rows)."""
+def read_table(name: str) -> np.ndarray:
+    """Columns (columns, rows) of a table in ``uwlts/tables``; its source stands in the file's first lines."""
     text = files("uwlts").joinpath("tables", name).read_text(encoding="utf-8")
-    return np.loadtxt(text.splitlines(), delimiter=",", comments=("#", "wavelength")).T
+    rows = [line for line in text.splitlines() if not line.startswith("#")]
+    return np.loadtxt(rows, delimiter=",", skiprows=1).T
 
 
 def water_absorption_per_m(*, wavelength_nm: float) -> float:
     """Absorption of pure water in 1/m (Pope and Fry 1997), linear between the table's 2.5 nm steps."""
-    wavelength, absorption = _table("water_absorption.csv")
+    wavelength, absorption = read_table("water_absorption.csv")
     check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], "the table of Pope and Fry (1997)")
     return float(np.interp(wavelength_nm, wavelength, absorption))
 
 
 def water_scattering_per_m(*, wavelength_nm: float, salinity_g_kg: float = 0.0) -> float:
     """Molecular scattering of water in 1/m (Zhang, Hu and He 2009 at 20 degC), linear in wavelength and salinity."""
-    wavelength, fresh, sea = _table("water_scattering.csv")
+    wavelength, fresh, sea = read_table("water_scattering.csv")
     source = "the table after Zhang, Hu and He (2009)"
     check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], source)
     check_range("salinity_g_kg", salinity_g_kg, 0.0, 35.0, source)

@@ -5,12 +5,13 @@ origin at the entrance pupil; all refractive indices are relative to air.
 """
 
 import math
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from uwlts import media
+from uwlts import media, waters
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -113,12 +114,21 @@ class Laser(Description):
     The baseline runs in the camera's x-y plane from the entrance pupil to the fan's origin, the angle lies between the
     camera's and the laser's axis. ``waist_radius_mm`` is the 1/e2 radius across the sheet at ``waist_distance_mm`` from
     the origin, in the medium of use. ``roll_deg`` turns the fan about the laser's axis.
+
+    ``power_mw`` leaves the line optics, spread over the fan as ``fan_profile`` says: "flat", the same power in every
+    angle; "gaussian", exp(-2 (angle / half the fan)^2) up to the fan's edges; or pairs of an angle in deg and a
+    relative power per angle, linear between them and zero outside. A beam that enters the line optics tilted by
+    ``bow_deg`` gives a line that curves towards the sheet's normal (positive) or away from it.
+    ``linewidth_nm`` is the full width at half maximum of the spectrum.
     """
 
     wavelength_nm: Annotated[float, Field(ge=400, le=700)]
+    linewidth_nm: NotNegative = 0.0
     power_mw: Positive
     fan_angle_deg: Annotated[float, Field(gt=0, lt=120)]
-    roll_deg: Annotated[float, Field(gt=-90, lt=90)] = 0.0
+    fan_profile: Literal["flat", "gaussian"] | tuple[tuple[float, float], ...] = "flat"
+    bow_deg: Annotated[float, Field(gt=-10, lt=10)] = 0.0
+    roll_deg: Annotated[float, Field(gt=-180, le=180)] = 0.0
     waist_radius_mm: Positive
     waist_distance_mm: Positive
     beam_quality_m2: Annotated[float, Field(ge=1)] = 1.0
@@ -138,22 +148,61 @@ class Laser(Description):
             raise ValueError(f"axis {self.axis} has no direction")
         return self
 
+    @model_validator(mode="after")
+    def _profile_within_the_fan(self) -> "Laser":
+        if isinstance(self.fan_profile, str):
+            return self
+        if len(self.fan_profile) < 2:
+            raise ValueError(
+                f"fan_profile has {len(self.fan_profile)} pairs of angle in deg and relative power: give at least two"
+            )
+        angles, powers = zip(*self.fan_profile, strict=True)
+        if any(b <= a for a, b in pairwise(angles)):
+            raise ValueError(f"the angles of fan_profile must increase, found {angles} deg")
+        if min(powers) < 0 or max(powers) == 0:
+            raise ValueError(f"the powers of fan_profile must not be negative nor all zero, found {powers}")
+        if max(-angles[0], angles[-1]) > self.fan_angle_deg / 2:
+            raise ValueError(
+                f"fan_profile reaches from {angles[0]:g} to {angles[-1]:g} deg, but the fan only from "
+                f"{-self.fan_angle_deg / 2:g} to {self.fan_angle_deg / 2:g} deg: widen fan_angle_deg or cut the profile"
+            )
+        return self
+
 
 class Medium(Description):
     """Air, fresh or sea water by temperature and salinity, or any medium with its index given.
 
-    ``absorption_per_m`` and ``scattering_per_m`` replace the tables of pure water. ``phase`` is the phase function of
-    the scattering: "molecular", or "henyey-greenstein" with ``asymmetry`` for water with particles.
+    Water is pure unless ``water`` names one known to `uwlts.waters`, or ``turbidity`` sweeps it from pure (0) over
+    clear (1) and coastal (2) to harbour (3). ``absorption_per_m`` and ``scattering_per_m`` replace what follows from
+    these.
+
+    ``phase`` is the phase function of the particles, while the molecules of water scatter as molecules do; of
+    everything if ``scattering_per_m`` is given. It is "molecular", "henyey-greenstein" with ``asymmetry``, "petzold"
+    (average particle), or "fournier-forand" with ``particle_index`` (relative to water) and ``particle_slope`` (of the
+    size distribution), which ``backscatter_share`` replaces if given. Unless given it is "petzold" where ``water`` or
+    ``turbidity`` is given, else "molecular".
     """
 
     kind: Literal["air", "fresh", "sea", "custom"]
     temperature_c: float = 20.0
     salinity_g_kg: NotNegative = 0.0
     index: Annotated[float, Field(ge=1, lt=2)] | None = None
+    water: str | None = None
+    turbidity: Annotated[float, Field(ge=0, le=3)] | None = None
     absorption_per_m: NotNegative | None = None
     scattering_per_m: NotNegative | None = None
-    phase: Literal["molecular", "henyey-greenstein"] = "molecular"
+    phase: Literal["molecular", "henyey-greenstein", "petzold", "fournier-forand"] | None = None
     asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.924
+    particle_index: Annotated[float, Field(gt=1, lt=1.5)] = 1.10
+    particle_slope: Annotated[float, Field(gt=3, lt=5)] = 3.5835
+    backscatter_share: Annotated[float, Field(ge=1e-4, le=0.1)] | None = None
+
+    @field_validator("water")
+    @classmethod
+    def _known_water(cls, value: str | None) -> str | None:
+        if value is not None and value not in waters.water_names():
+            raise ValueError(f"unknown water; known are {', '.join(waters.water_names())}")
+        return value
 
     @model_validator(mode="after")
     def _consistent(self) -> "Medium":
@@ -161,6 +210,10 @@ class Medium(Description):
             raise ValueError("a custom medium needs its index")
         if self.kind == "fresh" and self.salinity_g_kg > 0:
             raise ValueError(f"fresh water with salinity {self.salinity_g_kg:g} g/kg: use kind = 'sea'")
+        if self.water is not None and self.turbidity is not None:
+            raise ValueError(f"give water ('{self.water}') or turbidity ({self.turbidity:g}), not both")
+        if self.kind == "air" and (self.water is not None or self.turbidity is not None):
+            raise ValueError("air has neither water nor turbidity: use kind = 'fresh', 'sea' or 'custom'")
         if self.kind in ("fresh", "sea") and self.index is None:
             self.refractive_index(635.0)
         return self
@@ -176,19 +229,52 @@ class Medium(Description):
         )
 
     def absorption_per_mm(self, wavelength_nm: float) -> float:
-        """Absorption coefficient a in 1/mm."""
+        """Absorption coefficient a in 1/mm; RangeError outside the tables."""
         if self.absorption_per_m is not None:
             return 1e-3 * self.absorption_per_m
-        water = self.kind in ("fresh", "sea")
-        return 1e-3 * media.water_absorption_per_m(wavelength_nm=wavelength_nm) if water else 0.0
+        if not self._is_water():
+            return 0.0
+        pure = media.water_absorption_per_m(wavelength_nm=wavelength_nm)
+        return 1e-3 * (pure + self._particles(wavelength_nm).absorption_per_m)
 
     def scattering_per_mm(self, wavelength_nm: float) -> float:
-        """Scattering coefficient b in 1/mm."""
+        """Scattering coefficient b in 1/mm; RangeError outside the tables."""
+        return sum((part.coefficient_per_mm for part in self.scatterers(wavelength_nm)), 0.0)
+
+    def scatterers(self, wavelength_nm: float) -> tuple[waters.Scatterer, ...]:
+        """What scatters, with its part of b and its phase function; RangeError outside the tables."""
         if self.scattering_per_m is not None:
-            return 1e-3 * self.scattering_per_m
-        if self.kind not in ("fresh", "sea"):
-            return 0.0
-        return 1e-3 * media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
+            parts = [(self.scattering_per_m, self._phase_function())]
+        elif self._is_water():
+            molecules = media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
+            particles = self._particles(wavelength_nm).scattering_per_m
+            parts = [(molecules, waters.Molecular()), (particles, self._phase_function())]
+        else:
+            parts = []
+        return tuple(waters.Scatterer(1e-3 * b, phase) for b, phase in parts if b > 0)
+
+    def _is_water(self) -> bool:
+        """Whether absorption and scattering are those of water, pure or not, unless given."""
+        return self.kind in ("fresh", "sea") or self.water is not None or self.turbidity is not None
+
+    def _particles(self, wavelength_nm: float) -> waters.Particles:
+        if self.turbidity is not None:
+            return waters.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
+        return waters.particles_of(self.water or "pure", wavelength_nm=wavelength_nm)
+
+    def _phase_function(self) -> waters.PhaseFunction:
+        natural = self.water is not None or self.turbidity is not None
+        match self.phase or ("petzold" if natural else "molecular"):
+            case "henyey-greenstein":
+                return waters.HenyeyGreenstein(self.asymmetry)
+            case "petzold":
+                return waters.PetzoldAverage()
+            case "fournier-forand" if self.backscatter_share is not None:
+                return waters.fournier_forand_of(self.backscatter_share)
+            case "fournier-forand":
+                return waters.FournierForand(self.particle_index, self.particle_slope)
+            case _:
+                return waters.Molecular()
 
     def extinction_per_mm(self, wavelength_nm: float) -> float:
         """Extinction coefficient c = a + b in 1/mm, by which a beam grows weaker."""
@@ -196,15 +282,52 @@ class Medium(Description):
 
 
 class Detector(Description):
-    """Image sensor after EMVA 1288: photons to electrons to grey values. The gain maps the full well to full scale."""
+    """Image sensor after EMVA 1288: photons to electrons to grey values. The gain maps the full well to full scale.
+
+    ``dark_current_e_per_s`` holds at ``reference_temperature_c`` and doubles with every ``dark_current_doubling_k``
+    up to ``temperature_c``, the image sensor's own.
+
+    How pixels differ belongs to the camera, for whose serial number ``pattern_seed`` stands. ``prnu`` is the rms of
+    their gain as a share of the light's signal. ``dsnu_e`` is the rms in electrons of the dark image of short exposure,
+    an offset of the readout that neither exposure nor temperature changes; ``dsnu_row_e`` and ``dsnu_column_e`` are
+    offsets in addition that whole rows and columns share. ``hot_pixels_per_million`` have a dark current on top of the
+    others', exponentially distributed about a mean of ``hot_pixel_dark_current_e_per_s`` at the reference temperature.
+
+    ``blooming`` is the share of the charge above the full well that spills along the columns; the rest is drained.
+    A "rolling" shutter starts to expose each row ``line_time_us`` after the row above it.
+    """
 
     bits: Literal[8, 10, 12]
     quantum_efficiency: Annotated[float, Field(gt=0, le=1)]
     full_well_e: Positive
     read_noise_e: NotNegative
     dark_current_e_per_s: NotNegative = 0.0
+    reference_temperature_c: Annotated[float, Field(ge=-100, le=150)] = 25.0
+    dark_current_doubling_k: Annotated[float, Field(ge=1, le=100)] = 8.0
+    temperature_c: Annotated[float, Field(ge=-100, le=150)] = 25.0
+    prnu: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    dsnu_e: NotNegative = 0.0
+    dsnu_row_e: NotNegative = 0.0
+    dsnu_column_e: NotNegative = 0.0
+    hot_pixels_per_million: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    hot_pixel_dark_current_e_per_s: NotNegative = 0.0
+    pattern_seed: Annotated[int, Field(ge=0)] = 0
+    blooming: Annotated[float, Field(ge=0, le=1)] = 0.0
     black_level_dn: NotNegative = 0.0
     frame_rate_hz: Positive = 60.0
+    shutter: Literal["global", "rolling"] = "global"
+    line_time_us: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Detector":
+        if self.shutter == "rolling" and self.line_time_us == 0:
+            raise ValueError("a rolling shutter needs line_time_us, the delay from row to row; found 0")
+        if (self.hot_pixels_per_million > 0) != (self.hot_pixel_dark_current_e_per_s > 0):
+            raise ValueError(
+                f"hot_pixels_per_million is {self.hot_pixels_per_million:g} and hot_pixel_dark_current_e_per_s "
+                f"{self.hot_pixel_dark_current_e_per_s:g}: give both, or neither"
+            )
+        return self
 
     def full_scale_dn(self) -> int:
         """Largest grey value."""
@@ -213,6 +336,10 @@ class Detector(Description):
     def gain_dn_per_e(self) -> float:
         """Overall system gain K in grey values per electron."""
         return self.full_scale_dn() / self.full_well_e
+
+    def dark_current_growth(self) -> float:
+        """Dark current at the image sensor's temperature over that at the reference (EMVA 1288 release 4)."""
+        return 2.0 ** ((self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_k)
 
 
 class Exposure(Description):
@@ -225,9 +352,13 @@ class Exposure(Description):
 
 
 class Lamp(Description):
-    """Diffuse light on the target when the laser is off: the irradiance it puts on every surface."""
+    """Other light than the laser's, at the laser's wavelength: what it puts on every surface.
+
+    The lamp is on when the laser is off; ``ambient_w_per_m2`` is daylight behind the camera's filter, always there.
+    """
 
     irradiance_w_per_m2: Positive = 5.0
+    ambient_w_per_m2: NotNegative = 0.0
 
 
 class Stage(Description):
@@ -252,12 +383,13 @@ class Volume(Description):
 
 
 class Sensor(Description):
-    """A complete sensor with the media it is used in."""
+    """A complete sensor with the media it is used in. ``more_lasers`` shine further sheets at the same time."""
 
     name: str
     notes: str = ""
     camera: Camera
     laser: Laser
+    more_lasers: tuple[Laser, ...] = ()
     detector: Detector
     exposure: Exposure = Exposure()
     lamp: Lamp = Lamp()

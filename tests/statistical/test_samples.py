@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
-from twin.renderer import Renderer, _lattice_step
+from twin.effects import NONE
+from twin.renderer import Renderer
+from twin.samples import golden_step
 
 
 @pytest.fixture(scope="module")
 def renderer(thesis):
-    return Renderer(cropped(thesis, 64, 64), clear(0.3), scene_of(plate()))
+    return Renderer(cropped(thesis, 64, 64), clear(0.3), scene_of(plate()), effects=NONE)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def test_stripe_pixels_are_unbiased_in_the_mean(renderer, reference, stripe):
 def test_sixteen_samples_find_the_stripes_centre(thesis, along):
     # The detector's noise leaves some 0.02 px of a stripe's centre; samples must add far less than that.
     sensor = altered(thesis, {"camera": {"stripe_along": along, "width_px": 64, "height_px": 64}})
-    renderer = Renderer(sensor, clear(0.3), scene_of(plate()))
+    renderer = Renderer(sensor, clear(0.3), scene_of(plate()), effects=NONE)
     images = [renderer.irradiance("laser", sensor_at(), spp=spp).astype(float) for spp in (16, 4096)]
     if along == "height":
         images = [image.T for image in images]
@@ -68,7 +70,7 @@ def test_equal_arguments_give_equal_images(renderer):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 16, 64, 100, 4096])
 def test_lattice_is_even_along_either_side(count):
-    step = _lattice_step(count)
+    step = golden_step(count)
     assert math.gcd(step, count) == 1
     assert sorted(k * step % count for k in range(count)) == list(range(count))
     if count >= 16:

@@ -25,6 +25,7 @@ from tests.virtual_sensors import (
     window_transmittance,
 )  # fmt: skip
 from twin.arrays import to_jit
+from twin.effects import NONE
 from twin.renderer import Renderer
 from twin.sheet import Sheet
 from twin.windows import WindowFaces
@@ -173,7 +174,7 @@ def stripe_sum(sensor: Sensor, medium: Medium, y: np.ndarray, z: float, *, refle
 
 def test_the_stripes_irradiance_is_what_power_reflectance_and_lens_make_of_it(thesis):
     sensor, medium, reflectance = cropped(thesis, 1280, 160), clear(0.3), 0.37
-    renderer = Renderer(sensor, medium, scene_of(plate(reflectance=reflectance)))
+    renderer = Renderer(sensor, medium, scene_of(plate(reflectance=reflectance)), effects=NONE)
     column_sums = renderer.irradiance("laser", sensor_at(), spp=64).astype(float).sum(axis=0)
     y = np.linspace(-60.0, 60.0, 13)
     centre = image_of(sensor, medium, np.stack([0 * y, y, 0 * y], axis=1))[:, 0]
@@ -195,7 +196,7 @@ def test_water_dims_the_stripe_over_the_laser_s_and_the_cameras_way(thesis, abso
     sensor = cropped(thesis, 33, 512)
     # The phase function of forward scattering leaves hardly any haze in the stripe: below 1e-5 of it.
     media = clear(), clear(absorption, scattering, phase="henyey-greenstein", asymmetry=0.95)
-    renderers = [Renderer(sensor, medium, scene_of(plate())) for medium in media]
+    renderers = [Renderer(sensor, medium, scene_of(plate()), effects=NONE) for medium in media]
     for z in (-40.0, 0.0, 50.0):
         bright, dim = (r.irradiance("laser", sensor_at(-z), spp=64).astype(float) for r in renderers)
         lit = bright.sum(axis=1) > 0.01 * bright.sum(axis=1).max()
@@ -211,7 +212,7 @@ def test_water_dims_the_stripe_over_the_laser_s_and_the_cameras_way(thesis, abso
 def test_a_plate_under_the_lamp_shows_reflectance_times_irradiance_over_pi(thesis):
     sensor = altered(thesis, {"lamp": {"irradiance_w_per_m2": 3.0}})
     medium, z = clear(0.8), 30.0
-    renderer = Renderer(sensor, medium, scene_of(plate(z, reflectance=0.45)))
+    renderer = Renderer(sensor, medium, scene_of(plate(z, reflectance=0.45)), effects=NONE)
     image = renderer.irradiance("lamp", sensor_at(), spp=4)
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(-60, 40, 11), np.linspace(-70, 70, 11)))
     points = np.stack([x, y, np.full_like(x, z)], axis=1)

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # and how both commands speak on the terminal. Nothing of how the software computes: camera, refraction, sheet, stripe,
 # targets, calibration, reconstruction, metrology.
 SHARED_WITH_TWIN = {
-    "errors", "sensor", "media", "placement", "library", "capture", "truth", "files", "unfinished",
+    "errors", "sensor", "media", "waters", "placement", "library", "capture", "truth", "files", "unfinished",
     "file_label", "console",
 }  # fmt: skip
 

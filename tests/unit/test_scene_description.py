@@ -5,16 +5,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import altered, plate, scene_of
-from twin.objects import build_objects
+from twin.objects import Objects, build_objects
+from twin.options import Options
 from twin.renderer import Renderer
 from twin.scene import Motion, Pose, Scene, load_scene, scene_names
-from twin.simulate import Options, check_scene, medium_of
+from twin.simulate import check_scene, medium_of
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.library import library_folder, load_sensor, names
 from uwlts.sensor import Sensor
 
 SENSORS = names("sensors")
 PLACES = [(scene, place) for scene in scene_names() for place in load_scene(scene).placements]
+
+
+def built(scene: Scene) -> Objects:
+    return build_objects(scene, medium_index=1.33, wavelength_nm=635.0)
 
 
 def test_the_library_is_not_empty():
@@ -33,7 +38,7 @@ def test_every_shipped_sensor_loads(name):
 @pytest.mark.parametrize(("name", "place"), PLACES)
 def test_every_shipped_scene_stands_before_the_thesis_sensor(thesis, name, place):
     scene = load_scene(name, changes={"placement": place})
-    assert build_objects(scene).bbox().valid()
+    assert built(scene).scene.bbox().valid()
     assert len(scene.object_poses()) == len(scene.objects)
     window = {"mounted": scene.window_mounted}
     sensor = altered(thesis, {"camera": {"window": window}})
@@ -109,7 +114,7 @@ def test_a_laser_may_be_placed_by_origin_and_axis_instead(tmp_path, thesis):
     placed = placed.replace("triangulation_angle_deg = 35.0", "axis = [0.0, 1.0, 1.4281480067421146]")
     sensor = load_sensor(written(tmp_path, placed))
     scene = scene_of(plate())
-    views = [Renderer(which, which.media["water"], scene).view for which in (sensor, thesis)]
+    views = [Renderer(which, which.media["water"], scene).design for which in (sensor, thesis)]
     np.testing.assert_allclose(
         [views[0].standoff_mm, views[0].line_length_mm], [views[1].standoff_mm, views[1].line_length_mm]
     )
@@ -149,6 +154,8 @@ def test_a_base_gives_what_a_description_leaves_out(tmp_path):
     assert (other.laser.power_mw, other.laser.window.glass, other.camera) == (20.0, "N-BK7", thesis.camera)
 
 
+PLATE = "title = 't'\n[[objects]]\nkind = 'plate'\nwidth_mm = 5.0\nheight_mm = 5.0\n"
+
 BAD_SCENES = {
     "no objects": ("title = 't'\nobjects = []", r"objects: .*at least 1"),
     "objects as a table": ("title = 't'\n[objects]\nkind = 'plate'", r"\[\[objects\]\]"),
@@ -170,6 +177,18 @@ BAD_SCENES = {
     "unknown light": ("base = 'plane'\n[motion]\nlights = ['sun']", r"motion\.lights\.0: .*'sun'"),
     "no frames": ("base = 'plane'\n[motion]\ncount = 0", r"motion\.count: .*found 0"),
     "step not a number": ("base = 'plane'\n[motion]\nstep_mm = nan", r"motion\.step_mm: .*finite"),
+    "backwards in time": ("base = 'plane'\n[motion]\nspeed_mm_per_s = -1.0", r"motion\.speed_mm_per_s: .*found -1"),
+    "unknown finish": (PLATE + "finish = 'velvet'", r"finish: .*'diffuse', 'painted', 'pvc' or 'metal'.*'velvet'"),
+    "too smooth": (PLATE + "finish = 'metal'\nalpha = 0.001", r"alpha: .*0\.02.*found 0\.001"),
+    "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish 'diffuse' has none: leave alpha out"),
+    "negative height": (PLATE + "roughness_um = -1.0", r"roughness_um: .*found -1"),
+    "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than all light"),
+    "coated mirror": (PLATE + "reflectance = 0.1\nfinish = 'pvc'\nmirror = 0.5", r"mirror 0\.5 under a coat"),
+    "round mirror": (
+        "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nmirror = 0.1",
+        r"objects\.0\.sphere\.mirror: unknown key",
+    ),
+    "texture not a path": (PLATE + "texture = 3", r"texture: .*string.*found 3"),
 }
 
 
@@ -197,11 +216,32 @@ MESH = "title = 't'\n[[objects]]\nkind = 'mesh'\npath = 'part.stl'\n"
 def test_a_mesh_that_is_missing_or_damaged_is_refused(tmp_path):
     scene = load_scene(written(tmp_path, MESH))
     with pytest.raises(DescriptionError, match=rf"no mesh at {tmp_path}/part\.stl"):
-        build_objects(scene)
+        built(scene)
     for content in (b"", b"solid nothing\nendsolid nothing\n", b"\x00" * 200):
         (tmp_path / "part.stl").write_bytes(content)
         with pytest.raises(DescriptionError, match=r"part\.stl"):
-            build_objects(scene)
+            built(scene)
+
+
+def test_paths_of_meshes_and_textures_start_at_the_scenes_folder(tmp_path):
+    scene = load_scene(written(tmp_path, MESH + "texture = 'skin/grey.png'\n"))
+    assert (scene.objects[0].path, scene.objects[0].texture) == (f"{tmp_path}/part.stl", f"{tmp_path}/skin/grey.png")
+
+
+def test_a_circle_plate_takes_no_texture():
+    plate = load_scene("target").objects[0].model_dump()
+    with pytest.raises(ValueError, match="texture grey.png on a circle_plate, which has its lattice"):
+        scene_of(plate | {"texture": "grey.png"})
+
+
+def test_what_a_finish_does_not_say_is_usual_for_it():
+    plain, steel, mirror = scene_of(
+        plate(), plate() | {"finish": "metal"}, plate(reflectance=0.1) | {"mirror": 0.8, "roughness_um": 0.01}
+    ).objects
+    assert (plain.finish, plain.mirror_share(), plain.polarisation(), plain.rms_height_um()) == ("diffuse", 0, 0, 5)
+    assert (steel.gloss_alpha(), steel.mirror_share(), steel.polarisation(), steel.rms_height_um()) == (0.3, 0, 1, 1)
+    assert (mirror.mirror_share(), mirror.polarisation(), mirror.rms_height_um()) == (0.8, 1, 0.01)
+    assert Motion().speed_mm_per_s == 0
 
 
 @pytest.mark.parametrize("wrong", [{"spp": 0}, {"spp": 70000}, {"seed": -1}])

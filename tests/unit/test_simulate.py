@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, plate, scene_of
+from twin.effects import NONE
+from twin.options import Options
 from twin.scene import Scene
-from twin.simulate import Options, simulate
+from twin.simulate import simulate
 from uwlts.capture import Capture
 from uwlts.errors import CaptureError, OutputError
 from uwlts.sensor import Sensor
@@ -119,7 +121,7 @@ def test_ideal_recordings_have_no_noise(small, scene, tmp_path):
     frames = []
     for seed in (1, 2):
         path = tmp_path / f"ideal-{seed}.h5"
-        simulate(scene, small, path, options=Options(spp=16, seed=seed, ideal=True))
+        simulate(scene, small, path, options=Options(spp=16, seed=seed, effects=NONE))
         with Capture(path) as capture:
             frames.append([capture.image(index).astype(int) for index in range(FRAMES)])
     for one, two in zip(*frames, strict=True):

@@ -27,7 +27,8 @@ from tests.virtual_sensors import (
 )  # fmt: skip
 from twin.arrays import to_jit, to_numpy
 from twin.camera import LensRays
-from twin.renderer import Renderer, SensorPose
+from twin.pose import SensorPose
+from twin.renderer import Renderer
 from twin.sheet import Sheet
 from twin.windows import WindowFaces, frame_about
 from uwlts.placement import camera_from_object
@@ -87,8 +88,8 @@ def opencv_pixels(camera: Camera, rays: np.ndarray) -> np.ndarray:
 def hits(renderer: Renderer, pixels: np.ndarray, z: float) -> np.ndarray:
     """Where image points see the plate at ``z``, (N, 3) in the OCS, by Mitsuba."""
     pose = SensorPose(sensor_at(-z))
-    bundle = renderer.bundle(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
-    si = renderer.objects.ray_intersect(pose.ray(bundle.origin, bundle.direction))
+    bundle = renderer.view.bundle(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
+    si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction))
     seen = si.is_valid() & (bundle.weight > 0)
     dr.eval(si.p, seen)
     assert seen.numpy().all()

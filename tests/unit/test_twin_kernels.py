@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.renderer import Renderer, SensorPose
+from twin.pose import SensorPose
+from twin.renderer import Renderer
 from twin.scene import load_scene
 from twin.truth import true_stripe
 
