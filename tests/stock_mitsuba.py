@@ -23,7 +23,7 @@ from uwlts.sensor import Medium, Sensor
 MOLECULAR_ANISOTROPY = 0.925
 """k of water's phase function 1 + k cos^2; Mitsuba's Rayleigh scattering has k = 1."""
 _WAIST_MM = 0.02
-_ACROSS_SIGMAS, _ACROSS_TEXELS = 10.0, 320
+_ACROSS_SIGMAS, _ACROSS_TEXELS = 10.0, 640
 
 
 def opened_from_its_origin(sensor: Sensor, *, sigma_deg: float, fan_angle_deg: float) -> Sensor:

@@ -1,8 +1,9 @@
 """The main job in small: render, calibrate from rendered images only, reconstruct, and judge against truth.
 
 Two gates stand here. With perfect images and true parameters nothing but the stripe's centre and the chain's arithmetic
-is left, so errors of micrometres show. With noise and a calibration from noisy images of a sensor that differs from its
-drawings, the gates are a few times the errors that the full campaign shows, and well below the thesis's own 0.11 mm.
+is left, so errors of micrometres show. With speckle, blur and noise, and a calibration from such images of a sensor that
+differs from its drawings, the gates are a few times the errors that the full campaign shows; the thesis's own spacing
+error is 0.11 mm, its standard deviation 0.10 to 0.14 mm.
 """
 
 from pathlib import Path
@@ -10,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from twin.effects import ALL, NONE
+from twin.options import Options
 from twin.scene import load_scene
-from twin.simulate import Options, simulate
+from twin.simulate import simulate
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate
@@ -41,7 +44,7 @@ def record(
     scene: str, path: Path, *, as_built: str | None = None, ideal: bool = False, seed: int = 0, **changes
 ) -> Path:
     built = load_sensor(as_built) if as_built else None
-    options = Options(spp=64 if ideal else 16, seed=seed, ideal=ideal)
+    options = Options(spp=64 if ideal else 16, seed=seed, effects=NONE if ideal else ALL)
     simulate(load_scene(scene, changes=changes), load_sensor("thesis"), path, as_built=built, options=options)
     return path
 
@@ -85,7 +88,8 @@ def test_calibration_finds_the_sensor_as_built(campaign: tuple[Path, Calibration
     assert camera.cy_px == pytest.approx(built.camera.principal_point()[1], abs=1.0)
     # The window's true tilt of 0.08 deg is not part of the thesis's model and moves its distance by about 1 mm.
     assert calibration.window.distance_mm == pytest.approx(built.camera.window.distance_mm, abs=2.5)
-    assert calibration.residuals["sheet"]["rms_mm"] < 0.03
+    # Speckle leaves 0.04 to 0.05 mm of the stripe on the plate.
+    assert calibration.residuals["sheet"]["rms_mm"] < 0.08
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -100,9 +104,9 @@ def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationRes
         motion=PROFILES,
     )
     figures = measured(path, result.calibration).content["evaluation"]["figures_mm"]
-    assert abs(figures["SSE"]) <= 0.08
-    assert figures["STD"] <= 0.02
-    assert abs(figures["diameter error sphere 1"]) <= 0.08
+    assert abs(figures["SSE"]) <= 0.11
+    assert 0.03 < figures["STD"] <= 0.09, "speckle is there, and no more than speckle"
+    assert abs(figures["diameter error sphere 1"]) <= 0.3
 
 
 def test_a_hundredth_of_a_millimetre_is_noticed(tmp_path: Path):
@@ -133,7 +137,7 @@ def test_shadowed_lines_give_no_points(tmp_path: Path):
     objects = (*[thing.model_dump() for thing in scene.objects], block)
     path = tmp_path / "plane.h5"
     shaded = type(scene).model_validate(scene.model_dump() | {"objects": objects, "artefact": None})
-    simulate(shaded, load_sensor("thesis"), path, options=Options(ideal=True))
+    simulate(shaded, load_sensor("thesis"), path, options=Options(effects=NONE))
     with Capture(path) as capture:
         cloud = reconstruct_capture(capture, true_calibration()).cloud
     on_block = cloud.points_mm[:, 2] < -30

@@ -152,8 +152,8 @@ def _origin(capture: GatheredCapture) -> str:
     provenance = capture.header.provenance
     source = provenance.get("source")
     if source == "twin":
-        ideal = provenance.get("ideal")
-        return "rendered by the digital twin" + (", without noise" if ideal is True else "")
+        effects = provenance.get("effects")
+        return "rendered by the digital twin" + (", sharp and without noise" if effects == [] else "")
     return f"recorded by {source}" if isinstance(source, str) else "of unknown origin"
 
 
