@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -61,6 +61,7 @@ def rendering() -> list[Row]:
     from twin.variant import use_variant
 
     use_variant()
+    from twin.effects import NONE
     from twin.renderer import Renderer
     from twin.scene import load_scene
     from uwlts.library import load_sensor
@@ -72,25 +73,46 @@ def rendering() -> list[Row]:
         transform[0, 3] = 0.5 * (k - 8)
         return transform
 
-    spheres = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
-    pipe = Renderer(sensor, sensor.media["water"], load_scene("pipe"))
+    spheres, pipe = (
+        Renderer(sensor, sensor.media["water"], load_scene(name), effects=replace(NONE, haze=True))
+        for name in ("spheres", "pipe")
+    )
     limit = 0.25
     return [
         at_most(
-            "laser frame 1280 x 1024, 64 samples per lit pixel, spheres in water",
+            "sharp laser frame 1280 x 1024, 64 samples per lit pixel, spheres in water",
             median_seconds(lambda k: spheres.irradiance("laser", pose(k), spp=64)), "s", limit,
         ),
         at_most(
-            "laser frame 1280 x 1024, 64 samples per lit pixel, pipe across the whole image in water",
+            "sharp laser frame 1280 x 1024, 64 samples per lit pixel, pipe across the whole image in water",
             median_seconds(lambda k: pipe.irradiance("laser", pose(k), spp=64)), "s", limit,
         ),
     ]  # fmt: skip
 
 
+def light() -> list[Row]:
+    """Time and noise of frames with all effects, the advantage over stock Mitsuba, and a campaign."""
+    from tests import bench_light
+
+    rows = []
+    for water, limit in (("clear", 0.5), ("coastal", 1.5)):
+        seconds, noise = bench_light.full_physics(water)
+        rows.append(at_most(f"laser frame with all effects, spheres in {water} water", seconds, "s", limit))
+        rows.append(at_most(f"noise of its stripe before speckle, {water} water", 100 * noise, "% of peak", 1.0))
+    advantage, how = bench_light.equal_noise_advantage()
+    rows.append(at_least(f"advantage over volpath at equal noise ({how})", advantage, "times", 1000))
+    frames, seconds, peak, growth = bench_light.campaign()
+    rows.append(at_most(f"campaign of {frames} frames", seconds, "s", 300))
+    rows.append(at_most("campaign, peak memory", peak, "GiB", 3))
+    rows.append(at_most("campaign, time of the last frames over that of earlier ones", growth, "times", 1.3))
+    return rows
+
+
 def pipeline() -> list[Row]:
     """Time of stripe extraction and reconstruction on one core, on frames with a stripe on every line."""
+    from twin.options import Options
     from twin.scene import load_scene
-    from twin.simulate import Options, Studio
+    from twin.simulate import Studio
     from uwlts.calibration.nominal import nominal_calibration
     from uwlts.library import load_sensor
     from uwlts.reconstruction import reconstruct_pixels
@@ -141,7 +163,7 @@ def main() -> int:
     if (count := len(os.sched_getaffinity(0))) > CORES:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
         print(f"{count} cores found, measuring on {CORES}")
-    rows = [*demo(), *rendering(), *pipeline()]
+    rows = [*demo(), *rendering(), *light(), *pipeline()]
     table = Table("what", "value", "limit", "unit", "")
     for row in rows:
         table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:.4g}", row.unit, "ok" if row.ok else "MISSED")
