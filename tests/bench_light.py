@@ -11,7 +11,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from tests.stock_mitsuba import fog, opened_from_its_origin, stock_scene
+from tests.stock_mitsuba import fog, stock_scene
+from tests.virtual_sensors import altered
 from twin.effects import NONE
 from twin.options import Options
 from twin.renderer import Renderer
@@ -57,8 +58,12 @@ def equal_noise_advantage() -> tuple[float, str]:
     projector that throws the sheet, 0.15 mm wide at the stand-off. Noise is the rms error of the stripe's pixels; what
     stock would need is extrapolated by its own 1 / sqrt(N), and the twin is held against a mean of many more samples.
     """
-    thesis = load_sensor("thesis")
-    sensor = opened_from_its_origin(thesis, sigma_deg=float(np.degrees(0.15 / 462)), fan_angle_deg=45.0)
+    bare = {"window": {"mounted": False}}
+    sensor = altered(load_sensor("thesis"), {"camera": bare, "laser": bare})
+    # A projector's light opens from a point: as wide at the stand-off as the sheet, whose waist is there.
+    sigma = 0.5 * sensor.laser.waist_radius_mm / sensor.laser.waist_distance_mm
+    waist = 1e-6 * sensor.laser.wavelength_nm / (2 * np.pi * sigma)
+    thrown = altered(sensor, {"laser": {"waist_radius_mm": waist, "beam_quality_m2": 1.0}})
     coastal = Medium(kind="fresh", water="coastal")
     a, b = (1e3 * f(635.0) for f in (coastal.absorption_per_mm, coastal.scattering_per_mm))
     medium = fog(absorption_per_m=a, scattering_per_m=b, phase="henyey-greenstein", asymmetry=0.924)
@@ -72,7 +77,7 @@ def equal_noise_advantage() -> tuple[float, str]:
     our_seconds = (time.perf_counter() - start) / SEEDS
     truth = np.mean([renderer.irradiance("laser", np.eye(4), spp=8 * SPP, seed=100 + k) for k in range(8)], axis=0)
     our_noise = stripe_noise(ours, truth)
-    stock = stock_scene(sensor, medium, scene, across_texels=64)
+    stock = stock_scene(thrown, medium, scene, across_texels=64)
     volpath = mi.load_dict({"type": "volpath", "max_depth": -1})
     start = time.perf_counter()
     theirs = np.stack([np.array(mi.render(stock, integrator=volpath, spp=SPP, seed=k))[..., 0] for k in range(3)])

@@ -30,7 +30,7 @@ def opened_from_its_origin(sensor: Sensor, *, sigma_deg: float, fan_angle_deg: f
     """The sensor without windows and with a sheet that is a Gaussian of ``sigma_deg`` in angle across.
 
     A waist w0 at the origin gives w = w0 s / zR far away, and zR = pi w0^2 / (M2 lambda): M2 = 2 pi w0 sigma / lambda.
-    At 300 mm w is larger than that by less than 1e-5 of itself.
+    The waist lies 0.01 mm before the origin; from 300 mm on w is within 4e-5 of that.
     """
     quality = 2 * math.pi * _WAIST_MM * math.radians(sigma_deg) / (1e-6 * sensor.laser.wavelength_nm)
     laser = {
@@ -46,11 +46,20 @@ def fog(*, absorption_per_m: float, scattering_per_m: float, **phase: Any) -> Me
     return Medium.model_validate({"kind": "air"} | coefficients | phase)
 
 
-def stock_scene(sensor: Sensor, medium: Medium, scene: Scene, *, pixel_px: int = 1) -> mi.Scene:
-    """Mitsuba scene of the sensor's camera and laser before objects; ``pixel_px`` sensor pixels make one film pixel."""
+def stock_scene(
+    sensor: Sensor, medium: Medium, scene: Scene, *, pixel_px: int = 1, across_texels: int = _ACROSS_TEXELS
+) -> mi.Scene:
+    """Mitsuba scene of the sensor's camera and laser before objects.
+
+    ``pixel_px`` sensor pixels make one film pixel; the sheet's profile is thrown with ``across_texels``.
+    """
     shapes = {f"object_{index}": _shape(thing, pose, sensor, medium)
               for index, (thing, pose) in enumerate(zip(scene.objects, scene.object_poses(), strict=True))}  # fmt: skip
-    parts = {"type": "scene", "projector": projector(sensor), "camera": _camera(sensor, pixel_px)} | shapes
+    parts = {
+        "type": "scene",
+        "projector": projector(sensor, across_texels),
+        "camera": _camera(sensor, pixel_px),
+    } | shapes
     if medium.extinction_per_mm(sensor.laser.wavelength_nm) > 0:
         parts["fog"] = homogeneous(medium, wavelength_nm=sensor.laser.wavelength_nm)
         parts["camera"]["medium"] = {"type": "ref", "id": "fog"}
@@ -115,7 +124,7 @@ def _camera(sensor: Sensor, pixel_px: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def projector(sensor: Sensor) -> dict[str, Any]:
+def projector(sensor: Sensor, across_texels: int) -> dict[str, Any]:
     """The sheet as Mitsuba's projector at the fan's origin.
 
     Between the fan angles a and a + da flows P da / A of an even fan of full angle A. At the point (x, y, 1) before the
@@ -131,10 +140,10 @@ def projector(sensor: Sensor) -> dict[str, Any]:
     fan = math.radians(laser.fan_angle_deg)
     sigma = laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm / (2 * math.pi * laser.waist_radius_mm)
     height = 2 * math.tan(fan / 2)
-    rows = round(height / (_ACROSS_SIGMAS * sigma) * _ACROSS_TEXELS)
+    rows = round(height / (_ACROSS_SIGMAS * sigma) * across_texels)
     texel = height / rows
     x, y = np.meshgrid(
-        (np.arange(_ACROSS_TEXELS) + 0.5 - _ACROSS_TEXELS / 2) * texel, (np.arange(rows) + 0.5 - rows / 2) * texel
+        (np.arange(across_texels) + 0.5 - across_texels / 2) * texel, (np.arange(rows) + 0.5 - rows / 2) * texel
     )
     spread = sigma * np.sqrt(1 + x * x + y * y)
     across = np.exp(-0.5 * (x / spread) ** 2) / (math.sqrt(2 * math.pi) * spread)

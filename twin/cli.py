@@ -14,6 +14,7 @@ from twin.variant import CPU, use_variant
 from uwlts.console import progress_bar, run
 from uwlts.errors import DescriptionError
 from uwlts.library import load_sensor, names
+from uwlts.waters import water_names
 
 app = App(
     name="twin",
@@ -116,7 +117,7 @@ def _water(text: str | None) -> str | float | None:
 
 @app.command
 def scenes() -> None:
-    """List the scenes and sensors that ship with the program.
+    """List the scenes, sensors and waters that ship with the program.
 
     Example: twin scenes
     """
@@ -124,6 +125,7 @@ def scenes() -> None:
         scene = load_scene(name)
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     print(f"sensors: {', '.join(names('sensors'))}")
+    print(f"waters: {', '.join(water_names())}, or a turbidity from 0 to 3")
 
 
 def main() -> None:

@@ -396,3 +396,13 @@ class Sensor(Description):
     stage: Stage
     volume: Volume
     media: dict[str, Medium]
+
+    @model_validator(mode="after")
+    def _one_wavelength(self) -> "Sensor":
+        for laser in self.more_lasers:
+            if laser.wavelength_nm != self.laser.wavelength_nm:
+                raise ValueError(
+                    f"the lasers have {self.laser.wavelength_nm:g} and {laser.wavelength_nm:g} nm; "
+                    "a sensor is rendered at one wavelength: give all lasers the same"
+                )
+        return self

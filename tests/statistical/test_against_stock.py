@@ -172,7 +172,7 @@ def test_direct_light_on_a_plate_is_stocks_pixel_by_pixel(broad, rotation):
 def test_light_scattered_once_is_stocks(broad, medium):
     scene = scene_of(plate(side=800.0))
     stock = stock_irradiance(
-        broad, medium, scene, integrator="volpath", max_depth=2, spp=512, runs=16, pixel_px=BLOCK_PX
+        broad, medium, scene, integrator="volpath", max_depth=2, spp=1024, runs=24, pixel_px=BLOCK_PX
     )
     twin = twin_irradiance(broad, medium, scene, *SINGLY, spp=64, runs=1)
     direct = twin_irradiance(broad, medium, scene, *SINGLY, "haze", spp=64, runs=1)[0]
@@ -181,37 +181,38 @@ def test_light_scattered_once_is_stocks(broad, medium):
     assert haze.sum() >= 60
     for part in (compared(twin, stock, stripe), compared(twin, stock, haze)):
         assert part.agrees(), part
-        assert part.resolved < 0.03
+        assert part.resolved < 0.012
     assert (stock[:, off_stripe(direct) & (twin[0] == 0)] == 0).all(), "there is no haze behind the plate"
 
 
-@pytest.mark.parametrize(("asymmetry", "largest_error"), [(0.0, 0.03), (0.5, 0.1), (0.9, None)])
-def test_light_scattered_any_number_of_times_is_stocks(broad, asymmetry, largest_error):
+@pytest.mark.parametrize(
+    ("asymmetry", "names"),
+    [(0.0, ("stripe", "before", "behind")), (0.5, ("stripe", "behind")), (0.9, ("stripe",))],
+    ids=["even", "forward", "far forward"],
+)
+def test_light_scattered_any_number_of_times_is_stocks(broad, asymmetry, names):
     """Stripe and haze on their own, as the haze is a few per cent of the stripe and would hide in it; row by row.
 
-    Stock looks for the sheet by chance and finds it seldom, the bright part near the laser most seldom: its haze is
-    mostly too dark, now and then far too bright, the more so the more the fog scatters forwards. With 20 runs of 2^18
-    samples for each of 16 film pixels it came to the twin's haze within 3 % at an asymmetry of 0.9; in a test's time it
-    gives no mean there, and only the stripe is compared.
+    Stock finds the sheet by chance, its bright part near the laser most seldom: the haze of most runs is a little too
+    dark, that of a few far too bright, the more so the more the fog scatters forwards. Where a test's time gives no
+    mean the haze is left out: at an asymmetry of 0.5 before the plate, at 0.9 on both sides of the stripe.
     """
     scene, medium = scene_of(plate(side=800.0)), turbid(asymmetry)
     stock = stock_irradiance(
-        broad, medium, scene, integrator="volpath", max_depth=-1, spp=512, runs=14, pixel_px=BLOCK_PX
+        broad, medium, scene, integrator="volpath", max_depth=-1, spp=1024, runs=24, pixel_px=BLOCK_PX
     )
     twin = twin_irradiance(broad, medium, scene, spp=32, runs=4)
     once = twin_irradiance(broad, medium, scene, *SINGLY, spp=32, runs=1)
     direct = twin_irradiance(broad, medium, scene, *SINGLY, "haze", spp=32, runs=1)[0]
     away = off_stripe(direct)
-    parts = [(in_stripe(direct), 0.02)]
-    if largest_error is not None:
-        parts += [(away & (once[0] > 0), largest_error), (away & (once[0] == 0), largest_error)]
-    for part, error in parts:
+    parts = {"stripe": in_stripe(direct), "before": away & (once[0] > 0), "behind": away & (once[0] == 0)}
+    for part in (parts[name] for name in names):
         assert part.sum() >= 60
         rows = [np.where(part, image, 0.0).sum(axis=2, keepdims=True) for image in (twin, stock, once)]
         lit = part.any(axis=1, keepdims=True)
         found = compared(rows[0], rows[1], lit)
         assert found.agrees(), found
-        assert found.resolved < error
+        assert found.resolved < 0.03
         assert compared(rows[2], rows[1], lit).differs_clearly(), "light scattered once alone would be noticed"
 
 
@@ -242,7 +243,7 @@ def test_light_between_the_sides_of_a_groove_is_stocks(broad, name):
     finish, integrator = GROOVES[name]
     scene = groove(**finish)
     stock = stock_irradiance(
-        broad, CLEAR, scene, integrator=integrator, max_depth=-1, spp=512, runs=14, pixel_px=BLOCK_PX
+        broad, CLEAR, scene, integrator=integrator, max_depth=-1, spp=512, runs=24, pixel_px=BLOCK_PX
     )
     twin = twin_irradiance(broad, CLEAR, scene, spp=64, runs=4)
     direct = twin_irradiance(broad, CLEAR, scene, *SINGLY, spp=64, runs=1)

@@ -1,0 +1,193 @@
+"""One case of the study: frames of an object with some effects, and how far the stripe's centres lie from the truth."""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from twin.effects import ALL, NONE, Effects
+from twin.options import Options
+from twin.scene import Scene, load_scene
+from uwlts.library import load_sensor
+from uwlts.metrology.robust_fit import MAD_TO_STD
+from uwlts.sensor import Sensor
+from uwlts.stripe import StripeOptions, extract_stripe
+
+DEFAULT = "zero crossing"
+METHODS = {
+    DEFAULT: StripeOptions(),
+    "centre of mass": StripeOptions(method="centre-of-mass"),
+    "quadratic": StripeOptions(method="quadratic"),
+    # A mean of five pixels has a standard deviation of sqrt((25 - 1) / 12) px.
+    "5x5 low-pass, quadratic": StripeOptions(method="quadratic", smoothing_px=math.sqrt(2), smoothing_lines=5),
+}
+SPP = 64
+PLATE = {"kind": "plate", "width_mm": 200.0, "height_mm": 300.0, "finish": "painted"}
+"""The thesis's painted plane, so large that no end of the stripe is in view."""
+FACING = math.cos(math.radians(60))
+"""Surfaces turned farther away from the laser are left out: there the stripe ends, which is a matter of its own."""
+CROP_PX = 36
+_SCALE_Z, _SCALE_DEGREE = np.arange(-80.0, 131.0, 15.0), 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """What is rendered: an object of the thesis at Z, the effects, and what differs from its sensor.
+
+    ``level`` is the brightest light as a share of the full well; the automatic exposure's unless given. ``camera`` and
+    ``laser`` are pairs of a description's key and value.
+    """
+
+    thing: str = "plane"
+    z_mm: float = 0.0
+    effects: Effects = ALL
+    frames: int = 6
+    medium: str = "water"
+    water: str | float | None = None
+    level: float | None = None
+    camera: tuple[tuple[str, float], ...] = ()
+    laser: tuple[tuple[str, float], ...] = ()
+
+    def scene(self) -> Scene:
+        """The shipped scene, moved to Z, with so many frames spread over its scan."""
+        shipped = load_scene(self.thing).motion
+        travel = (shipped.count - 1) * shipped.step_mm
+        motion = {"start_mm": shipped.start_mm, "step_mm": travel / max(1, self.frames - 1), "count": self.frames}
+        changes: dict[str, Any] = {"motion": motion, "medium": self.medium, "placement": "here"}
+        changes["placements"] = {"here": {"position_mm": [0.0, 0.0, self.z_mm]}}
+        if self.water is not None:
+            changes["water"] = self.water
+        if self.thing == "plane":
+            changes["objects"] = [PLATE]
+        return load_scene(self.thing, changes=changes)
+
+    def sensor(self) -> Sensor:
+        """The thesis's sensor with this case's changes."""
+        sensor = load_sensor("thesis")
+        parts = {"camera": dict(self.camera), "laser": dict(self.laser)}
+        return sensor.model_copy(
+            update={name: getattr(sensor, name).model_copy(update=change) for name, change in parts.items()}
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Errors of a case by method: centre minus truth in px (F, L), NaN where either is missing.
+
+    ``mm_per_px`` (F, L) is how far a point moves along its surface's normal, away from the surface, for one px, and
+    ``step_mm`` (F, L, 3) how it moves in space; ``point_mm`` (F, L, 3) is the true point; ``used`` (F, L) tells
+    where the surface faces the laser; ``width_px`` is the median full width at half maximum. ``crop`` is a piece of
+    the first image about the middle of the stripe, with its first row and column.
+    """
+
+    error_px: dict[str, np.ndarray]
+    mm_per_px: np.ndarray
+    step_mm: np.ndarray
+    point_mm: np.ndarray
+    used: np.ndarray
+    truth_px: np.ndarray
+    width_px: float
+    exposure_ms: float
+    crop: np.ndarray
+    crop_at: tuple[int, int]
+
+    def spread(self, method: str = DEFAULT) -> "Spread":
+        """Bias and spread over all used lines."""
+        error = np.where(self.used, self.error_px[method], np.nan)
+        return Spread.of(error, error * self.mm_per_px, found=float(np.isfinite(error)[self.used].mean()))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Bias (median), standard deviation and its standard error from frame to frame; px, and mm along the normal.
+
+    ``robust_mm`` is the standard deviation from the median absolute deviation, ``found`` the share of lines found.
+    """
+
+    bias_px: float
+    bias_mm: float
+    std_px: float
+    std_mm: float
+    std_px_error: float
+    std_mm_error: float
+    robust_px: float
+    robust_mm: float
+    found: float
+
+    @classmethod
+    def of(cls, error_px: np.ndarray, error_mm: np.ndarray, *, found: float) -> "Spread":
+        numbers: dict[str, float] = {}
+        for unit, error in (("px", error_px), ("mm", error_mm)):
+            middle = np.nanmedian(error)
+            each = np.nanstd(error, axis=1)
+            numbers[f"bias_{unit}"] = float(middle)
+            numbers[f"std_{unit}"] = float(np.nanstd(error))
+            numbers[f"std_{unit}_error"] = float(each.std(ddof=1) / math.sqrt(len(each))) if len(each) > 1 else math.nan
+            numbers[f"robust_{unit}"] = float(MAD_TO_STD * np.nanmedian(np.abs(error - middle)))
+        return cls(**numbers, found=found)
+
+
+@cache
+def measure(case: Case) -> Frames:
+    """Render the case's frames, find the stripe in them, and compare with the truth."""
+    # Mitsuba looks for its variant when it is imported.
+    from twin.simulate import Studio
+    from twin.truth import true_stripe
+
+    sensor, scene = case.sensor(), case.scene()
+    studio = Studio(sensor, scene, Options(spp=SPP, effects=case.effects))
+    if case.level is not None:
+        fixed = studio.exposure_ms["laser"] * case.level / sensor.exposure.auto_level
+        exposure = sensor.exposure.model_copy(update={"laser_ms": fixed})
+        studio = Studio(sensor.model_copy(update={"exposure": exposure}), scene, studio.options)
+    truths, stripes, crop, corner = [], [], None, (0, 0)
+    for index, shot in enumerate(scene.motion.shots()):
+        truth, image = true_stripe(studio.renderer, studio.pose(shot)), studio.image(shot, index)
+        truths.append(truth)
+        stripes.append(
+            {name: extract_stripe(image, stripe_along="width", options=options) for name, options in METHODS.items()}
+        )
+        if crop is None:
+            middle = image.shape[1] // 2
+            corner = (int(np.nan_to_num(truth.centre_px[middle])) - CROP_PX // 2, middle)
+            crop = image[corner[0] : corner[0] + CROP_PX, corner[1] : corner[1] + CROP_PX].copy()
+    truth_px, point, normal = (
+        np.stack([getattr(truth, name) for truth in truths]) for name in ("centre_px", "point_mm", "normal")
+    )
+    step = _step_per_px(case, point[..., 2])
+    used = np.isfinite(truth_px) & (-normal[..., 2] >= FACING)
+    return Frames(
+        error_px={name: np.stack([found[name].centre_px for found in stripes]) - truth_px for name in METHODS},
+        mm_per_px=(step * normal).sum(axis=-1),
+        step_mm=step, point_mm=point, used=used, truth_px=truth_px,
+        width_px=float(np.nanmedian(np.where(used, [found[DEFAULT].width_px for found in stripes], np.nan))),
+        exposure_ms=studio.exposure_ms["laser"], crop=crop, crop_at=corner,
+    )  # fmt: skip
+
+
+def _step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
+    """How a point at Z (F, L) of the sheet moves, (F, L, 3) mm, when its centre moves by one px on its line."""
+    row_of_z, y_of_z = _scale(case.medium)
+    per_row = 1 / polynomial.polyval(z_mm, polynomial.polyder(row_of_z)[:, None], tensor=False)
+    along = polynomial.polyval(z_mm, polynomial.polyder(y_of_z)[:, None], tensor=False)
+    return np.stack([np.zeros_like(per_row), along * per_row, per_row], axis=-1)
+
+
+@cache
+def _scale(medium: str) -> tuple[np.ndarray, np.ndarray]:
+    """Polynomials (degree + 1, L) in Z of every line's row and Y, from the truth of plates all over the volume."""
+    from twin.simulate import Studio
+    from twin.truth import true_stripe
+
+    studio = Studio(load_sensor("thesis"), Case(medium=medium).scene(), Options(effects=NONE))
+    rows, places = [], []
+    for z in _SCALE_Z:
+        pose = np.eye(4)
+        pose[2, 3] = -z
+        truth = true_stripe(studio.renderer, pose)
+        rows.append(truth.centre_px)
+        places.append(truth.point_mm[:, 1])
+    return tuple(polynomial.polyfit(_SCALE_Z, np.stack(values), _SCALE_DEGREE) for values in (rows, places))
