@@ -1,9 +1,9 @@
 """The main job in small: render, calibrate from rendered images only, reconstruct, and judge against truth.
 
 Two gates stand here. With perfect images and true parameters nothing but the stripe's centre and the chain's arithmetic
-is left, so errors of micrometres show. With speckle, blur and noise, and a calibration from such images of a sensor that
-differs from its drawings, the gates are a few times the errors that the full campaign shows; the thesis's own spacing
-error is 0.11 mm, its standard deviation 0.10 to 0.14 mm.
+is left, so errors of micrometres show. With speckle, blur and noise, and a calibration from such images of a sensor
+that differs from its drawings, the gates are a few times the errors that the full campaign shows; the thesis's own
+spacing error is 0.11 mm, its standard deviation 0.10 to 0.14 mm.
 """
 
 from pathlib import Path
