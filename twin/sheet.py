@@ -26,6 +26,8 @@ _RAYS, _NODES, _NEWTON_STEPS = 1025, 4097, 3
 _LARGEST_DEGREE, _LARGEST_MISS_MM = 27, 1e-3
 _SERIES_MM, _SERIES_SLOPE = 5e-5, 1e-7
 """What the terms left out of a series may sum up to: about the roundings of the traced rays."""
+_SMALLEST_SPREAD_MM = 1e-3
+"""Rays closer to where the fan begins are taken as if so far from it."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,9 @@ class Sheet:
 
     def _normal(self, m: mi.Float, t: mi.Float, z: mi.Float) -> mi.Vector3f:
         """Unit normal of the surface X(Y, Z): its derivatives are X_Y = (x0' + k' Z) / (y0' + Z), X_Z = k - m X_Y."""
-        by_y = (_value(self._dx0, t) + _value(self._dtilt, t) * z) / (_value(self._dy0, t) + z)
+        # At the fan's origin, where all rays meet, both derivatives vanish.
+        spread = dr.maximum(_value(self._dy0, t) + z, _SMALLEST_SPREAD_MM)
+        by_y = (_value(self._dx0, t) + _value(self._dtilt, t) * z) / spread
         return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - _value(self._tilt, t)))
 
 

@@ -352,6 +352,15 @@ def test_the_numbers_0_and_almost_1_give_rays(thesis):
         assert np.ptp(direction[:, 1]) > 0.4, "the fan's two edges"
 
 
+def test_a_waist_at_the_origin_of_a_bare_fan_gives_rays(thesis):
+    # There the rays of the fan meet, and the surface has no normal of its own.
+    sensor = altered(thesis, {"laser": {"waist_distance_mm": 1e-9, "window": {"mounted": False}}})
+    u = mi.Point3f(*(to_jit(mi.Float, np.linspace(0.01, 0.99, 50)) for _ in range(3)))
+    rays = Sheet(sensor, Medium(kind="air")).sample(u)
+    assert np.isfinite(to_numpy(rays.origin)).all()
+    np.testing.assert_allclose(np.linalg.norm(to_numpy(rays.direction), axis=1), 1.0, atol=1e-6)
+
+
 def test_what_is_not_a_point_gets_no_light(thesis):
     points = np.array([[math.nan] * 3, [0.0, math.inf, 0.0], [0.0, -math.inf, 0.0], [0.0, 0.0, -1e9]])
     irradiance = light_at(Sheet(thesis, WATER), points)["irradiance"]
