@@ -1,4 +1,4 @@
-"""Light on longer ways: integrating sphere, corner and thin water against closed forms and quadrature, and its noise."""
+"""Light on longer ways: integrating sphere, corner and thin water against closed forms and quadrature; its noise."""
 
 import math
 from dataclasses import replace
@@ -98,8 +98,8 @@ def test_an_integrating_sphere_is_filled_with_the_geometric_series(coarse, tmp_p
     assert inside.sum() >= 4
     found, error = walked(renderer, pixels[inside], 16384)
     expected = (reflectance / math.pi * bounced * factor)[inside]
-    # A facet of 16 mm is turned by up to 0.5 deg against the sphere, which changes what it gets of a stripe that is seen
-    # under 76 deg from its normal by up to 3.5 %, one way or the other.
+    # A facet of 16 mm is turned by up to 0.5 deg against the sphere, which changes what it gets of a stripe that is
+    # seen under 76 deg from its normal by up to 3.5 %, one way or the other.
     assert_agrees(found, error, expected, within=0.035, noise=0.01)
     assert (found / expected).mean() == pytest.approx(1.0, abs=0.01)
 
