@@ -21,11 +21,19 @@ def corner_extremes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
 
 
+def any_corner(nodes: np.ndarray) -> np.ndarray:
+    """Cells (rows - 1, columns - 1) of which some corner is True."""
+    beside = nodes[:, :-1] | nodes[:, 1:]
+    return beside[:-1] | beside[1:]
+
+
 def near_sheet(across: np.ndarray) -> np.ndarray:
-    """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes."""
-    nearest, _ = corner_extremes(np.abs(across))
-    low, high = corner_extremes(across)
-    return (nearest < LIT_SIGMAS) | ((low < 0) & (high > 0) & np.isfinite(high))
+    """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes.
+
+    ``across`` is the sheet's distance at the nodes in standard deviations, infinity where there is no surface.
+    """
+    seen = np.isfinite(across)
+    return any_corner(np.abs(across) < LIT_SIGMAS) | any_corner(seen & (across < 0)) & any_corner(seen & (across > 0))
 
 
 def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:

@@ -94,7 +94,7 @@ def simulate(
     shared = {"width_px", "height_px", "stripe_along"}
     if built and built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
         raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{sensor}'")
-    options = Options(spp=spp, seed=seed, effects=NONE if ideal else ALL.without(*without))
+    options = Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))
     use_variant(variant)
     from twin.simulate import simulate as record
 

@@ -35,7 +35,7 @@ class Light:
         if mirror is not None:
             object_from_face = np.linalg.inv(pose.scene_from_object) @ mirror.pose
             reflection = object_from_face @ np.diag([1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(object_from_face)
-            own = reflection if own is None else own @ reflection
+            self._reflection = opaque_transform(reflection)
             self._to_face = opaque_transform(np.linalg.inv(object_from_face))
             self._from_face = opaque_transform(object_from_face)
             self._half = mi.Vector2f(*(dr.opaque(mi.Float, float(h)) for h in mirror.half_size_mm))
@@ -45,31 +45,47 @@ class Light:
 
     def in_own_frame(self, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
         """A ray of the sensor's OCS in the sheet's own, where the nominal sheet is X = 0."""
+        if self._mirror is not None:
+            origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ direction
         if self._to_own is None:
             return origin, direction
         return self._to_own @ mi.Point3f(origin), self._to_own @ direction
 
-    def at(self, p: mi.Point3f) -> SheetLight:
+    def at(self, p: mi.Point3f, travel_mm: mi.Float | None = None) -> SheetLight:
         """The sheet's light at points of the sensor's OCS, shadows aside; nothing where the mirror does not send it."""
-        if self._to_own is None:
-            return self.sheet.at(p)
-        light = self.sheet.at(self._to_own @ mi.Point3f(p))
-        light = replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
         if self._mirror is None:
-            return light
+            return self._unfolded(p)
+        p = self._at_rest(p, travel_mm)
+        light = self._unfolded(self._reflection @ p, travel_mm)
+        light = replace(light, direction=self._reflection @ light.direction, normal=self._reflection @ light.normal)
         _, meets = self._on_mirror(p, -light.direction)
         return replace(light, irradiance=dr.select(meets, light.irradiance * self._share, 0.0))
 
-    def may_reach(self, light: SheetLight) -> mi.Bool:
+    def _unfolded(self, p: mi.Point3f, travel_mm: mi.Float | None = None) -> SheetLight:
+        """The sheet's light at points of the OCS, given where they stand while the sensor rests."""
+        if travel_mm is not None:
+            p = mi.Point3f(p - self._pose.object_travel(travel_mm))
+        if self._to_own is None:
+            return self.sheet.at(p)
+        light = self.sheet.at(self._to_own @ mi.Point3f(p))
+        return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
+
+    def _at_rest(self, p: mi.Point3f, travel_mm: mi.Float | None) -> mi.Point3f:
+        """Where points of the travelling OCS, in which a mirror moves, lie in that of the resting sensor."""
+        return mi.Point3f(p if travel_mm is None else p + self._pose.object_travel(travel_mm))
+
+    def may_reach(self, p: mi.Point3f, light: SheetLight) -> mi.Bool:
         """Where the sheet may shine: everywhere, but by way of a mirror only where that sends it."""
-        return mi.Bool(True) if self._mirror is None else light.irradiance > 0
+        if self._mirror is None:
+            return dr.full(mi.Bool, True, dr.width(p))
+        return self._on_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: mi.Point3f, light: SheetLight, travel_mm: mi.Float | None, active: mi.Bool):
         """Whether nothing stands between points of the sensor's OCS and the laser's window."""
         towards = -light.direction
         if self._mirror is None:
             return active & ~self._blocked(objects, p, towards, light.exit_mm, travel_mm, active)
-        t, meets = self._on_mirror(p, towards)
+        t, meets = self._on_mirror(self._at_rest(p, travel_mm), towards)
         active = active & meets & ~self._blocked(objects, p, towards, t, travel_mm, active & meets)
         folded = self._to_face @ towards
         folded.z = -folded.z
@@ -104,7 +120,10 @@ class Light:
         t = -origin.x / direction.x
         light = self.sheet.at(mi.Point3f(origin + direction * t))
         t -= light.distance_mm / dr.dot(direction, light.normal)
-        return t, self.sheet.at(mi.Point3f(origin + direction * t))
+        light = self.sheet.at(mi.Point3f(origin + direction * t))
+        if self._mirror is not None:
+            light = replace(light, irradiance=light.irradiance * self._share)
+        return t, light
 
     def pick_in_sheet(
         self, origin: mi.Point3f, direction: mi.Vector3f, length: mi.Float, u: mi.Float

@@ -62,6 +62,10 @@ class SensorPose:
         """A direction of the OCS in the scene."""
         return self._to_scene @ direction
 
+    def object_travel(self, travel_mm: mi.Float) -> mi.Vector3f:
+        """The sensor's travel as a vector of the OCS."""
+        return self.object_direction(self._direction) * travel_mm
+
     def object_direction(self, direction: mi.Vector3f) -> mi.Vector3f:
         """A direction of the scene in the OCS."""
         return self._to_object @ direction

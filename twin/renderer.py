@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.arrays import to_jit
-from twin.cells import NODE_SPACING_PX, corner_extremes, corner_mean, near_sheet, widened
+from twin.cells import NODE_SPACING_PX, any_corner, corner_extremes, corner_mean, near_sheet, widened
 from twin.effects import ALL, Effects
 from twin.legs import Leg, legs
 from twin.light import Light, Source, lights
@@ -39,6 +39,8 @@ WALK_CELL_PX = 8
 """Side of the cells of multiply scattered light away from the stripe."""
 SAMPLES_AT_ONCE = 2**23
 """More samples are rendered one part after the other; this many take some 100 MB."""
+WALKS_AT_ONCE = 2**21
+"""The same for random walks, which take some 200 MB."""
 CHANGE_SHARE = 2e-3
 """Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
 _MIRRORS = 2
@@ -137,8 +139,8 @@ class Renderer:
         return self._pixels_of(np.any(near, axis=0))
 
     def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None = None) -> mi.Float:
-        """Irradiance of laser light per ray, in W/mm2: the lit surface seen straight, without the light around it."""
-        direct, _ = lights(self._sources, pose)
+        """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
+        direct, _ = lights(self._sources[:1], pose)
         leg = next(self._legs(pose, bundle, travel_mm))
         return leg.weight * self._radiance(pose, leg, direct, travel_mm)
 
@@ -151,13 +153,13 @@ class Renderer:
     def _sigmas(self, light: Light, leg: Leg) -> mi.Float:
         """The light's distance across at the legs' ends in standard deviations; infinity where there is no surface."""
         here = light.at(leg.end())
-        return dr.select(leg.valid & light.may_reach(here), here.distance_mm / here.sigma_mm, dr.inf)
+        return dr.select(leg.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
     def _radiance(self, pose: SensorPose, leg: Leg, sources: list[Light], travel_mm: mi.Float | None) -> mi.Float:
         """Radiance in W/mm2/sr that lit surfaces send back along legs, as it arrives at their beginning."""
         radiance, end, bsdf = mi.Float(0.0), leg.end(), leg.si.bsdf()
         for light in sources:
-            here = light.at(end)
+            here = light.at(end, travel_mm)
             lit = light.reaches(self.objects.scene, end, here, travel_mm, leg.valid & (here.irradiance > 0))
             towards = leg.si.to_local(pose.direction(-here.direction))
             radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), leg.si, towards, lit)[0] * here.irradiance, 0.0)
@@ -181,8 +183,11 @@ class Renderer:
                 if index == 0 and moment is pose and self.effects.haze and self.scattering.coefficient > 0:
                     for light, sigmas in zip(sources, across, strict=True):
                         haze += bundle.weight * self._haze(light, leg, sigmas)
-                dr.eval(depth, haze, *across)
-                near = np.any([near_sheet(sigmas.numpy().reshape(shape)) for sigmas in across], axis=0)
+                reached = [light.may_reach(leg.end(), light.at(leg.end())) for light in sources]
+                dr.eval(depth, haze, *across, *reached)
+                near = np.zeros_like(lit)
+                for sigmas, there in zip(across, reached, strict=True):
+                    near |= near_sheet(sigmas.numpy().reshape(shape)) & any_corner(there.numpy().reshape(shape))
                 if self.effects.defocus and near.any():
                     blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
                     reach = np.maximum(reach, np.where(near, corner_extremes(blur)[1], 0))
@@ -236,12 +241,18 @@ class Renderer:
         self, walker: Walker, rows: np.ndarray, columns: np.ndarray, size_px: int, *, seed: int, walks: int
     ) -> np.ndarray:
         """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
-        count = len(rows) * walks
-        cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, walks)
-        u, v = (mi.sample_tea_float32(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, (2 * seed + k) % 2**32)) for k in (0, 1))
-        x, y = (dr.gather(mi.Float, to_jit(mi.Float, place * size_px), cell) for place in (columns, rows))
-        bundle = self.view.bundle(x + u * size_px - 0.5, y + v * size_px - 0.5)
-        return walker.radiance(bundle, cell, len(rows), seed=seed) / walks
+        x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
+        total = np.zeros(len(rows), np.float32)
+        most = max(1, WALKS_AT_ONCE // len(rows))
+        for part, first in enumerate(range(0, walks, most)):
+            some = min(most, walks - first)
+            count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
+            cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
+            u, v = (_random(count, (place_seed + k) % 2**32) for k in (0, 1))
+            column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
+            bundle = self.view.bundle(column + u * size_px - 0.5, row + v * size_px - 0.5)
+            total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
+        return total / walks
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 
@@ -258,6 +269,8 @@ class Renderer:
         if self.effects.defocus:
             blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
             changes = widened(changes, corner_extremes(blur)[1], cell_px=1)
+        if pose.travel is not None:
+            changes[:] = True  # what moves by may change any pixel
         image = corner_mean(nodes)
         for rows, columns in _parts(*np.nonzero(changes), spp=spp):
             image[rows, columns] = self._fine(self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp)[0]
@@ -279,9 +292,8 @@ class Renderer:
         leg = next(self._legs(pose, bundle, travel_mm))
         lamp = self.sensor.lamp
         level = 1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2)
-        facing = leg.valid & (leg.si.wi.z > 0)
         left = dr.exp(-self.scattering.extinction * dr.select(leg.valid, leg.si.t, dr.inf))
-        radiance = dr.select(facing, self.objects.albedo(leg.si) * left, 0.0)
+        radiance = dr.select(leg.valid, self.objects.albedo(leg.si) * left, 0.0)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += scattered / self.scattering.extinction * (1 - left)
@@ -342,6 +354,11 @@ def _further(sensor: Sensor, laser: Laser, medium: Medium) -> Source:
     """Another laser of the sensor, whose sheet has an OCS of its own."""
     other = sensor.model_copy(update={"laser": laser})
     return Source(Sheet(other, medium), np.linalg.inv(camera_from_object(other)) @ camera_from_object(sensor))
+
+
+def _random(count: int, seed: int) -> mi.Float:
+    """Numbers from 0 to 1 that depend on their index and the seed."""
+    return mi.sample_tea_float32(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, seed))
 
 
 def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -199,6 +199,8 @@ class Motion(Description):
                 raise ValueError(f"direction {vector} has no length")
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
+        if self.speed_mm_per_s > 0 and len(self.lights) > 1:
+            raise ValueError("a moving stage takes one image at each position: name one light, or stop with speed 0")
         return self
 
     def unit_direction(self) -> np.ndarray:
