@@ -38,12 +38,12 @@ class Row:
 
 def at_most(name: str, value: float, unit: str, limit: float) -> Row:
     """A row whose value must not exceed the limit."""
-    return Row(name, round(value, 4), unit, limit, value <= limit)
+    return Row(name, round(float(value), 4), unit, limit, bool(value <= limit))
 
 
 def at_least(name: str, value: float, unit: str, limit: float) -> Row:
     """A row whose value must reach the limit."""
-    return Row(name, round(value, 4), unit, limit, value >= limit)
+    return Row(name, round(float(value), 4), unit, limit, bool(value >= limit))
 
 
 def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: int = 15) -> float:

@@ -201,7 +201,7 @@ def test_light_scattered_any_number_of_times_is_stocks(broad, asymmetry, names):
     stock = stock_irradiance(
         broad, medium, scene, integrator="volpath", max_depth=-1, spp=1024, runs=24, pixel_px=BLOCK_PX
     )
-    twin = twin_irradiance(broad, medium, scene, spp=32, runs=4)
+    twin = twin_irradiance(broad, medium, scene, spp=32, runs=8)
     once = twin_irradiance(broad, medium, scene, *SINGLY, spp=32, runs=1)
     direct = twin_irradiance(broad, medium, scene, *SINGLY, "haze", spp=32, runs=1)[0]
     away = off_stripe(direct)
@@ -245,7 +245,7 @@ def test_light_between_the_sides_of_a_groove_is_stocks(broad, name):
     stock = stock_irradiance(
         broad, CLEAR, scene, integrator=integrator, max_depth=-1, spp=512, runs=24, pixel_px=BLOCK_PX
     )
-    twin = twin_irradiance(broad, CLEAR, scene, spp=64, runs=4)
+    twin = twin_irradiance(broad, CLEAR, scene, spp=64, runs=8)
     direct = twin_irradiance(broad, CLEAR, scene, *SINGLY, spp=64, runs=1)
     for part in (in_stripe(direct[0]), off_stripe(direct[0])):
         assert part.sum() >= 60
