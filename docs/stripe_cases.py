@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.polynomial import polynomial
 
@@ -16,20 +17,20 @@ from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor
 from uwlts.stripe import StripeOptions, extract_stripe
 
-DEFAULT = "zero crossing"
+DEFAULT, MASS, FILTERED = "zero crossing (default)", "centre of mass", "5x5 mean, quadratic"
 METHODS = {
     DEFAULT: StripeOptions(),
-    "centre of mass": StripeOptions(method="centre-of-mass"),
+    MASS: StripeOptions(method="centre-of-mass"),
     "quadratic": StripeOptions(method="quadratic"),
     # A mean of five pixels has a standard deviation of sqrt((25 - 1) / 12) px.
-    "5x5 low-pass, quadratic": StripeOptions(method="quadratic", smoothing_px=math.sqrt(2), smoothing_lines=5),
+    FILTERED: StripeOptions(method="quadratic", smoothing_px=math.sqrt(2), smoothing_lines=5),
 }
-SPP = 64
+VERTEX = "5x5 mean, parabola through 3 px"
 PLATE = {"kind": "plate", "width_mm": 200.0, "height_mm": 300.0, "finish": "painted"}
 """The thesis's painted plane, so large that no end of the stripe is in view."""
 FACING = math.cos(math.radians(60))
 """Surfaces turned farther away from the laser are left out: there the stripe ends, which is a matter of its own."""
-CROP_PX = 36
+CROP_PX, FAR_OFF_PX = 28, 2.0
 _SCALE_Z, _SCALE_DEGREE = np.arange(-80.0, 131.0, 15.0), 5
 
 
@@ -44,7 +45,8 @@ class Case:
     thing: str = "plane"
     z_mm: float = 0.0
     effects: Effects = ALL
-    frames: int = 6
+    frames: int = 5
+    spp: int = 64
     medium: str = "water"
     water: str | float | None = None
     level: float | None = None
@@ -52,10 +54,11 @@ class Case:
     laser: tuple[tuple[str, float], ...] = ()
 
     def scene(self) -> Scene:
-        """The shipped scene, moved to Z, with so many frames spread over its scan."""
+        """The shipped scene, moved to Z, with so many frames evenly spread over its scan."""
         shipped = load_scene(self.thing).motion
-        travel = (shipped.count - 1) * shipped.step_mm
-        motion = {"start_mm": shipped.start_mm, "step_mm": travel / max(1, self.frames - 1), "count": self.frames}
+        step = shipped.count * shipped.step_mm / self.frames
+        start = shipped.start_mm + (step - shipped.step_mm) / 2
+        motion = {"start_mm": start, "step_mm": step, "count": self.frames}
         changes: dict[str, Any] = {"motion": motion, "medium": self.medium, "placement": "here"}
         changes["placements"] = {"here": {"position_mm": [0.0, 0.0, self.z_mm]}}
         if self.water is not None:
@@ -104,7 +107,8 @@ class Frames:
 class Spread:
     """Bias (median), standard deviation and its standard error from frame to frame; px, and mm along the normal.
 
-    ``robust_mm`` is the standard deviation from the median absolute deviation, ``found`` the share of lines found.
+    ``robust`` is the standard deviation from the median absolute deviation; ``found`` is the share of lines found,
+    ``far_off`` that of centres more than `FAR_OFF_PX` from the truth.
     """
 
     bias_px: float
@@ -116,18 +120,20 @@ class Spread:
     robust_px: float
     robust_mm: float
     found: float
+    far_off: float
 
     @classmethod
     def of(cls, error_px: np.ndarray, error_mm: np.ndarray, *, found: float) -> "Spread":
         numbers: dict[str, float] = {}
         for unit, error in (("px", error_px), ("mm", error_mm)):
             middle = np.nanmedian(error)
-            each = np.nanstd(error, axis=1)
+            each = np.array([np.nanstd(line) for line in error if np.isfinite(line).any()])
             numbers[f"bias_{unit}"] = float(middle)
             numbers[f"std_{unit}"] = float(np.nanstd(error))
             numbers[f"std_{unit}_error"] = float(each.std(ddof=1) / math.sqrt(len(each))) if len(each) > 1 else math.nan
             numbers[f"robust_{unit}"] = float(MAD_TO_STD * np.nanmedian(np.abs(error - middle)))
-        return cls(**numbers, found=found)
+        far_off = float((np.abs(error_px[np.isfinite(error_px)]) > FAR_OFF_PX).mean())
+        return cls(**numbers, found=found, far_off=far_off)
 
 
 @cache
@@ -138,18 +144,19 @@ def measure(case: Case) -> Frames:
     from twin.truth import true_stripe
 
     sensor, scene = case.sensor(), case.scene()
-    studio = Studio(sensor, scene, Options(spp=SPP, effects=case.effects))
+    studio = Studio(sensor, scene, Options(spp=case.spp, effects=case.effects))
     if case.level is not None:
         fixed = studio.exposure_ms["laser"] * case.level / sensor.exposure.auto_level
         exposure = sensor.exposure.model_copy(update={"laser_ms": fixed})
         studio = Studio(sensor.model_copy(update={"exposure": exposure}), scene, studio.options)
-    truths, stripes, crop, corner = [], [], None, (0, 0)
+    truths, centres, widths, crop, corner = [], [], [], None, (0, 0)
     for index, shot in enumerate(scene.motion.shots()):
         truth, image = true_stripe(studio.renderer, studio.pose(shot)), studio.image(shot, index)
         truths.append(truth)
-        stripes.append(
-            {name: extract_stripe(image, stripe_along="width", options=options) for name, options in METHODS.items()}
-        )
+        found = {name: extract_stripe(image, stripe_along="width", options=wanted) for name, wanted in METHODS.items()}
+        widths.append(found[DEFAULT].width_px)
+        centres.append({name: stripe.centre_px for name, stripe in found.items()})
+        centres[-1][VERTEX] = np.where(np.isfinite(found[DEFAULT].centre_px), _vertex(image), np.nan)
         if crop is None:
             middle = image.shape[1] // 2
             corner = (int(np.nan_to_num(truth.centre_px[middle])) - CROP_PX // 2, middle)
@@ -160,12 +167,20 @@ def measure(case: Case) -> Frames:
     step = _step_per_px(case, point[..., 2])
     used = np.isfinite(truth_px) & (-normal[..., 2] >= FACING)
     return Frames(
-        error_px={name: np.stack([found[name].centre_px for found in stripes]) - truth_px for name in METHODS},
+        error_px={name: np.stack([found[name] for found in centres]) - truth_px for name in centres[0]},
         mm_per_px=(step * normal).sum(axis=-1),
         step_mm=step, point_mm=point, used=used, truth_px=truth_px,
-        width_px=float(np.nanmedian(np.where(used, [found[DEFAULT].width_px for found in stripes], np.nan))),
+        width_px=float(np.nanmedian(np.where(used, widths, np.nan))),
         exposure_ms=studio.exposure_ms["laser"], crop=crop, crop_at=corner,
     )  # fmt: skip
+
+
+def _vertex(image: np.ndarray) -> np.ndarray:
+    """Vertex (L,) of the parabola through each column's highest pixel and its neighbours, after a 5x5 mean."""
+    smooth = cv2.blur(image.astype(np.float32), (5, 5))
+    top, column = smooth.argmax(axis=0).clip(1, len(smooth) - 2), np.arange(smooth.shape[1])
+    before, here, after = (smooth[top + shift, column] for shift in (-1, 0, 1))
+    return top + 0.5 * (after - before) / np.maximum(2 * here - before - after, np.finfo(np.float32).tiny)
 
 
 def _step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:

@@ -108,7 +108,7 @@ def _panel(panel: Panel, left: float, clip: str) -> str:
                      f'fill="{band.colour}" clip-path="url(#{clip})"/>')  # fmt: skip
     for mark in panel.x_ticks or x.ticks():
         at = x.at(mark)
-        parts += [_line(at, y.start, at, y.end, FAINT), _text(f"{mark:g}", at, y.start + 17)]
+        parts += [_line(at, y.start, at, y.end, FAINT), _text(_number(mark), at, y.start + 17)]
     for mark in y.ticks():
         at = y.at(mark)
         parts += [_line(x.start, at, x.end, at, FAINT), _text(_number(mark), x.start - 6, at + 4, "end")]
