@@ -320,11 +320,11 @@ def test_the_mean_does_not_depend_on_the_number_of_walks(coarse):
 def test_images_hold_what_the_walks_find(tiny):
     # Cells of pixels and their interpolation must keep the light: over a region it is that of walks pixel by pixel.
     renderer = Renderer(tiny, clear(0.3), corner_scene(), effects=BOUNCED)
-    frames = [renderer.laser_frame(sensor_at(), spp=64, seed=seed).scattered for seed in range(4)]
+    frames = [renderer.laser_frame(sensor_at(), spp=64, seed=seed).scattered for seed in range(12)]
     rows, columns = np.arange(16, 112), np.arange(40, 120)
     sums = [frame[16:112, 40:120].sum(dtype=float) for frame in frames]
     y, x = (g.ravel() for g in np.meshgrid(rows, columns, indexing="ij"))
     found, error = walked(renderer, np.stack([x, y], axis=1).astype(float), 128, seed=9)
-    scatter = math.hypot(np.std(sums, ddof=1) / 2, math.sqrt((error**2).sum()))
+    scatter = math.hypot(np.std(sums, ddof=1) / math.sqrt(12), math.sqrt((error**2).sum()))
     assert scatter < 0.08 * np.mean(sums)
     assert np.mean(sums) == pytest.approx(found.sum(), abs=5 * scatter)
