@@ -242,7 +242,7 @@ class Renderer:
     ) -> np.ndarray:
         """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
         x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
-        total = np.zeros(len(rows), np.float32)
+        total = np.zeros(len(rows))
         most = max(1, WALKS_AT_ONCE // len(rows))
         for part, first in enumerate(range(0, walks, most)):
             some = min(most, walks - first)

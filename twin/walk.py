@@ -83,9 +83,9 @@ class Walker:
     def radiance(self, bundle: Bundle, cell: mi.UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
         width = dr.width(cell)
-        total = dr.zeros(mi.Float, cells)
+        total = np.zeros(cells)
         if not (self._scatters or self.effects.secondary_light):
-            return total.numpy()
+            return total
         walks = _Walks(
             bundle.origin, bundle.direction, dr.full(mi.Float, 1.0, width), bundle.weight, cell,
             dr.arange(mi.UInt32, width), dr.zeros(mi.Float, width), dr.full(mi.Bool, False, width),
@@ -93,8 +93,9 @@ class Walker:
         )  # fmt: skip
         for step in range(_STEPS):
             walks, found, alive = self._step(walks, dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32))
-            dr.scatter_add(total, found, walks.cell, found != 0, dr.ReduceMode.Local)
-            dr.eval(total, alive, *(getattr(walks, f.name) for f in fields(walks)))
+            dr.eval(found, alive, *(getattr(walks, f.name) for f in fields(walks)))
+            # Dr.Jit's threads would add in any order, which rounds differently every time.
+            total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
             kept = dr.compress(alive)
             if dr.width(kept) == 0:
                 break
@@ -103,7 +104,7 @@ class Walker:
                 kept = mi.UInt32([kept[0], kept[0]])
                 walks.weight *= 0.5
             walks = walks.of(kept)
-        return total.numpy()
+        return total
 
     def _step(self, walks: _Walks, seed: mi.UInt32) -> tuple[_Walks, mi.Float, mi.Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
