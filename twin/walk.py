@@ -215,9 +215,10 @@ class Walker:
             active &= ~walks.reflected
         active = light.reaches(self.objects.scene, end, here, None, active)
         radiance = bsdf.eval(mi.BSDFContext(), si, towards, active)[0] * here.irradiance
-        by_walk = walks.density * dr.abs(mi.Frame3f.cos_theta(si.wi)) / dr.square(si.t)
-        by_light = self._light_density(light, here, mi.Frame3f.cos_theta(towards))
-        return dr.select(active, radiance * by_walk / (by_walk + by_light), 0.0)
+        # Both densities per sr: per mm2, that of a walk along its own surface has no bound.
+        by_walk = walks.density * dr.abs(mi.Frame3f.cos_theta(si.wi))
+        by_light = self._light_density(light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
+        return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
 
     def _light_density(self, light: Light, here: object, cosine: mi.Float) -> mi.Float:
         """Density per mm2 of the lit points that `_connected` draws: the share of the power that falls there."""
@@ -246,7 +247,7 @@ class Walker:
         by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
         way = here.exit_mm + distance
         light_there = light.sheet.power_w * sent * dr.exp(-self.scattering.extinction * way) / dr.square(distance)
-        return dr.select(active, value * light_there * by_light / (by_light + by_walk), 0.0)
+        return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
     def _free_path(self, length: mi.Float, hit: mi.Bool, rng: mi.PCG32) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Whether walks are scattered before the surface, how far along they then are, and the share of light left.
