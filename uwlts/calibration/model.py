@@ -62,8 +62,9 @@ class SheetModel(Description):
 class Calibration(Description):
     """A calibrated sensor.
 
-    ``window`` is None where none stands in the light's way, or where its effect in air was left to the distortion and
-    no calibration in water has been made. ``camera_from_object`` is the 4x4 matrix ``T_camera_object`` of the OCS: X
+    ``window`` is None where none stands in the light's way, or where its effect was left to focal length and
+    distortion. Without a window the calibration holds in the kind of medium in which the target was seen,
+    ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix ``T_camera_object`` of the OCS: X
     normal to the sheet, Z along the laser's axis, Y along the stripe. ``stripe_along`` is as in the sensor description.
     ``residuals`` are named figures of each step, ``provenance`` tells what the calibration was made from.
     """
@@ -71,6 +72,7 @@ class Calibration(Description):
     sensor_name: str
     stripe_along: Literal["width", "height"]
     wavelength_nm: Positive
+    medium_kind: Literal["air", "fresh", "sea", "custom"] = "air"
     camera: CameraModel
     window: WindowModel | None
     sheet: SheetModel

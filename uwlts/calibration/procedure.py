@@ -19,7 +19,7 @@ from uwlts.calibration.window import WindowSolution, label_step, solve_window
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.placement import camera_from_object, laser_pose
-from uwlts.sensor import Sensor
+from uwlts.sensor import Sensor, Window
 from uwlts.stripe import StripeOptions
 from uwlts.targets import CircleTarget, Target
 
@@ -89,6 +89,40 @@ class CalibrationResult:
     warnings: list[str]
 
 
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All that the captures of a calibration show.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        As the captures of the target describe it.
+    medium_kind : str
+        Kind of the medium in which the target was seen.
+    stage_direction : (3,)
+        Nominal direction of the stage before the target, in the OCS.
+    approaching : bool or None
+        Whether the stage moves the sensor towards the target; None where that does not matter.
+    air : AirEvidence
+    plate : Window or None
+        Description of the camera's window before the step standard; None without step captures.
+    steps : list of StepEvidence
+    sources : dict
+        What the captures say of themselves, for the calibration's provenance.
+    warnings : list of str
+    """
+
+    sensor: Sensor
+    medium_kind: str
+    stage_direction: np.ndarray
+    approaching: bool | None
+    air: AirEvidence
+    plate: Window | None
+    steps: list[StepEvidence]
+    sources: dict[str, Any]
+    warnings: list[str]
+
+
 def calibrate(
     air: Sequence[Capture],
     steps: Sequence[Capture] = (),
@@ -96,13 +130,15 @@ def calibrate(
     options: CalibrationOptions | None = None,
     progress: Progress | None = None,
 ) -> CalibrationResult:
-    """Calibrate a sensor from its captures; without step captures for use in air only.
+    """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
 
     Parameters
     ----------
     air : sequence of Capture
         A target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
-        the target, those with the laser on, at the same stage positions, the stripe on it.
+        the target, those with the laser on, at the same stage positions, the stripe on it. Seen through the window in
+        another medium, and without step captures, they give the calibration of a single viewpoint: refraction goes
+        into focal length and distortion.
     steps : sequence of Capture
         A step standard in the medium of use.
     options : CalibrationOptions
@@ -116,31 +152,64 @@ def calibrate(
         A capture does not describe its target or its step standard.
     """
     options = CalibrationOptions() if options is None else options
+    return solve(gather(air, steps, options=options, progress=progress), options=options)
+
+
+def gather(
+    air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
+) -> Evidence:
+    """Find the target, the stripes on it and those on the step standard in all images; errors as for `calibrate`."""
     sensor = _common_sensor([*air, *steps])
-    evidence = air_evidence(air, stripe=options.stripe, progress=progress)
-    if not evidence.images:
-        raise CalibrationError(f"the target was found in no image; {'; '.join(evidence.warnings[:3])}")
-    warnings = [*evidence.warnings, *_window_warnings(air, steps, options)]
-    camera, unbiased = _camera(evidence, sensor, air, options)
-    margin = lattice_spacing(evidence.target) / 2 if options.margin_mm is None else options.margin_mm
+    media = {capture.header.medium.kind for capture in air}
+    if len(media) > 1 or (steps and media != {"air"}):
+        raise CalibrationError(
+            f"the target was seen in {' and '.join(sorted(media))}: images of it are taken in air if a step standard is "
+            "to find the window, else all in the medium of use"
+        )
+    found = air_evidence(air, stripe=options.stripe, progress=progress)
+    if not found.images:
+        raise CalibrationError(f"the target was found in no image; {'; '.join(found.warnings[:3])}")
+    warnings = [*found.warnings, *_window_warnings(air, steps, options)]
+    on_steps: list[StepEvidence] = []
+    if steps:
+        on_steps, left_out = step_evidence(
+            steps, medium_index=options.medium_index, stripe=options.stripe, progress=progress
+        )
+        warnings += left_out
+    return Evidence(
+        sensor=sensor, medium_kind=media.pop(), stage_direction=np.array(air[0].header.stage_direction),
+        approaching=None if options.poses == "free" else _approaching(air), air=found,
+        plate=steps[0].header.sensor.camera.window if steps else None, steps=on_steps,
+        sources=_sources(air, steps), warnings=warnings,
+    )  # fmt: skip
+
+
+def solve(
+    evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None
+) -> CalibrationResult:
+    """Calibrate from what the captures show; ``start`` is a camera for nearly the same evidence. Errors: `calibrate`."""
+    sensor, found = evidence.sensor, evidence.air
+    camera, unbiased = _camera(evidence, options, start)
+    margin = lattice_spacing(found.target) / 2 if options.margin_mm is None else options.margin_mm
     stripe_points = points_on_target(
-        camera.model, evidence.stripes, camera.target_poses, extent_mm=plate_extent(evidence.target), margin_mm=margin
+        camera.model, found.stripes, camera.target_poses, extent_mm=plate_extent(found.target), margin_mm=margin
     )
     pose = laser_pose(sensor)
     sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
-    warnings += _turn_warnings(camera, sheet, sensor, air)
+    warnings = [*evidence.warnings, *_turn_warnings(camera, sheet, evidence)]
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
         wavelength_nm=sensor.laser.wavelength_nm,
+        medium_kind=evidence.medium_kind,
         camera=camera.model,
         window=None,
         sheet=sheet.model,
         camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
     )
     used, window = [], None
-    if steps:
-        used, window, left_out = _window(calibration, sensor, steps, options, progress)
+    if evidence.plate is not None:
+        used, window, left_out = _window(calibration, evidence, options)
         warnings += left_out
     figures: dict[str, Any] = {
         "camera": camera_figures(camera, unbiased),
@@ -148,15 +217,16 @@ def calibrate(
     }
     if window is not None:
         figures["window"] = window_figures(window, [step.source for step in used])
+    how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
         update={
             "window": None if window is None else window.model,
             "residuals": figures,
-            "provenance": _provenance(air, steps, options, warnings),
+            "provenance": evidence.sources | how | {"warnings": warnings},
         }
     )
     bias = None if unbiased is None else unbiased.bias_px
-    return CalibrationResult(calibration, evidence, camera, bias, stripe_points, sheet, used, window, warnings)
+    return CalibrationResult(calibration, found, camera, bias, stripe_points, sheet, used, window, warnings)
 
 
 def _common_sensor(captures: Sequence[Capture]) -> Sensor:
@@ -178,20 +248,20 @@ def _common_sensor(captures: Sequence[Capture]) -> Sensor:
 
 
 def _camera(
-    evidence: AirEvidence, sensor: Sensor, air: Sequence[Capture], options: CalibrationOptions
+    evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None
 ) -> tuple[CameraSolution, UnbiasedSolution | None]:
-    approaching = options.poses == "free" or _approaching(air)
+    image = evidence.sensor.camera
 
-    def solve(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
+    def solved(images: Sequence[TargetImage], better: CameraSolution | None) -> CameraSolution:
         return solve_camera(
-            images, width_px=sensor.camera.width_px, height_px=sensor.camera.height_px, poses=options.poses,
-            approaching=approaching, options=options.camera, start=start,
+            images, width_px=image.width_px, height_px=image.height_px, poses=options.poses,
+            approaching=evidence.approaching is not False, options=options.camera, start=better or start,
         )  # fmt: skip
 
-    target: Target = evidence.target
+    target: Target = evidence.air.target
     if not (options.correct_circles and isinstance(target, CircleTarget)):
-        return solve(evidence.images, None), None
-    unbiased = solve_without_bias(evidence.images, solve, diameter_mm=target.diameter_mm)
+        return solved(evidence.air.images, None), None
+    unbiased = solve_without_bias(evidence.air.images, solved, diameter_mm=target.diameter_mm)
     return unbiased.solution, unbiased
 
 
@@ -204,31 +274,15 @@ def _approaching(air: Sequence[Capture]) -> bool:
             f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in sorted(along))}: use "
             "poses='free' with a tilted target"
         )
-    return min(along) > 0
+    return bool(min(along) > 0)
 
 
 def _window(
-    calibration: Calibration,
-    sensor: Sensor,
-    captures: Sequence[Capture],
-    options: CalibrationOptions,
-    progress: Progress | None,
+    calibration: Calibration, evidence: Evidence, options: CalibrationOptions
 ) -> tuple[list[StepEvidence], WindowSolution, list[str]]:
-    plate = captures[0].header.sensor.camera.window
-    normal = tuple(plate.normal().tolist())
-    if options.refractions == 2:
-        glass = plate.index(sensor.laser.wavelength_nm)
-        window = WindowModel(
-            refractions=2, distance_mm=plate.distance_mm, normal=normal, thickness_mm=plate.thickness_mm,
-            glass_index=glass,
-        )  # fmt: skip
-    else:
-        window = WindowModel(refractions=1, distance_mm=plate.distance_mm, normal=normal)
-    found, warnings = step_evidence(
-        captures, medium_index=options.medium_index, stripe=options.stripe, progress=progress
-    )
-    used, images = [], []
-    for step in found:
+    window = nominal_window(evidence.plate, evidence.sensor, refractions=options.refractions)
+    used, images, warnings = [], [], []
+    for step in evidence.steps:
         try:
             images.append(
                 label_step(
@@ -245,8 +299,22 @@ def _window(
         except EvaluationError as error:
             warnings.append(f"{step.source}: left out, {error}")
     if not images:
-        raise CalibrationError(f"no step image can be used for the window's distance; {'; '.join(warnings[:3])}")
+        raise CalibrationError(
+            "no step image can be used for the window's distance; "
+            + "; ".join([*evidence.warnings, *warnings][:3])
+        )
     return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
+
+
+def nominal_window(plate: Window, sensor: Sensor, *, refractions: Literal[1, 2]) -> WindowModel:
+    """A window as described, as the reconstruction sees it: a glass plate, or one interface."""
+    normal = tuple(plate.normal().tolist())
+    if refractions == 1:
+        return WindowModel(refractions=1, distance_mm=plate.distance_mm, normal=normal)
+    return WindowModel(
+        refractions=2, distance_mm=plate.distance_mm, normal=normal, thickness_mm=plate.thickness_mm,
+        glass_index=plate.index(sensor.laser.wavelength_nm),
+    )  # fmt: skip
 
 
 def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
@@ -265,12 +333,12 @@ def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: 
     return []
 
 
-def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor, air: Sequence[Capture]) -> list[str]:
+def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:
     warnings = []
     if sheet.turn_rad > _LARGEST_USUAL_TURN:
         warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")
     if camera.stage_direction is not None:
-        nominal = camera_from_object(sensor)[:3, :3] @ np.array(air[0].header.stage_direction)
+        nominal = camera_from_object(evidence.sensor)[:3, :3] @ evidence.stage_direction
         cosine = camera.stage_direction @ nominal / np.linalg.norm(nominal)
         turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
         if turn > np.degrees(_LARGEST_USUAL_TURN):
@@ -278,9 +346,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, sensor: Sensor,
     return warnings
 
 
-def _provenance(
-    air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions, warnings: list[str]
-) -> dict[str, Any]:
+def _sources(air: Sequence[Capture], steps: Sequence[Capture]) -> dict[str, Any]:
     return {
         "source": "calibration from captures",
         "air_captures": [{"file": capture.path.name, "name": capture.header.name} for capture in air],
@@ -288,8 +354,4 @@ def _provenance(
             {"file": capture.path.name, "name": capture.header.name, "medium": capture.header.medium_name}
             for capture in steps
         ],
-        "refractions": options.refractions,
-        "poses": options.poses,
-        "medium_index": options.medium_index,
-        "warnings": warnings,
     }
