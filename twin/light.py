@@ -46,10 +46,10 @@ class Light:
     def in_own_frame(self, origin: mi.Point3f, direction: mi.Vector3f) -> tuple[mi.Point3f, mi.Vector3f]:
         """A ray of the sensor's OCS in the sheet's own, where the nominal sheet is X = 0."""
         if self._mirror is not None:
-            origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ direction
+            origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ mi.Vector3f(direction)
         if self._to_own is None:
             return origin, direction
-        return self._to_own @ mi.Point3f(origin), self._to_own @ direction
+        return self._to_own @ mi.Point3f(origin), self._to_own @ mi.Vector3f(direction)
 
     def at(self, p: mi.Point3f, travel_mm: mi.Float | None = None) -> SheetLight:
         """The sheet's light at points of the sensor's OCS, shadows aside; nothing where the mirror does not send it."""

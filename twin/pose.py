@@ -56,11 +56,12 @@ class SensorPose:
         start = self._to_scene @ mi.Point3f(origin)
         if travel_mm is not None:
             start += self._direction * travel_mm
-        return mi.Ray3f(mi.Point3f(start), self._to_scene @ direction)
+        return mi.Ray3f(mi.Point3f(start), self.direction(direction))
 
     def direction(self, direction: mi.Vector3f) -> mi.Vector3f:
         """A direction of the OCS in the scene."""
-        return self._to_scene @ direction
+        # The difference of two points is a point to Dr.Jit, which a transform would also shift.
+        return self._to_scene @ mi.Vector3f(direction)
 
     def object_travel(self, travel_mm: mi.Float) -> mi.Vector3f:
         """The sensor's travel as a vector of the OCS."""
@@ -68,7 +69,7 @@ class SensorPose:
 
     def object_direction(self, direction: mi.Vector3f) -> mi.Vector3f:
         """A direction of the scene in the OCS."""
-        return self._to_object @ direction
+        return self._to_object @ mi.Vector3f(direction)
 
 
 def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:
