@@ -47,6 +47,8 @@ _MIRRORS = 2
 """How many mirrors the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
+_LAMP_BLOCK_PX = 2
+"""Under the lamp, so many pixels square take samples at different places."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
 
@@ -273,7 +275,9 @@ class Renderer:
             changes[:] = True  # what moves by may change any pixel
         image = corner_mean(nodes)
         for rows, columns in _parts(*np.nonzero(changes), spp=spp):
-            image[rows, columns] = self._fine(self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp)[0]
+            image[rows, columns] = self._fine(
+                self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp, block=_LAMP_BLOCK_PX
+            )[0]
         return image
 
     def _evenly_lit_sums(
@@ -315,14 +319,20 @@ class Renderer:
 
     def _fine(
         self, light: Callable[..., tuple[mi.Float, ...]], pose: SensorPose, rows: np.ndarray, columns: np.ndarray,
-        *rest: object, spp: int,
+        *rest: object, spp: int, block: int = 1,
     ) -> np.ndarray:  # fmt: skip
-        """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray."""
+        """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray.
+
+        Pixels of a square ``block`` share the points of one finer lattice, so that a blurred edge shows no steps.
+        """
         x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
         index = dr.arange(mi.UInt32, len(rows) * spp)
         pixel, sample = index // spp, index % spp
+        if block > 1:
+            place = to_jit(mi.UInt32, (rows % block) * block + columns % block)
+            sample = sample * block**2 + dr.gather(mi.UInt32, place, pixel)
         axes = 2 + 2 * self.effects.defocus + (pose.travel is not None)
-        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp, axes)]
+        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp * block**2, axes)]
         row = dr.gather(mi.Float, y, pixel)
         pupil = None
         if self.effects.defocus:

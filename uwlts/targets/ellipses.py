@@ -10,20 +10,23 @@ from uwlts.targets.edges import PROFILES, REACH_OVER_MINOR_AXIS, rim_directions,
 SAMPLES = 11
 PASSES = 2
 
-# Reach of an edge profile on either side of the ellipse. Two and a half pixels hold the edge of a usual lens; inside a
-# small blob half the minor semi-axis is all there is before the opposite edge is felt.
-REACH_PX = 2.5
+# Reaches of an edge profile on either side of the ellipse, tried in turn. Two and a half pixels hold the edge of a lens
+# in focus, six that of one out of focus; inside a small blob half the minor semi-axis is all there is before the
+# opposite edge is felt. The next is tried where this share of the blobs shows no sharp edge.
+REACHES_PX = (2.5, 6.0)
+MISSED_SHARE = 0.2
 
-# Largest rms distance of the edge from its ellipse: absolute, as a share of the mean radius, against what the noise of
-# a single pixel does to an edge, and against the median of all blobs, which have about the same noise and blur.
-MAX_RESIDUAL_PX = 0.15
+# Largest rms distance of the edge from its ellipse: as a share of the reach (0.15 px of 2.5 px) and of the mean radius,
+# against what the noise of a single pixel does to an edge, and against the median of all blobs, which have about the
+# same noise and blur.
+MAX_RESIDUAL_OVER_REACH = 0.06
 MAX_RESIDUAL_OVER_RADIUS = 0.01
 MAX_RESIDUAL_OVER_NOISE = 1.5
 MAX_RESIDUAL_OVER_MEDIAN = 2.5
 RESIDUAL_FLOOR_PX = 0.03
 
-# Slope over contrast, 1/px, of the edge under a blur of 4 px: a softer edge is not one to measure on.
-MIN_SHARPNESS = 0.1
+# Least slope over contrast of an edge, times the reach; at a reach of 2.5 px it is that under a Gaussian blur of 4 px.
+MIN_SHARPNESS_TIMES_REACH = 0.25
 
 # Largest departure of one profile's contrast from the smooth course around the blob. Where blur fills a small blob, its
 # inside level differs between the ends and the flanks of the ellipse.
@@ -73,7 +76,8 @@ def fit_ellipses(image, blobs):
     ellipse. Both levels follow a constant and a first harmonic around the blob, so that shading does not shift the
     centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
     least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the plate's edge show a large residual or
-    an uneven contrast and are left out; nothing is downweighted.
+    an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
+    over a longer way.
 
     Parameters
     ----------
@@ -87,23 +91,33 @@ def fit_ellipses(image, blobs):
     """
     grey = image.astype(np.float32)
     noise = max(noise_level(grey), 0.5)
+    best = _fitted(grey, blobs, REACHES_PX[0], noise)
+    for reach in REACHES_PX[1:]:
+        if len(best) >= (1 - MISSED_SHARE) * len(blobs.centres):
+            break
+        best = max(best, _fitted(grey, blobs, reach, noise), key=len)
+    return best
+
+
+def _fitted(grey, blobs, reach, noise):
+    """Ellipses of a float32 image (H, W) with edges sampled over one reach in px."""
     centres, shapes = blobs.centres, blobs.shapes
     kept = np.ones(len(centres), bool)
     for _ in range(PASSES):
-        kept = kept & _inside(grey.shape, centres, shapes)
+        kept = kept & _inside(grey.shape, centres, shapes, reach)
         centres, shapes = centres[kept], shapes[kept]
         if len(centres) == 0:
             break
-        edge = _edges(grey, centres, shapes, bright=blobs.bright, noise=noise)
+        edge = _edges(grey, centres, shapes, reach, bright=blobs.bright, noise=noise)
         centres, shapes, residual, fitted = _moved(centres, shapes, edge)
-        kept = edge.whole & fitted & _inside(grey.shape, centres, shapes)
+        kept = edge.whole & fitted & _inside(grey.shape, centres, shapes, reach)
     if len(centres) == 0:
         empty = np.empty(0)
         return Ellipses(np.empty((0, 2)), np.empty((0, 2, 2)), empty, empty, empty, blobs.bright)
     found = Ellipses(centres, shapes, residual, edge.contrast, edge.sharpness, blobs.bright)[kept]
     radii = np.sqrt(np.linalg.det(found.shapes))
-    from_noise = noise / (found.contrast * np.maximum(found.sharpness, MIN_SHARPNESS))
-    limit = np.maximum(MAX_RESIDUAL_PX, MAX_RESIDUAL_OVER_RADIUS * radii)
+    from_noise = noise / (found.contrast * np.maximum(found.sharpness, MIN_SHARPNESS_TIMES_REACH / reach))
+    limit = np.maximum(MAX_RESIDUAL_OVER_REACH * reach, MAX_RESIDUAL_OVER_RADIUS * radii)
     round_enough = found.residual_px <= np.maximum(limit, MAX_RESIDUAL_OVER_NOISE * from_noise)
     if round_enough.any():
         usual = np.median(found.residual_px[round_enough])
@@ -121,19 +135,19 @@ class _Edges:
     whole: np.ndarray
 
 
-def _inside(shape, centres, shapes):
+def _inside(shape, centres, shapes, reach):
     """Whether the profiles of ellipses stay within the image, (N,) bool."""
-    half_width = np.sqrt((shapes**2).sum(2)) + REACH_PX
+    half_width = np.sqrt((shapes**2).sum(2)) + reach
     limit = np.array([shape[1], shape[0]]) - 1.001
     return (centres - half_width >= 0).all(1) & (centres + half_width <= limit).all(1)
 
 
-def _edges(grey, centres, shapes, *, bright, noise):
+def _edges(grey, centres, shapes, longest, *, bright, noise):
     directions = rim_directions()
     rim = centres[:, None] + directions @ shapes
     normals = directions @ np.linalg.inv(shapes)
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    reach = np.minimum(REACH_PX, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(shapes)[:, 0])
+    reach = np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(shapes)[:, 0])
     offsets = np.linspace(-1, 1, SAMPLES)
     steps = reach[:, None] * offsets
     profiles = sample(grey, rim[:, :, None] + normals[:, :, None] * steps[:, None, :, None])
@@ -145,7 +159,7 @@ def _edges(grey, centres, shapes, *, bright, noise):
     inner_level, outer_level = inner @ smoother, outer @ smoother
     contrast = inner_level - outer_level
     departure = np.abs(inner - outer - contrast)
-    share = np.where(reach < REACH_PX, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
+    share = np.where(reach < longest, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
     whole = (contrast > 0).all(1) & (departure <= np.maximum(share[:, None] * contrast, 6 * noise)).all(1)
     excess = profiles - (inner_level + outer_level)[:, :, None] / 2
     distance, crossed = _crossing(excess)
