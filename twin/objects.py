@@ -15,7 +15,8 @@ import trimesh
 from twin.arrays import to_jit
 from twin.finish import albedo_parts, finish_bsdf, square_on
 from twin.pattern import register_circle_pattern
-from twin.scene import AnyObject, Block, Mesh, Pipe, Scene, Sphere
+from twin.scene import AnyObject, Block, CirclePlate, FreeForm, Head, Mesh, Pipe, Scene, Sphere
+from twin.shapes import bowed_plate, head_surface, weld_surface
 from uwlts.errors import DescriptionError
 
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -115,12 +116,14 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
         "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
         "polarisation": [thing.polarisation() for thing in things],
         "roughness_um": [thing.rms_height_um() for thing in things],
-        "two_sided": [isinstance(thing, Mesh) for thing in things],
+        "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],
     }
     # Optimised, Mitsuba would merge meshes of equal BSDF into one shape, whatever else differs between the objects.
-    whole = mi.load_dict({"type": "scene"} | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
+    # Embree's faster test lets one ray in some ten thousand slip through the seam between two facets.
+    whole = {"type": "scene", "embree_use_robust_intersections": True}
+    whole = mi.load_dict(whole | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
     return Objects(
         scene=whole,
         mirrors=tuple(
@@ -144,7 +147,10 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
     """An object at its pose (4, 4) in the scene."""
     match thing:
         case Sphere():
-            matrix = pose @ _scaled(*[thing.diameter_mm / 2] * 3)
+            matrix = pose.copy()
+            if thing.texture is None:
+                matrix[:3, :3] = np.eye(3)  # Mitsuba takes a turned sphere's rounding for shear
+            matrix = matrix @ _scaled(*[thing.diameter_mm / 2] * 3)
             kind = "sphere"
         case Block():
             matrix = pose @ _scaled(*(side / 2 for side in thing.size_mm))
@@ -154,7 +160,9 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
             along[0, 3] = -thing.length_mm / 2
             matrix = pose @ along
             kind = "cylinder"
-        case Mesh():
+        case CirclePlate() if thing.bow_mm != 0:
+            return _mesh(thing, pose, bsdf)
+        case Mesh() | FreeForm():
             return _mesh(thing, pose, {"type": "twosided", "bsdf": bsdf})
         case _:
             matrix = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1)
@@ -162,19 +170,13 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
     return mi.load_dict({"type": kind, "to_world": _to_world(matrix), "bsdf": bsdf})
 
 
-def _mesh(thing: Mesh, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
-    """A surface from a file with its vertices already in scene coordinates."""
-    vertices, faces, uv = _surface(thing.path)
-    if len(faces) == 0 or not np.isfinite(vertices).all():
-        raise DescriptionError(f"{thing.path} holds no usable surface: {len(faces)} faces")
-    if thing.texture is not None and uv is None:
-        raise DescriptionError(
-            f"{thing.path} has no texture coordinates for {thing.texture}: add them, or leave it out"
-        )
-    vertices = thing.scale * vertices @ pose[:3, :3].T + pose[:3, 3]
+def _mesh(thing: Mesh | FreeForm | CirclePlate, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
+    """A surface of triangles with its vertices already in scene coordinates."""
+    vertices, faces, uv = _surface(thing)
+    vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh(Path(thing.path).stem, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh(thing.kind, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     parameters["faces"] = np.ravel(faces).astype(np.uint32)
@@ -184,7 +186,24 @@ def _mesh(thing: Mesh, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
     return mesh
 
 
-def _surface(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface(thing: Mesh | FreeForm | CirclePlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices (V, 3) in the object's own frame, faces (F, 3) and, if it has them, texture coordinates (V, 2)."""
+    if isinstance(thing, FreeForm):
+        vertices, faces = head_surface(height_mm=thing.height_mm) if isinstance(thing, Head) else weld_surface(thing)
+        return vertices, faces, None
+    if isinstance(thing, CirclePlate):
+        return bowed_plate(width_mm=thing.width_mm, height_mm=thing.height_mm, bow_mm=thing.bow_mm)
+    vertices, faces, uv = _surface_from_file(thing.path)
+    if len(faces) == 0 or not np.isfinite(vertices).all():
+        raise DescriptionError(f"{thing.path} holds no usable surface: {len(faces)} faces")
+    if thing.texture is not None and uv is None:
+        raise DescriptionError(
+            f"{thing.path} has no texture coordinates for {thing.texture}: add them, or leave it out"
+        )
+    return thing.scale * vertices, faces, uv
+
+
+def _surface_from_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of all parts of a file.
 
     The parts are joined here, as trimesh copies their materials to join them, which needs an imaging library.

@@ -143,12 +143,85 @@ class Mesh(Placed):
     scale: Positive = 1.0
 
 
+class FreeForm(Placed):
+    """Base of free-form surfaces of a shape of their own. They have no uv coordinates for a texture."""
+
+    @model_validator(mode="after")
+    def _has_no_texture(self) -> "FreeForm":
+        if self.texture is not None:
+            raise ValueError(f"texture {self.texture} on a surface without uv coordinates: leave it out, or use a mesh")
+        return self
+
+
+class Head(FreeForm):
+    """A dummy head with the stub of its neck, about its own origin; its face looks along -z, its crown lies at +y.
+
+    ``height_mm`` runs from the neck's cut to the crown.
+    """
+
+    kind: Literal["head"]
+    height_mm: Positive = 160.0
+
+
+class Weld(FreeForm):
+    """Rippled weld beads on the front of a plate in its own x-y plane, facing -z (towards the sensor).
+
+    The beads run along the plate's x or y axis (``along``), side by side, ``spacing_mm`` from middle to middle;
+    ``length_mm``, ``width_mm`` and ``height_mm`` are those of one bead, ``ripple_height_mm`` is that from trough to
+    crest. ``irregularity`` is how much width and height change on the way, as a share of them, and how far the path
+    and the ripples' places wander, in widths and pitches; ``seed`` chooses how.
+    """
+
+    kind: Literal["weld"]
+    plate_mm: tuple[Positive, Positive] = (80.0, 120.0)
+    beads: Annotated[int, Field(ge=1, le=100)] = 3
+    spacing_mm: Positive = 18.0
+    along: Literal["x", "y"] = "x"
+    length_mm: Positive = 56.0
+    width_mm: Positive = 10.0
+    height_mm: Positive = 2.0
+    ripple_pitch_mm: Positive = 3.0
+    ripple_height_mm: NotNegative = 0.25
+    irregularity: Annotated[float, Field(ge=0, le=0.3)] = 0.06
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def bead_reach_mm(self) -> float:
+        """How far a bead reaches sideways from its straight middle line, however irregular."""
+        return self.width_mm * (0.5 + 1.5 * self.irregularity)
+
+    @model_validator(mode="after")
+    def _beads_have_room(self) -> "Weld":
+        plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
+        wide = (self.beads - 1) * self.spacing_mm + 2 * self.bead_reach_mm()
+        if self.length_mm < self.width_mm:
+            raise ValueError(f"a bead of length_mm {self.length_mm:g} is shorter than its width_mm {self.width_mm:g}")
+        if self.beads > 1 and self.spacing_mm < 2 * self.bead_reach_mm():
+            raise ValueError(
+                f"spacing_mm {self.spacing_mm:g} lets beads touch that may be {2 * self.bead_reach_mm():g} mm wide"
+            )
+        if self.length_mm > plate[0] or wide > plate[1]:
+            raise ValueError(
+                f"beads of {self.length_mm:g} mm along {self.along} and {wide:g} mm together across it do not fit on "
+                f"plate_mm {self.plate_mm[0]:g} x {self.plate_mm[1]:g}"
+            )
+        if self.ripple_height_mm > 2 * (1 - self.irregularity) * self.height_mm:
+            raise ValueError(
+                f"ripple_height_mm {self.ripple_height_mm:g} lets troughs dip into the plate under a bead of height_mm "
+                f"{self.height_mm:g}"
+            )
+        return self
+
+
 class CirclePlate(Placed):
     """Flat plate, facing -z, with a lattice of circles; three of them carry a dot and mark origin, X and Y.
 
     The lattice has ``columns`` along x and ``rows`` along y; ``origin`` is the marked origin's column and row, and
     ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two. The origin circle lies at the
     plate's own origin. ``reflectance`` is the ground's; the lattice takes the place of a ``texture``.
+
+    A real plate differs from its description: every circle is off by ``centre_std_mm`` along x and y, and the middle
+    of the plate stands ``bow_mm`` before its corners. ``detection_std_px`` shifts every circle in every image anew, as
+    errors of detection beyond those that the image itself leads to. ``errors_seed`` chooses these errors.
     """
 
     kind: Literal["circle_plate"]
@@ -165,6 +238,10 @@ class CirclePlate(Placed):
     marker_y: tuple[int, int] = (0, 2)
     circle_reflectance: Reflectance = 0.85
     marker_reflectance: Reflectance = 0.05
+    centre_std_mm: NotNegative = 0.0
+    bow_mm: Annotated[float, Field(gt=-10, lt=10)] = 0.0
+    detection_std_px: NotNegative = 0.0
+    errors_seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
     def _has_one_pattern(self) -> "CirclePlate":
@@ -173,14 +250,15 @@ class CirclePlate(Placed):
         return self
 
 
-AnyObject = Annotated[Sphere | Plate | Block | Pipe | Mesh | CirclePlate, Field(discriminator="kind")]
+AnyObject = Annotated[Sphere | Plate | Block | Pipe | Mesh | Head | Weld | CirclePlate, Field(discriminator="kind")]
 
 
 class Motion(Description):
     """Stage positions of a scan: ``count`` of them from ``start_mm`` in steps of ``step_mm`` along ``direction``.
 
     ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
-    position the images in ``lights`` are taken in turn. ``speed_mm_per_s`` is how fast the stage moves along
+    position the images in ``lights`` are taken in turn. ``position_errors_mm`` is how much farther than recorded the
+    stage truly stands at each position, 0 unless given. ``speed_mm_per_s`` is how fast the stage moves along
     ``direction`` while an image is exposed; at 0 it stands still.
     """
 
@@ -189,6 +267,7 @@ class Motion(Description):
     count: Annotated[int, Field(ge=1, le=100000)] = 1
     direction: Vector = (1.0, 0.0, 0.0)
     nominal_direction: Vector | None = None
+    position_errors_mm: tuple[float, ...] = ()
     lights: tuple[Literal["lamp", "laser"], ...] = ("laser",)
     speed_mm_per_s: NotNegative = 0.0
 
@@ -197,6 +276,10 @@ class Motion(Description):
         for vector in (self.direction, self.nominal_direction):
             if vector is not None and np.linalg.norm(vector) < 1e-9:
                 raise ValueError(f"direction {vector} has no length")
+        if self.position_errors_mm and len(self.position_errors_mm) != self.count:
+            raise ValueError(
+                f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions: give one for each"
+            )
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
         if self.speed_mm_per_s > 0 and len(self.lights) > 1:
@@ -215,15 +298,18 @@ class Motion(Description):
     def shots(self) -> Iterator["Shot"]:
         """Every image of the scan in its order."""
         for index in range(self.count):
+            stage_mm = self.start_mm + index * self.step_mm
+            error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
             for light in self.lights:
-                yield Shot(stage_mm=self.start_mm + index * self.step_mm, light=light)
+                yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light)
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image to take: stage position in mm and the light that is on."""
+    """One image to take: recorded and true position of the stage in mm, and the light that is on."""
 
     stage_mm: float
+    travelled_mm: float
     light: Literal["lamp", "laser"]
 
 
@@ -252,6 +338,13 @@ class Scene(Description):
     def _placement_known(self) -> "Scene":
         if self.placement not in self.placements:
             raise ValueError(f"placement '{self.placement}' is not one of {', '.join(self.placements)}")
+        return self
+
+    @model_validator(mode="after")
+    def _one_circle_plate(self) -> "Scene":
+        plates = [thing for thing in self.objects if isinstance(thing, CirclePlate)]
+        if len(plates) > 1 and any(plate.detection_std_px > 0 for plate in plates):
+            raise ValueError("detection_std_px is for scenes with one circle_plate: leave it out, or the other plates")
         return self
 
     def object_poses(self) -> list[np.ndarray]:

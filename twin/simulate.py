@@ -12,9 +12,10 @@ import numpy as np
 from twin.detector import electrons_per_ms, grey_values
 from twin.fixed_pattern import fixed_pattern
 from twin.options import Options
+from twin.pattern import shift_circles
 from twin.pose import Travel
 from twin.renderer import LaserFrame, Renderer
-from twin.scene import Scene, Shot
+from twin.scene import CirclePlate, Scene, Shot
 from twin.speckle import Speckle, coherence
 from twin.truth import FrameTruth, depth_map, no_stripe, true_stripe
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
@@ -62,7 +63,7 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
     nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
     box = renderer.objects.scene.bbox()
-    offsets = np.array([shot.stage_mm * scene.motion.unit_direction() for shot in scene.motion.shots()])
+    offsets = np.array([shot.travelled_mm * scene.motion.unit_direction() for shot in scene.motion.shots()])
     low, high = (np.array(corner) - offsets for corner in (box.min, box.max))
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
         raise DesignError(
@@ -119,7 +120,7 @@ class Studio:
     def pose(self, shot: Shot) -> np.ndarray:
         """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
         transform = np.eye(4)
-        transform[:3, 3] = shot.stage_mm * self.scene.motion.unit_direction()
+        transform[:3, 3] = shot.travelled_mm * self.scene.motion.unit_direction()
         return transform
 
     def travel(self, light: Literal["lamp", "laser"]) -> Travel | None:
@@ -155,17 +156,35 @@ class Studio:
             index=self.medium.refractive_index(laser.wavelength_nm),
         )  # fmt: skip
         return self._speckle.factors(
-            frame.rows, frame.columns, travel_mm=shot.stage_mm, polarisation=frame.polarisation, coherence=contrast
+            frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
         )
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
+        self._shift_circles(shot, index)
         rng = np.random.default_rng([self.options.seed, index]) if self.options.effects.noise else None
         exposure = self.exposure_ms[shot.light]
         light = exposure * self.electrons_per_ms(
             shot, spp=self.options.spp, seed=self._seed(index), travel=self.travel(shot.light)
         )
         return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng, pattern=self._pattern)
+
+    def _shift_circles(self, shot: Shot, index: int) -> None:
+        """Move the circles of plates with errors of detection to where this image shows them."""
+        for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
+            if isinstance(plate, CirclePlate) and plate.detection_std_px > 0:
+                seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
+                mm_per_px = self._apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
+                shift_circles(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
+
+    def _apparent_depth_mm(self, depth_mm: float) -> float:
+        """Depth at which a point on the axis seems to be: a layer of index n looks n times thinner."""
+        window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
+        if not window.mounted:
+            return depth_mm
+        outside = depth_mm - window.distance_mm - window.thickness_mm
+        in_medium = outside / self.medium.refractive_index(wavelength)
+        return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
     def _seed(self, index: int) -> int:
         """Seed of a frame's random walks."""

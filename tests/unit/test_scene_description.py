@@ -24,7 +24,7 @@ def built(scene: Scene) -> Objects:
 
 def test_the_library_is_not_empty():
     assert {"thesis", "thesis-as-built"} <= set(SENSORS)
-    assert {"plane", "spheres", "step", "pipe", "target"} <= set(scene_names())
+    assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(scene_names())
     assert len(PLACES) > 15
 
 
@@ -155,6 +155,8 @@ def test_a_base_gives_what_a_description_leaves_out(tmp_path):
 
 
 PLATE = "title = 't'\n[[objects]]\nkind = 'plate'\nwidth_mm = 5.0\nheight_mm = 5.0\n"
+HEAD = "title = 't'\n[[objects]]\nkind = 'head'\n"
+WELD = "title = 't'\n[[objects]]\nkind = 'weld'\n"
 
 BAD_SCENES = {
     "no objects": ("title = 't'\nobjects = []", r"objects: .*at least 1"),
@@ -189,6 +191,24 @@ BAD_SCENES = {
         r"objects\.0\.sphere\.mirror: unknown key",
     ),
     "texture not a path": (PLATE + "texture = 3", r"texture: .*string.*found 3"),
+    "textured head": (HEAD + "texture = 'skin.png'", r"texture .*skin\.png on a surface without uv coordinates"),
+    "flat head": (HEAD + "height_mm = 0.0", r"objects\.0\.head\.height_mm: .*found 0"),
+    "headless head": (HEAD + "diameter_mm = 90.0", r"objects\.0\.head\.diameter_mm: unknown key"),
+    "textured weld": (WELD + "texture = 'rust.png'", r"texture .*rust\.png on a surface without uv coordinates"),
+    "slanting weld": (WELD + "along = 'z'", r"along: .*'x' or 'y'.*found 'z'"),
+    "beads that touch": (WELD + "spacing_mm = 11.0", r"spacing_mm 11 lets beads touch that may be 11\.8 mm wide"),
+    "beads beyond the plate": (
+        WELD + "beads = 8",
+        r"56 mm along x and 137\.8 mm together across it do not fit on.*80 x 120",
+    ),
+    "a bead too long": (WELD + "length_mm = 90.0", r"90 mm along x .*do not fit on plate_mm 80 x 120"),
+    "beads across the plate": (
+        WELD + "along = 'y'\nlength_mm = 90.0\nspacing_mm = 36.0",
+        r"along y and 83\.8 mm .*not fit",
+    ),
+    "a short bead": (WELD + "length_mm = 9.0", r"length_mm 9 is shorter than its width_mm 10"),
+    "deep ripples": (WELD + "ripple_height_mm = 4.0", r"ripple_height_mm 4 lets troughs dip .* bead of height_mm 2"),
+    "wild beads": (WELD + "irregularity = 0.5", r"irregularity: .*0\.3.*found 0\.5"),
 }
 
 
