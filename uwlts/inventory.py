@@ -8,6 +8,8 @@ import numpy as np
 
 from uwlts.calibration.model import FORMAT as CALIBRATION_FORMAT
 from uwlts.calibration.model import Calibration, read_calibration
+from uwlts.calibration.polynomial_model import FORMAT as POLYNOMIAL_FORMAT
+from uwlts.calibration.polynomial_model import PolynomialCalibration, read_polynomials
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, read_cloud
 from uwlts.errors import CaptureError, DescriptionError
@@ -53,6 +55,8 @@ def _json_lines(path: Path) -> list[str]:
     try:
         if found == CALIBRATION_FORMAT:
             return calibration_lines(read_calibration(path))
+        if found == POLYNOMIAL_FORMAT:
+            return polynomial_lines(read_polynomials(path))
         if found == EVALUATION_FORMAT:
             return evaluation_lines(read_evaluation(path))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -134,6 +138,24 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         value = calibration.residuals.get(step, {}).get(name)
         if value is not None:
             lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
+    return lines
+
+
+def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
+    """What a calibration by polynomials says, with its residuals."""
+    last = calibration.first_line + len(calibration.domains_px) - 1
+    reached = sum(domain is not None for domain in calibration.domains_px)
+    low, high = calibration.depth_range_mm
+    lines = [
+        f"polynomials of the sensor '{calibration.sensor_name}' in {calibration.medium_name} "
+        f"({calibration.provenance.get('source', 'unknown source')})",
+        f"degree {calibration.degree}, for {reached} of the lines {calibration.first_line} to {last}, Z from {low:.1f} "
+        f"to {high:.1f} mm",
+    ]
+    for name, what in (("depth", "Z(position)"), ("along", "Y(Z)"), ("map", "target's points on the plate")):
+        value = calibration.residuals.get(name, {}).get("rms_mm")
+        if value is not None:
+            lines.append(f"{what}: residual {value:.4f} mm (rms)")
     return lines
 
 

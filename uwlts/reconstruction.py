@@ -144,15 +144,27 @@ def to_object(
     RangeError
         A stage position is not finite, or the direction is not a unit vector.
     """
+    travel = stage_travel(stage_mm, stage_direction)
+    object_from_camera = np.linalg.inv(calibration.object_transform())
+    points = object_from_camera[:3, :3] @ np.asarray(points_camera, dtype=float).T + object_from_camera[:3, 3, None]
+    points += travel
+    return np.ascontiguousarray(points.T)
+
+
+def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> np.ndarray:
+    """What the stage's motion adds to points in the OCS: (3, N), or (3, 1) where all share a position.
+
+    Raises
+    ------
+    RangeError
+        A stage position is not finite, or the direction is not a unit vector.
+    """
     stage_mm, stage_direction = np.asarray(stage_mm, dtype=float), np.asarray(stage_direction, dtype=float)
     if not np.isfinite(stage_mm).all():
         raise RangeError("a stage position is not finite")
     if not abs(np.linalg.norm(stage_direction) - 1.0) <= 1e-6:
         raise RangeError(f"the stage's direction {stage_direction} is not a unit vector")
-    object_from_camera = np.linalg.inv(calibration.object_transform())
-    points = object_from_camera[:3, :3] @ np.asarray(points_camera, dtype=float).T + object_from_camera[:3, 3, None]
-    points += np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
-    return np.ascontiguousarray(points.T)
+    return np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
 
 
 def _crossings(rays: RaysInMedium, sheet: SheetModel) -> SheetPoints:

@@ -19,6 +19,7 @@ class RayStatus(IntEnum):
     NO_DIRECTION: the lens model has no inverse at the pixel. BEHIND_WINDOW: the ray never reaches the window going
     forward. TOTAL_REFLECTION: a face of the window lets nothing through. NO_CROSSING: the ray runs parallel to the
     sheet or away from it. BEHIND: the ray passes the sheet inside the housing or the glass, not in the medium.
+    OUTSIDE_CALIBRATION: a polynomial calibration says nothing about this place of the image.
     """
 
     OK = 0
@@ -27,6 +28,7 @@ class RayStatus(IntEnum):
     TOTAL_REFLECTION = 3
     NO_CROSSING = 4
     BEHIND = 5
+    OUTSIDE_CALIBRATION = 6
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""From a capture to a point cloud: the stripe of every laser image, sent back through the window onto the sheet."""
+"""From a capture to a point cloud: the stripe of every laser image, turned into points by a calibration of any kind."""
 
 import hashlib
 from collections.abc import Callable
@@ -7,12 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.polynomial_model import PolynomialCalibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud
 from uwlts.errors import CalibrationError, CaptureError, RangeError
-from uwlts.reconstruction import reconstruct_pixels
+from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
+from uwlts.reconstruction import ObjectPoints, reconstruct_profile
 from uwlts.refraction import RayStatus
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+
+AnyCalibration = Calibration | PolynomialCalibration
+
+# Polynomials hold the refraction they were made with: so much more, as from 20 to 30 degC, moves a point 300 mm away by
+# 0.2 mm.
+_LARGEST_INDEX_CHANGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -24,20 +32,23 @@ class Scan:
     rays_by_status: dict[str, int]
 
 
-def calibration_digest(calibration: Calibration) -> str:
+def calibration_digest(calibration: AnyCalibration) -> str:
     """Short digest that tells which calibration a cloud was made with."""
     return hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
 
 
-def check_fits(capture: Capture, calibration: Calibration) -> None:
+def check_fits(capture: Capture, calibration: AnyCalibration) -> None:
     """Refuse a calibration that cannot belong to the capture.
 
     Raises
     ------
     CalibrationError
-        Image size or stripe orientation differ, or the capture was made in water and the calibration has no window.
+        Image size or stripe orientation differ; the capture was made in water and the calibration has no window; or
+        the calibration is one by polynomials and the capture was made in another medium, or with the window on in one
+        and off in the other.
     """
-    camera, model = capture.header.sensor.camera, calibration.camera
+    camera = capture.header.sensor.camera
+    model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera
     if (camera.width_px, camera.height_px) != (model.width_px, model.height_px):
         raise CalibrationError(
             f"{capture.path.name} has images of {camera.width_px} x {camera.height_px} pixels, the calibration is for "
@@ -48,11 +59,33 @@ def check_fits(capture: Capture, calibration: Calibration) -> None:
             f"in {capture.path.name} the stripe runs along the image's {camera.stripe_along}, in the calibration along "
             f"its {calibration.stripe_along}"
         )
-    if capture.header.medium.kind != "air" and calibration.window is None:
+    if isinstance(calibration, PolynomialCalibration):
+        _check_same_refraction(capture, calibration)
+    elif capture.header.medium.kind not in ("air", calibration.medium_kind) and calibration.window is None:
         raise CalibrationError(
-            f"{capture.path.name} was made in {capture.header.medium_name}, but the calibration is for air only: "
-            "calibrate again with step images taken in the medium (--step)"
+            f"{capture.path.name} was made in {capture.header.medium_name}, but the calibration is for "
+            f"{calibration.medium_kind} only: calibrate again with step images taken in the medium (--step)"
         )
+    elif capture.header.medium.kind == "air" and calibration.medium_kind != "air":
+        raise CalibrationError(
+            f"{capture.path.name} was made in air, but the calibration is that of a single viewpoint in water "
+            f"({calibration.medium_kind}): its camera holds the refraction; calibrate in air"
+        )
+
+
+def _check_same_refraction(capture: Capture, calibration: PolynomialCalibration) -> None:
+    header, own = capture.header, calibration.medium
+    index, own_index = medium_index(capture, calibration), own.refractive_index(calibration.wavelength_nm)
+    if header.medium.kind != own.kind or abs(index - own_index) > _LARGEST_INDEX_CHANGE:
+        raise CalibrationError(
+            f"{capture.path.name} was made in {header.medium_name} ({header.medium.kind}, n {index:.4f}), the "
+            f"polynomials in {calibration.medium_name} ({own.kind}, n {own_index:.4f}): they hold in the medium they "
+            "were made in only; calibrate again in this one"
+        )
+    if header.sensor.camera.window.mounted != calibration.window_mounted:
+        with_window, without = "with the camera's window", "without the camera's window"
+        here, there = (with_window, without) if not calibration.window_mounted else (without, with_window)
+        raise CalibrationError(f"{capture.path.name} was made {here}, the polynomials {there}: calibrate again")
 
 
 def require_index(index: float) -> None:
@@ -61,76 +94,133 @@ def require_index(index: float) -> None:
         raise RangeError(f"the refractive index is {index:g}; expected that of a medium relative to air, from 1 to 2")
 
 
-def medium_index(capture: Capture, calibration: Calibration) -> float:
+def medium_index(capture: Capture, calibration: AnyCalibration) -> float:
     """Refractive index of the capture's medium at the sensor's wavelength, relative to air."""
     return capture.header.medium.refractive_index(calibration.wavelength_nm)
 
 
-def reconstruct_capture(
+@dataclass(frozen=True, eq=False)
+class FoundStripes:
+    """Stripe centres of all laser images of a capture, joined: N of them.
+
+    Attributes
+    ----------
+    frame, line : (N,) int
+        Image and profile line of each centre.
+    centre_px, amplitude : (N,)
+        Place on the line and height in grey levels.
+    lines_by_status : dict
+        What became of the profile lines of all images.
+    """
+
+    frame: np.ndarray
+    line: np.ndarray
+    centre_px: np.ndarray
+    amplitude: np.ndarray
+    lines_by_status: dict[str, int]
+
+
+def find_stripes(
     capture: Capture,
-    calibration: Calibration,
     *,
     options: StripeOptions = StripeOptions(),
-    index: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Scan:
-    """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
-
-    ``index`` replaces the refractive index that follows from the capture's medium. Without a window in the light's way
-    the calibration's window is left out.
+) -> FoundStripes:
+    """Find the stripe in all laser images of a capture.
 
     Raises
     ------
-    CalibrationError
-        The calibration does not fit the capture.
     CaptureError
         The capture holds no laser image, or none of them shows a stripe.
-    RangeError
-        The refractive index is none of a medium.
     """
-    check_fits(capture, calibration)
     header = capture.header
-    if not header.sensor.camera.window.mounted:
-        calibration = calibration.model_copy(update={"window": None})
-    index = medium_index(capture, calibration) if index is None else index
-    require_index(index)
-    pixels, frames, lines, intensities = [], [], [], []
+    frames, lines, centres, amplitudes = [], [], [], []
     statuses = np.zeros(len(StripeStatus), int)
     for number, image in capture.frames(laser_on=True):
         stripe = extract_stripe(
-            image, stripe_along=calibration.stripe_along, options=options, saturation=header.saturation_dn
+            image, stripe_along=header.sensor.camera.stripe_along, options=options, saturation=header.saturation_dn
         )
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
-        pixels.append(stripe.pixels())
+        centres.append(stripe.centre_px[good])
         lines.append(good)
         frames.append(np.full(len(good), number))
-        intensities.append(stripe.amplitude[good])
+        amplitudes.append(stripe.amplitude[good])
         progress(number + 1, len(capture))
-    if not pixels:
+    if not centres:
         raise CaptureError(f"{capture.path.name} holds no image with the laser on: nothing to reconstruct")
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
         found = ", ".join(f"{count} {name}" for name, count in by_status.items() if count)
         raise CaptureError(
-            f"no stripe in any of the {len(pixels)} laser images of {capture.path.name} (lines: {found})"
+            f"no stripe in any of the {len(centres)} laser images of {capture.path.name} (lines: {found})"
         )
-    frame, line, intensity = (np.concatenate(parts) for parts in (frames, lines, intensities))
-    found = reconstruct_pixels(
-        calibration, np.concatenate(pixels), medium_index=index,
-        stage_mm=capture.stage_mm[frame], stage_direction=np.array(header.stage_direction),
-    )  # fmt: skip
+    return FoundStripes(*(np.concatenate(parts) for parts in (frames, lines, centres, amplitudes)), by_status)
+
+
+def reconstruct_capture(
+    capture: Capture,
+    calibration: AnyCalibration,
+    *,
+    options: StripeOptions = StripeOptions(),
+    index: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Scan:
+    """Point cloud of a capture: `find_stripes`, then `reconstruct_stripes`, with the errors of both."""
+    check_fits(capture, calibration)
+    stripes = find_stripes(capture, options=options, progress=progress)
+    return reconstruct_stripes(capture, stripes, calibration, index=index)
+
+
+def reconstruct_stripes(
+    capture: Capture, stripes: FoundStripes, calibration: AnyCalibration, *, index: float | None = None
+) -> Scan:
+    """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
+
+    ``index`` replaces the refractive index that follows from the capture's medium. Without a window in the light's way
+    the calibration's window is left out. Points that a calibration by polynomials does not reach are left out and
+    counted in ``rays_by_status``.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration does not fit the capture, or an index is given for a calibration by polynomials.
+    RangeError
+        The refractive index is none of a medium.
+    """
+    check_fits(capture, calibration)
+    if index is not None and isinstance(calibration, PolynomialCalibration):
+        raise CalibrationError(
+            "polynomials hold the refraction of the medium they were made in: a refractive index cannot replace it"
+        )
+    index = medium_index(capture, calibration) if index is None else index
+    require_index(index)
+    header, frame = capture.header, stripes.frame
+    found = _points(capture, calibration, stripes.line, stripes.centre_px, frame, index)
     points = _posed(found.points_mm, capture, frame)
     good = found.status == RayStatus.OK
     cloud = PointCloud(
-        points_mm=points[good], intensity=intensity[good], frame=frame[good], line=line[good],
+        points_mm=points[good], intensity=stripes.amplitude[good], frame=frame[good], line=stripes.line[good],
         metadata={
             "capture": capture.path.name, "sensor": calibration.sensor_name, "medium": header.medium_name,
             "medium_index": index, "artefact": header.artefact, "calibration": calibration_digest(calibration),
         },
     )  # fmt: skip
     rays = np.bincount(found.status, minlength=len(RayStatus))
-    return Scan(cloud, by_status, {status.name.lower(): int(rays[status]) for status in RayStatus})
+    by_status = {status.name.lower(): int(rays[status]) for status in RayStatus}
+    return Scan(cloud, stripes.lines_by_status, by_status)
+
+
+def _points(
+    capture: Capture, calibration: AnyCalibration, line: np.ndarray, centre: np.ndarray, frame: np.ndarray, index: float
+) -> ObjectPoints:
+    """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
+    stage, direction = capture.stage_mm[frame], np.array(capture.header.stage_direction)
+    if isinstance(calibration, PolynomialCalibration):
+        return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
+    if not capture.header.sensor.camera.window.mounted:
+        calibration = calibration.model_copy(update={"window": None})
+    return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
 
 
 def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:

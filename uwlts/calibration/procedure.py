@@ -184,9 +184,7 @@ def gather(
     )  # fmt: skip
 
 
-def solve(
-    evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None
-) -> CalibrationResult:
+def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
     """Calibrate from what the captures show; ``start`` is a camera for nearly the same evidence. Errors: `calibrate`."""
     sensor, found = evidence.sensor, evidence.air
     camera, unbiased = _camera(evidence, options, start)
@@ -300,8 +298,7 @@ def _window(
             warnings.append(f"{step.source}: left out, {error}")
     if not images:
         raise CalibrationError(
-            "no step image can be used for the window's distance; "
-            + "; ".join([*evidence.warnings, *warnings][:3])
+            "no step image can be used for the window's distance; " + "; ".join([*evidence.warnings, *warnings][:3])
         )
     return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
 

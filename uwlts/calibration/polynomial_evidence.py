@@ -1,0 +1,199 @@
+"""What the polynomials are fitted to: the stripe's points on the plate, and their Y and Z in the OCS."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uwlts.calibration.evidence import AirEvidence
+from uwlts.calibration.nominal import nominal_calibration
+from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
+from uwlts.calibration.plate_map import PlateMap, fit_plate_map
+from uwlts.capture import Capture, CaptureHeader
+from uwlts.errors import CalibrationError
+from uwlts.placement import laser_pose
+from uwlts.reconstruction import reconstruct_pixels
+from uwlts.refraction import RayStatus
+from uwlts.targets import CircleTarget
+
+_SAME_POSITION_MM = 1e-6
+# Cosine of the angle between the stage's direction and the laser's axis.
+_ALONG_Z = 0.9
+# Stripe points about the camera's axis on which the origin of the OCS rests.
+_ORIGIN_POINTS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class PlateStripes:
+    """Stripe points of all images on the plate: N points.
+
+    Attributes
+    ----------
+    pixels : (N, 2)
+    lines : (N,) int
+        Profile line of each point.
+    centres_px : (N,)
+        Stripe centre on the line.
+    plate_mm : (N, 2)
+        Place on the plate, in the target's frame.
+    pose : (N,) int
+        Number of the image.
+    stage_mm : (N,)
+    """
+
+    pixels: np.ndarray
+    lines: np.ndarray
+    centres_px: np.ndarray
+    plate_mm: np.ndarray
+    pose: np.ndarray
+    stage_mm: np.ndarray
+
+
+def common_header(captures: Sequence[Capture]) -> CaptureHeader:
+    """The first capture's header.
+
+    Raises
+    ------
+    CalibrationError
+        There is no capture, one has no target, the others describe another arrangement, or the stage does not move
+        along Z.
+    """
+    if not captures:
+        raise CalibrationError("no capture of a target is given: the polynomials are fitted to nothing else")
+    first = captures[0]
+
+    def arrangement(capture: Capture) -> dict[str, Any]:
+        header, camera = capture.header, capture.header.sensor.camera
+        return {
+            "image size": (camera.width_px, camera.height_px), "stripe_along": camera.stripe_along,
+            "wavelength": header.sensor.laser.wavelength_nm, "medium": header.medium,
+            "window mounted": camera.window.mounted, "stage_direction": header.stage_direction,
+            "target": header.target,
+        }  # fmt: skip
+
+    for capture in captures:
+        if capture.header.target is None:
+            raise CalibrationError(f"{capture.path.name} does not tell its target: its header has none")
+        for (name, own), other in zip(arrangement(capture).items(), arrangement(first).values(), strict=True):
+            if own != other:
+                raise CalibrationError(
+                    f"{capture.path.name} does not belong to {first.path.name}: {name} is {own} against {other}"
+                )
+    direction = first.header.stage_direction
+    if abs(direction[2]) < _ALONG_Z:
+        raise CalibrationError(
+            f"the stage must move the sensor along the laser's axis (OCS Z); stage_direction is {direction}"
+        )
+    return first.header
+
+
+def stripes_on_plate(
+    evidence: AirEvidence, header: CaptureHeader, degree: int
+) -> tuple[PlateStripes, list[PlateMap], list[str]]:
+    """Stripe points that fall on the plate among or next to the target's points seen at the same position.
+
+    A point counts up to one spacing outside the hull of the target's points in the image, and up to half of one outside
+    the pattern.
+
+    Returns
+    -------
+    stripes : PlateStripes
+    maps : list of PlateMap
+        Of the images that have such points.
+    warnings : list of str
+
+    Raises
+    ------
+    CalibrationError
+        There are fewer positions than a polynomial of this degree has coefficients.
+    """
+    target = evidence.target
+    diameter = target.diameter_mm if isinstance(target, CircleTarget) else None
+    spacing, extent = lattice_spacing(target), plate_extent(target)
+    along = 0 if header.sensor.camera.stripe_along == "width" else 1
+    maps, parts, warnings = [], [], []
+    for number, (image, pixels) in enumerate(zip(evidence.images, evidence.stripes, strict=True)):
+        if not len(pixels):
+            warnings.append(f"no stripe at the stage position {image.stage_mm:g} mm, where the target was found")
+            continue
+        try:
+            plate_map = fit_plate_map(image, circle_diameter_mm=diameter)
+        except CalibrationError as error:
+            warnings.append(f"stage position {image.stage_mm:g} mm: left out, {error}")
+            continue
+        plate = plate_map(pixels)
+        in_pattern = (plate >= extent.min(axis=0) - spacing / 2) & (plate <= extent.max(axis=0) + spacing / 2)
+        on_plate = in_pattern.all(axis=1) & (plate_map.beyond_mm(pixels) <= spacing)
+        if on_plate.any():
+            maps.append(plate_map)
+            parts.append((pixels[on_plate], plate[on_plate], number, image.stage_mm))
+        else:
+            warnings.append(f"stage position {image.stage_mm:g} mm: left out, the stripe does not fall on the target")
+    positions = np.sort([stage for *_, stage in parts])
+    different = int(np.count_nonzero(np.diff(positions) > _SAME_POSITION_MM)) + 1 if len(positions) else 0
+    if different <= degree:
+        raise CalibrationError(
+            f"target and stripe were found together at {different} stage positions; polynomials of degree {degree} "
+            f"need at least {degree + 1}, better twice as many: {'; '.join([*evidence.warnings, *warnings][:3])}"
+        )
+    pixels = np.vstack([part[0] for part in parts])
+    counts = [len(part[0]) for part in parts]
+    stripes = PlateStripes(
+        pixels=pixels,
+        lines=np.rint(pixels[:, along]).astype(int),
+        centres_px=pixels[:, 1 - along],
+        plate_mm=np.vstack([part[1] for part in parts]),
+        pose=np.repeat([part[2] for part in parts], counts),
+        stage_mm=np.repeat([part[3] for part in parts], counts),
+    )
+    return stripes, maps, warnings
+
+
+def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np.ndarray, np.ndarray]:
+    """Z and Y (N,) of the stripe points in the OCS.
+
+    The plate stands still, so in the OCS it moves against the stage. Y runs along the stripe on the plate, in the sense
+    in which the described fan runs through the image. The origin is where the sensor as described sees the stripe
+    points next to its camera's axis.
+    """
+    camera = header.sensor.camera
+    direction = np.array(header.stage_direction)
+    depth = -direction[2] * stripes.stage_mm
+    centred = stripes.plate_mm - _pose_means(stripes.plate_mm, stripes.pose)
+    along_stripe = np.linalg.svd(centred, full_matrices=False)[2][0]
+    along = stripes.plate_mm @ along_stripe
+    with_lines = np.sum(centred @ along_stripe * (stripes.lines - stripes.lines.mean()))
+    fan = laser_pose(header.sensor).fan[0 if camera.stripe_along == "width" else 1]
+    along = along * np.sign(with_lines * fan) - direction[1] * stripes.stage_mm
+
+    nominal = nominal_calibration(header.sensor, header.medium)
+    index = header.medium.refractive_index(nominal.wavelength_nm)
+    seen = reconstruct_pixels(
+        nominal, stripes.pixels, medium_index=index, stage_mm=0.0, stage_direction=np.array([0.0, 0.0, 1.0])
+    )
+    known = np.flatnonzero(seen.status == RayStatus.OK)
+    if not len(known):
+        raise CalibrationError(
+            "the sensor as described sees the sheet at none of the stripe points: check baseline, angle and "
+            "stripe_along"
+        )
+    _, along_nominal, depth_nominal = seen.points_mm[known].T
+    if np.sum((depth_nominal - np.median(depth_nominal)) * (depth[known] - np.median(depth[known]))) <= 0:
+        raise CalibrationError(
+            "the stripe moves through the image the other way than the stage's positions say: check the sign of the "
+            f"captures' stage_direction, {header.stage_direction}, and on which side the laser stands"
+        )
+    from_axis = np.hypot(*(stripes.pixels[known] - camera.principal_point()).T)
+    middle = np.argsort(from_axis, kind="stable")[:_ORIGIN_POINTS]
+    depth = depth + np.median(depth_nominal[middle] - depth[known][middle])
+    along = along + np.median(along_nominal[middle] - along[known][middle])
+    return depth, along
+
+
+def _pose_means(values: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Mean (N, K) over the points of the same pose of values (N, K)."""
+    _, number, count = np.unique(pose, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(count), values.shape[1]))
+    np.add.at(sums, number, values)
+    return (sums / count[:, None])[number]

@@ -1,0 +1,124 @@
+"""The polynomial reference method's calibration: two polynomials for each profile line, stored as JSON."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from uwlts.calibration.model import Calibration, read_calibration
+from uwlts.errors import CaptureError
+from uwlts.files import written_aside
+from uwlts.sensor import Description, Medium, Positive
+
+FORMAT = "uwlts-polynomials"
+VERSION = 1
+Pair = tuple[float, float]
+Rows = tuple[tuple[float, ...], ...]
+
+
+class PolynomialCalibration(Description):
+    """A sensor calibrated by polynomials (thesis, section 4.7): stripe position to Z, and Z to Y, for each line.
+
+    It holds in the medium and with the window it was made with, and only where its evidence reached.
+
+    Attributes
+    ----------
+    medium_name, medium : of the captures it was made from
+    window_mounted : whether the camera's window stood in the light's way
+    degree : of both polynomials of a line
+    first_line : number of the profile line of the first row
+    position_range_px, depth_range_mm : ranges of the stripe position and of Z in the OCS on which the arguments of the
+        Legendre polynomials run from -1 to 1, for all lines
+    domains_px : for each line the range of stripe positions that was calibrated, None for a line without any
+    depth_coefficients, along_coefficients : Legendre coefficients in mm of Z(position) and of Y(Z), a row for each line
+    residuals, provenance : named figures, and what the calibration was made from
+    """
+
+    sensor_name: str
+    stripe_along: Literal["width", "height"]
+    wavelength_nm: Positive
+    medium_name: str
+    medium: Medium
+    window_mounted: bool
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    degree: Annotated[int, Field(ge=1)]
+    first_line: Annotated[int, Field(ge=0)]
+    position_range_px: Pair
+    depth_range_mm: Pair
+    domains_px: tuple[Pair | None, ...]
+    depth_coefficients: Rows
+    along_coefficients: Rows
+    residuals: dict[str, Any] = {}
+    provenance: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "PolynomialCalibration":
+        count, lines = len(self.domains_px), self.width_px if self.stripe_along == "width" else self.height_px
+        if not 0 < count <= lines - self.first_line:
+            raise ValueError(f"{count} lines from line {self.first_line} on do not lie in an image of {lines} lines")
+        for name in ("depth_coefficients", "along_coefficients"):
+            rows = getattr(self, name)
+            if len(rows) != count or {len(row) for row in rows} != {self.degree + 1}:
+                raise ValueError(
+                    f"{name} must have {count} rows of {self.degree + 1} numbers, as domains_px and degree"
+                )
+        for name in ("position_range_px", "depth_range_mm"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} must grow, not go from {low:g} to {high:g}")
+        low, high = self.position_range_px
+        known = [domain for domain in self.domains_px if domain is not None]
+        if not known or not all(low <= a <= b <= high for a, b in known):
+            raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
+        try:
+            json.dumps([self.residuals, self.provenance], allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
+        return self
+
+    def domains(self) -> np.ndarray:
+        """``domains_px`` as an array (L, 2), NaN for None."""
+        return np.array([(np.nan, np.nan) if domain is None else domain for domain in self.domains_px])
+
+
+def write_polynomials(path: str | Path, calibration: PolynomialCalibration, *, overwrite: bool = False) -> None:
+    """Write a polynomial calibration as JSON, one key a line, whole or not at all; OutputError where that fails."""
+    content = {"format": FORMAT, "version": VERSION} | calibration.model_dump(mode="json")
+    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+
+
+def read_polynomials(path: str | Path) -> PolynomialCalibration:
+    """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
+    content = _content(path)
+    if content.pop("format", None) != FORMAT:
+        raise CaptureError(f'{path} is JSON but no polynomial calibration: expected "format": "{FORMAT}"')
+    if (version := content.pop("version", None)) != VERSION:
+        raise CaptureError(f"{path} has version {version}; this program reads {VERSION}")
+    try:
+        return PolynomialCalibration.model_validate(content)
+    except ValidationError as error:
+        # A damaged table would be told of number by number.
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()[:5])
+        raise CaptureError(f"{path} is not a valid polynomial calibration: {details}") from error
+
+
+def read_any_calibration(path: str | Path) -> Calibration | PolynomialCalibration:
+    """Read a calibration of either kind, told by its "format"; CaptureError as from `read_calibration`."""
+    return read_polynomials(path) if _content(path).get("format") == FORMAT else read_calibration(path)
+
+
+def _content(path: str | Path) -> dict[str, Any]:
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read the calibration {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path} is not a calibration, or is truncated: {error}") from error
+    if not isinstance(content, dict):
+        raise CaptureError(f'{path} is JSON but not a calibration: expected an object with a "format"')
+    return content
