@@ -26,7 +26,7 @@ from twin.legs import Leg, legs
 from twin.light import Light, Source, lights
 from twin.objects import build_objects
 from twin.pose import SensorPose, Travel
-from twin.samples import lattice
+from twin.samples import lattice, pupil_shifts
 from twin.scene import Scene
 from twin.sheet import Sheet
 from twin.view import Bundle, View
@@ -47,8 +47,6 @@ _MIRRORS = 2
 """How many mirrors the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
-_LAMP_BLOCK_PX = 2
-"""Under the lamp, so many pixels square take samples at different places."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
 
@@ -275,9 +273,8 @@ class Renderer:
             changes[:] = True  # what moves by may change any pixel
         image = corner_mean(nodes)
         for rows, columns in _parts(*np.nonzero(changes), spp=spp):
-            image[rows, columns] = self._fine(
-                self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp, block=_LAMP_BLOCK_PX
-            )[0]
+            fine = self._fine(self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp, shifted=True)
+            image[rows, columns] = fine[0]
         return image
 
     def _evenly_lit_sums(
@@ -319,24 +316,25 @@ class Renderer:
 
     def _fine(
         self, light: Callable[..., tuple[mi.Float, ...]], pose: SensorPose, rows: np.ndarray, columns: np.ndarray,
-        *rest: object, spp: int, block: int = 1,
+        *rest: object, spp: int, shifted: bool = False,
     ) -> np.ndarray:  # fmt: skip
         """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray.
 
-        Pixels of a square ``block`` share the points of one finer lattice, so that a blurred edge shows no steps.
+        ``shifted`` takes other places on the pupil in neighbouring pixels, so that a blurred edge shows no steps.
         """
         x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
         index = dr.arange(mi.UInt32, len(rows) * spp)
         pixel, sample = index // spp, index % spp
-        if block > 1:
-            place = to_jit(mi.UInt32, (rows % block) * block + columns % block)
-            sample = sample * block**2 + dr.gather(mi.UInt32, place, pixel)
         axes = 2 + 2 * self.effects.defocus + (pose.travel is not None)
-        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp * block**2, axes)]
+        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp, axes)]
         row = dr.gather(mi.Float, y, pixel)
         pupil = None
         if self.effects.defocus:
-            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(places[2], places[3]))
+            u, v = places[2:4]
+            if shifted:
+                shift_u, shift_v = (to_jit(mi.Float, axis) for axis in pupil_shifts(rows, columns))
+                u, v = u + dr.gather(mi.Float, shift_u, pixel), v + dr.gather(mi.Float, shift_v, pixel)
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u - dr.floor(u), v - dr.floor(v)))
         travel_mm = None if pose.travel is None else pose.travel.at(row, places[-1])
         bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
         values = light(pose, bundle, travel_mm, *rest)

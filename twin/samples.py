@@ -1,7 +1,8 @@
 """Where in a pixel, on the pupil and during the exposure the samples of a pixel are taken: one lattice for all pixels.
 
 A rank-1 lattice is evenly spaced along every axis, so that a smooth stripe is integrated as by the midpoint rule,
-without the noise of random samples.
+without the noise of random samples. Its points come in pairs about the middle, so that neither the pixel's nor the
+pupil's few samples shift what they see.
 """
 
 import math
@@ -38,7 +39,19 @@ def lattice(count: int, axes: int) -> np.ndarray:
         free = [coprime[k] for k in spread if coprime[k] not in taken] or coprime
         steps.append(min(free, key=lambda k: merit @ _kernel(index * k % count / count)))
         merit = merit * _kernel(index * steps[-1] % count / count)
-    return np.stack([(index * step % count + 0.5) / count for step in steps])
+    # Counted from half a step on, every point has its mirror image about the cube's middle among the others.
+    return np.stack([(index + 0.5) * step / count % 1 for step in steps])
+
+
+def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """By how much the points on the pupil are shifted, cyclically, in pixels (P,): (2, P), from 0 to 1.
+
+    The few points of a pixel turn a blurred edge into steps; where they lie elsewhere in neighbouring pixels, the steps
+    do too. The 16 pixels of a block 4 px square take 16 evenly spread shifts (the R2 sequence, Roberts 2018),
+    neighbours such that lie far apart.
+    """
+    order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])[rows % 4, columns % 4]
+    return np.stack([(order * 0.7548776662466927) % 1, (order * 0.5698402909980532) % 1])
 
 
 def _kernel(x: np.ndarray) -> np.ndarray:
