@@ -17,9 +17,9 @@ from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor
 from uwlts.stripe import StripeOptions, extract_stripe
 
-DEFAULT, MASS, FILTERED = "zero crossing (default)", "centre of mass", "5x5 mean, quadratic"
+DEFAULT, MASS, FILTERED = "zero crossing", "centre of mass", "5x5 mean, quadratic"
 METHODS = {
-    DEFAULT: StripeOptions(),
+    DEFAULT: StripeOptions(method="zero-crossing"),
     MASS: StripeOptions(method="centre-of-mass"),
     "quadratic": StripeOptions(method="quadratic"),
     # A mean of five pixels has a standard deviation of sqrt((25 - 1) / 12) px.
@@ -164,7 +164,7 @@ def measure(case: Case) -> Frames:
     truth_px, point, normal = (
         np.stack([getattr(truth, name) for truth in truths]) for name in ("centre_px", "point_mm", "normal")
     )
-    step = _step_per_px(case, point[..., 2])
+    step = step_per_px(case, point[..., 2])
     used = np.isfinite(truth_px) & (-normal[..., 2] >= FACING)
     return Frames(
         error_px={name: np.stack([found[name] for found in centres]) - truth_px for name in centres[0]},
@@ -183,7 +183,7 @@ def _vertex(image: np.ndarray) -> np.ndarray:
     return top + 0.5 * (after - before) / np.maximum(2 * here - before - after, np.finfo(np.float32).tiny)
 
 
-def _step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
+def step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
     """How a point at Z (F, L) of the sheet moves, (F, L, 3) mm, when its centre moves by one px on its line."""
     row_of_z, y_of_z = _scale(case.medium)
     per_row = 1 / polynomial.polyval(z_mm, polynomial.polyder(row_of_z)[:, None], tensor=False)

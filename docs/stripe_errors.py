@@ -7,7 +7,6 @@ renders every case, draws the plots into docs/pictures, and writes the tables be
 
 import argparse
 import math
-import re
 import time
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from stripe_plan import (
     THESIS_STD,
     Plan,
 )
+from stripe_tables import table, write_tables
 
 from twin.variant import use_variant
 from uwlts.console import progress_bar
@@ -48,7 +48,7 @@ def effects_table(plan: Plan, thing: str) -> str:
             else:
                 cells += [f"{s.std_px:.3f} ± {s.std_px_error:.3f}", f"{s.std_mm:.4f}"]
         rows.append(cells)
-    return _table(["effects", *(f"{place}: {column}" for place in PLACES[thing] for column in columns)], rows)
+    return table(["effects", *(f"{place}: {column}" for place in PLACES[thing] for column in columns)], rows)
 
 
 def methods_table(plan: Plan) -> str:
@@ -57,7 +57,7 @@ def methods_table(plan: Plan) -> str:
     cases["plane", "stand-off, only noise"] = plan.effects("plane")["only noise", "stand-off"]
     rows = [[name, *(f"{_spread(measure(case), name, thing):.4f}" for (thing, _), case in cases.items())]
             for name in SHOWN]  # fmt: skip
-    return _table(["method, std mm", *(f"{thing}, {place}" for thing, place in cases)], rows)
+    return table(["method, std mm", *(f"{thing}, {place}" for thing, place in cases)], rows)
 
 
 def _spread(frames: Frames, method: str, thing: str) -> float:
@@ -74,7 +74,7 @@ def unknown_table(plan: Plan) -> str:
         values = [measure(cases[name, place]).spread().std_mm for place in PLACES["plane"]]
         values += [measure(cases[name, "stand-off"]).spread(method).std_mm for method in (MASS, FILTERED)]
         rows.append([name, *(f"{value:.3f}" for value in values)])
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def exposure_table(plan: Plan) -> str:
@@ -86,7 +86,7 @@ def exposure_table(plan: Plan) -> str:
         numbers = (f"{v:.3f}" for v in (noise.std_px, core.std_px, core.std_mm, mass.std_mm))
         rows.append([f"{level:g}", *numbers, fixed(core.bias_px, signed=True), f"{100 * core.found:.1f} %"])
     head = ["brightest light / full well", "only noise: std px", f"{NAME_CORE}: std px", "std mm"]
-    return _table([*head, f"{MASS}: std mm", "bias px", "lines found"], rows)
+    return table([*head, f"{MASS}: std mm", "bias px", "lines found"], rows)
 
 
 def gloss_table(plan: Plan) -> str:
@@ -97,14 +97,14 @@ def gloss_table(plan: Plan) -> str:
         s = measure(case).spread()
         numbers = fixed(s.bias_px, 4, signed=True), f"{s.robust_px:.4f}", f"{s.std_px:.4f}"
         rows.append([thing, name, *numbers, f"{100 * s.found:.1f} %"])
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def walks_table(plan: Plan) -> str:
     """Scatter alone in harbour water by samples per pixel."""
     rows = [[str(spp), fixed(s.bias_px, 4, signed=True), f"{s.std_px:.3f}", f"{s.std_px * math.sqrt(spp):.2f}"]
             for spp, s in ((spp, measure(case).spread()) for spp, case in plan.walks().items())]  # fmt: skip
-    return _table(["samples per pixel", "bias px", "std px", "std times root of samples"], rows)
+    return table(["samples per pixel", "bias px", "std px", "std times root of samples"], rows)
 
 
 def thesis_table(plan: Plan) -> str:
@@ -123,7 +123,7 @@ def thesis_table(plan: Plan) -> str:
         left = proposed * math.sqrt(max(0.0, 1 - shares[1]))
         cells = [*(f"{v:.3f}" for v in std.values()), *(f"{100 * share:.0f} %" for share in shares), f"{left:.3f}"]
         rows.append([thing, medium, place, f"{polynomial:.3g} / {proposed:.3g}", *cells])
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def range_table(plan: Plan) -> str:
@@ -149,7 +149,7 @@ def range_table(plan: Plan) -> str:
             rows.append([f"{thing}, {place}", f"{count}", *numbers])
     head = ["water", "points", "thesis: range mm", "range / STD", f"twin, {DEFAULT}: range mm", "range / STD"]
     head += ["normal noise: range / STD", f"the same, {1e3 * VDI_OUTLIER_SHARE:g} permille left out"]
-    return _table([*head, "largest noise within the thesis's range, mm"], rows)
+    return table([*head, "largest noise within the thesis's range, mm"], rows)
 
 
 def sphere_fits(frames: Frames, method: str) -> list:
@@ -157,22 +157,6 @@ def sphere_fits(frames: Frames, method: str) -> list:
     moved = frames.point_mm + frames.error_px[method][..., None] * frames.step_mm
     good = frames.used & np.isfinite(moved).all(axis=-1)
     return [fit_robustly(fit_sphere, moved[good & side]) for side in (moved[..., 1] < 0, moved[..., 1] >= 0)]
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
-def write_tables(tables: dict[str, str]) -> None:
-    """Put each table between its markers in the page."""
-    page = PAGE.read_text(encoding="utf-8")
-    for name, table in tables.items():
-        marked = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-        page, count = marked.subn(lambda m, table=table: f"{m[1]}\n{table}\n\n{m[2]}", page)
-        if count != 1:
-            raise SystemExit(f"{PAGE.name} has {count} places for the table '{name}'; expected one")
-    PAGE.write_text(page, encoding="utf-8")
 
 
 def main() -> None:
@@ -195,7 +179,7 @@ def main() -> None:
         "walks": walks_table(plan), "exposure": exposure_table(plan), "thesis": thesis_table(plan),
         "range": range_table(plan),
     }  # fmt: skip
-    write_tables(tables)
+    write_tables(PAGE, tables)
     print(f"{len(cases)} cases, {sum(case.frames for case in cases)} frames in {time.perf_counter() - start:.0f} s")
 
 

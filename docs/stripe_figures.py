@@ -18,12 +18,12 @@ from stripe_plan import (
     TURBIDITIES,
     Plan,
 )
-from svg_plot import COLOURS, Band, Curve, Panel, draw
 
 from twin.speckle import pixel_contrast
 from uwlts.library import load_sensor
 from uwlts.placement import camera_from_object, check_design
 from uwlts.report.canvas import ORANGE, blank, dot, line, write
+from uwlts.report.svg_plot import COLOURS, Band, Curve, Panel, draw
 from uwlts.stripe.result import FWHM_PER_SIGMA
 
 ZOOM, GAP = 8, 12

@@ -17,7 +17,7 @@ FOLDER = "campaigns"
 
 
 class Imperfections(Description):
-    """How far real things lie from their descriptions; standard deviations of normal, half widths of even distributions.
+    """How far real things lie from their descriptions: standard deviations if normal, half widths if evenly spread.
 
     ``circle_centre_std_mm``
         every printed circle of the target, along x and y.
@@ -238,7 +238,8 @@ def _lower_block(scene: Scene) -> int:
 
 
 def _moved(thing: AnyObject, by_mm: tuple[float, float, float]) -> AnyObject:
-    return thing.model_copy(update={"position_mm": tuple(float(p + d) for p, d in zip(thing.position_mm, by_mm))})
+    moved = np.array(thing.position_mm) + by_mm
+    return thing.model_copy(update={"position_mm": tuple(moved.tolist())})
 
 
 def _turned_slightly(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:

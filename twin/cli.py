@@ -1,5 +1,6 @@
 """The ``twin`` command: renders virtual recordings."""
 
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated, Literal
@@ -116,8 +117,75 @@ def _water(text: str | None) -> str | float | None:
 
 
 @app.command
+def reproduce(
+    campaign: str = "thesis",
+    *,
+    out: Path | None = None,
+    campaigns: int = 3,
+    first: int = 0,
+    every: int = 1,
+    spp: int = 16,
+    trials: int = 100,
+    workers: int | None = None,
+    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
+) -> None:
+    """Render the thesis's whole evaluation, evaluate it by all its methods, and set its tables beside the results.
+
+    Every campaign has imperfections and noise of its own. Run again, it goes on where it was stopped, and adds
+    campaigns if more are asked for. The report is OUT/report.html.
+
+    Example: twin reproduce --campaigns 1 --every 10 --out runs/quick
+
+    Parameters
+    ----------
+    campaign
+        Name or path of the campaign's description.
+    out
+        Folder for campaigns and report; runs/CAMPAIGN unless given.
+    campaigns
+        How many campaigns there shall be.
+    first
+        Seed of the first one; the others follow.
+    every
+        Take only every n-th profile of the scans; calibrations keep all their images.
+    spp
+        Samples per lit pixel.
+    trials
+        Trials of the Monte-Carlo propagation of every campaign, 0 for none.
+    workers
+        Recordings rendered at a time; as many as there are processors unless given.
+    overwrite
+        Render and evaluate everything anew.
+    variant
+        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
+    """
+    from twin.campaign import load_campaign
+    from twin.reproduce import record_campaigns
+
+    for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
+        if value < 1:
+            raise DescriptionError(f"{name} is {value}; it must be at least 1")
+    if first < 0:
+        raise DescriptionError(f"first is {first}; a seed must not be negative")
+    description = load_campaign(campaign)
+    folder = out or Path("runs") / Path(campaign).stem
+    with progress_bar(f"rendering {description.title}") as progress:
+        record_campaigns(
+            description, folder, seeds=range(first, first + campaigns), every=every, spp=spp, variant=variant,
+            workers=workers, overwrite=overwrite, progress=progress,
+        )  # fmt: skip
+    # The sensor's software is a program of its own, which knows nothing of the twin.
+    command = [sys.executable, "-m", "uwlts.cli", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
+    command += ["--again"] if overwrite else []
+    command += ["--workers", str(workers)] if workers else []
+    if code := subprocess.run(command, check=False).returncode:
+        sys.exit(code)
+
+
+@app.command
 def scenes() -> None:
-    """List the scenes, sensors and waters that ship with the program.
+    """List the scenes, sensors, campaigns and waters that ship with the program.
 
     Example: twin scenes
     """
@@ -125,6 +193,7 @@ def scenes() -> None:
         scene = load_scene(name)
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     print(f"sensors: {', '.join(names('sensors'))}")
+    print(f"campaigns: {', '.join(names('campaigns'))}")
     print(f"waters: {', '.join(water_names())}, or a turbidity from 0 to 3")
 
 

@@ -278,7 +278,7 @@ class Motion(Description):
                 raise ValueError(f"direction {vector} has no length")
         if self.position_errors_mm and len(self.position_errors_mm) != self.count:
             raise ValueError(
-                f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions: give one for each"
+                f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions"
             )
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")

@@ -3,7 +3,7 @@
 import sys
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -11,6 +11,9 @@ import uwlts
 from uwlts.console import progress_bar, run
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files import refuse_unsuitable
+
+if TYPE_CHECKING:
+    from uwlts.sensor import Medium, Sensor
 
 app = App(
     name="uwlts",
@@ -24,7 +27,7 @@ Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=""
 Coefficients = Annotated[
     tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
 ]
-Method = Literal["centre-of-mass", "quadratic", "zero-crossing"]
+Method = Literal["centre-of-mass", "profile-fit", "quadratic", "zero-crossing"]
 
 
 @app.command
@@ -115,6 +118,75 @@ def calibrate(
 
 
 @app.command
+def polynomials(
+    *,
+    target: Files,
+    out: Path,
+    degree: int = 6,
+    method: Method | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Calibrate by polynomials, position to Z and Z to Y for each profile line, wholly in the medium of use.
+
+    Example: uwlts polynomials --target target-water.h5 --out polynomials.json
+
+    Parameters
+    ----------
+    target
+        Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor along Z:
+        at every stage position one image under the lamp and one with the laser.
+    out
+        Calibration file to write.
+    degree
+        Degree of the polynomials; there must be more stage positions.
+    method
+        How the stripe's centre is found.
+    overwrite
+        Replace an existing file.
+    """
+    from contextlib import ExitStack
+
+    from uwlts.calibration.polynomial import calibrate_polynomials
+    from uwlts.calibration.polynomial_model import write_polynomials
+    from uwlts.capture import Capture
+    from uwlts.inventory import polynomial_lines
+    from uwlts.stripe import StripeOptions
+
+    refuse_unsuitable(out, overwrite=overwrite)
+    stripe = StripeOptions(method=method) if method else StripeOptions()
+    with ExitStack() as stack, progress_bar("calibrating") as progress:
+        captures = [stack.enter_context(Capture(path)) for path in target]
+        result = calibrate_polynomials(
+            captures, degree=degree, stripe=stripe, progress=lambda stage, done, total: progress(done, total)
+        )
+    write_polynomials(out, result.calibration, overwrite=overwrite)
+    print("\n".join(polynomial_lines(result.calibration)))
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(f"wrote {out}")
+
+
+@app.command
+def design(sensor: str, *, medium: str) -> None:
+    """Say what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
+
+    Example: uwlts design thesis --medium water
+
+    Parameters
+    ----------
+    sensor
+        Name or path of a sensor description.
+    medium
+        One of the sensor's media.
+    """
+    from uwlts.design_table import design_table, table_lines
+    from uwlts.library import load_sensor
+
+    described = load_sensor(sensor)
+    print("\n".join(table_lines(design_table(described, _medium_of(described, medium)))))
+
+
+@app.command
 def nominal(sensor: str, *, medium: str, out: Path, overwrite: Flag = False) -> None:
     """Write the calibration that a sensor would have if it were built exactly as described.
 
@@ -136,11 +208,7 @@ def nominal(sensor: str, *, medium: str, out: Path, overwrite: Flag = False) -> 
     from uwlts.library import load_sensor
 
     described = load_sensor(sensor)
-    if medium not in described.media:
-        raise DescriptionError(
-            f"the sensor '{described.name}' knows the media {', '.join(described.media)}, not '{medium}'"
-        )
-    write_calibration(out, nominal_calibration(described, described.media[medium]), overwrite=overwrite)
+    write_calibration(out, nominal_calibration(described, _medium_of(described, medium)), overwrite=overwrite)
     print(f"wrote {out}")
 
 
@@ -164,7 +232,7 @@ def reconstruct(
     capture
         Capture of a scan.
     calibration
-        Calibration of the sensor.
+        Calibration of the sensor, or one by polynomials.
     out
         Cloud to write (PLY with intensity, frame and line of every point).
     index
@@ -176,7 +244,7 @@ def reconstruct(
     overwrite
         Replace an existing file.
     """
-    from uwlts.calibration.model import read_calibration
+    from uwlts.calibration.polynomial_model import read_any_calibration
     from uwlts.capture import Capture
     from uwlts.cloud import write_cloud
     from uwlts.scan import reconstruct_capture
@@ -186,14 +254,15 @@ def reconstruct(
     options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
         scan = reconstruct_capture(
-            opened, read_calibration(calibration), options=options, index=index, progress=progress
+            opened, read_any_calibration(calibration), options=options, index=index, progress=progress
         )
     write_cloud(out, scan.cloud, overwrite=overwrite)
     lines = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in scan.lines_by_status.items() if count)
     print(f"profile lines: {lines}")
     lost = {name: count for name, count in scan.rays_by_status.items() if count and name != "ok"}
     if lost:
-        print(f"rays that meet no point of the sheet: {', '.join(f'{n} {name}' for name, n in lost.items())}")
+        reasons = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in lost.items())
+        print(f"stripe centres without a point: {reasons}")
     print(f"wrote {out} with {len(scan.cloud)} points")
 
 
@@ -300,6 +369,67 @@ def report(
         write_pictures(pictures, campaign, overwrite=overwrite)
     print_table(summary_table(campaign, published))
     print(f"wrote {page} and {page.with_name('summary.json')}")
+
+
+@app.command
+def thesis(
+    folder: Path,
+    *,
+    published: str = "thesis-tables",
+    trials: int = 100,
+    workers: int | None = None,
+    again: Flag = False,
+    overwrite: Flag = False,
+) -> None:
+    """Evaluate campaigns as the thesis does, by all its methods, and set its tables beside the results.
+
+    The folder holds campaign-0, campaign-1, ..., each with the recordings of the whole evaluation; `twin reproduce`
+    renders such. Writes report.html, summary.json, tables.csv and summary.md into it.
+
+    Example: uwlts thesis runs/thesis
+
+    Parameters
+    ----------
+    folder
+        Folder of the campaigns.
+    published
+        Published tables: name or path of a TOML file.
+    trials
+        Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
+    workers
+        Scans measured at a time; as many as there are processors unless given.
+    again
+        Evaluate campaigns anew that have results already.
+    overwrite
+        Replace an existing report.
+    """
+    from uwlts.thesis.comparison import markdown, write_comparison
+    from uwlts.thesis.evaluation import evaluate_campaign
+    from uwlts.thesis.folder import campaign_folders
+    from uwlts.thesis.published import load_published
+
+    if trials != 0 and trials < 20:
+        raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
+    tables = load_published(published)
+    refuse_unsuitable(folder / "report.html", overwrite=overwrite)
+    results = []
+    for campaign in campaign_folders(folder):
+        with progress_bar(f"evaluating {campaign.path.name}") as progress:
+            results.append(
+                evaluate_campaign(
+                    campaign, trials=trials, workers=workers, overwrite=again,
+                    progress=lambda stage, done, total: progress(done, total),
+                )
+            )  # fmt: skip
+    rows = write_comparison(folder, results, tables, overwrite=overwrite)
+    print(markdown(rows, results), end="")
+    print(f"wrote {folder / 'report.html'}, summary.json, tables.csv and summary.md")
+
+
+def _medium_of(sensor: "Sensor", name: str) -> "Medium":
+    if name not in sensor.media:
+        raise DescriptionError(f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{name}'")
+    return sensor.media[name]
 
 
 def _read_toml(path: Path) -> dict[str, object]:

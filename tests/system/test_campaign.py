@@ -105,7 +105,8 @@ def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationRes
     )
     figures = measured(path, result.calibration).content["evaluation"]["figures_mm"]
     assert abs(figures["SSE"]) <= 0.11
-    assert 0.03 < figures["STD"] <= 0.09, "speckle is there, and no more than speckle"
+    # Speckle leaves the profile fit 0.022 to 0.025 mm on spheres (docs/stripe-methods.md); half of it and twice of it.
+    assert 0.012 < figures["STD"] <= 0.05, "speckle is there, and no more than speckle"
     assert abs(figures["diameter error sphere 1"]) <= 0.3
 
 

@@ -61,8 +61,12 @@ def position_bound(*, sigma, amplitude, noise):
 
 # Largest error over the pixel phase without noise. Zero crossing: aliasing of the Gaussian weight, which falls as
 # exp(-2 pi^2 s^2), and at sigma 4 the flanks that still hold a few thousandths of the stripe; measured 0.005 at both
-# ends. The other two weigh pixels in part at the ends of a window where the profile is not zero.
-@pytest.mark.parametrize(("method", "limit"), [("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)])
+# ends. The profile fit has the same flanks, and at sigma 0.7 the pixel's width makes the profile no Gaussian. The other
+# two weigh pixels in part at the ends of a window where the profile is not zero.
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [("profile-fit", 0.008), ("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)],
+)
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
 def test_bias_over_the_pixel_phase(method, limit, sigma):
     centre = phases()
@@ -114,11 +118,12 @@ def test_width_and_amplitude(sigma):
 
 @pytest.mark.parametrize(("sigma", "efficiency"), [(0.7, 0.7), (1.0, 0.85), (2.0, 0.8), (3.0, 0.75), (4.0, 0.6)])
 @pytest.mark.parametrize("amplitude", [40, 150])
-def test_noise_is_near_the_cramer_rao_bound(sigma, efficiency, amplitude):
+def test_white_noise_is_near_the_cramer_rao_bound(sigma, efficiency, amplitude):
     rng = np.random.default_rng(1)
     centre = LENGTH / 2 + rng.uniform(-0.5, 0.5, 3000)
     image = gaussian(centre, sigma=sigma, amplitude=amplitude) + 20 + 2 * rng.standard_normal((3000, LENGTH))
-    error = rows(image.astype(np.float32)).centre_px - centre
+    found = rows(image.astype(np.float32), options=StripeOptions(method="zero-crossing"))
+    error = found.centre_px - centre
     bound = position_bound(sigma=sigma, amplitude=amplitude, noise=2)
     # Least efficiency: the measured 0.72 to 0.97 less five standard errors of a variance of 3000 samples
     # (5 sqrt(2 / 3000) = 13 %). The bound takes the background as known. No estimator beats it by more than that error.
@@ -126,20 +131,21 @@ def test_noise_is_near_the_cramer_rao_bound(sigma, efficiency, amplitude):
     assert abs(error.mean()) < 5 * error.std() / math.sqrt(3000)
 
 
-def test_zero_crossing_is_the_least_noisy():
+def test_zero_crossing_is_the_least_noisy_in_white_noise():
     rng = np.random.default_rng(2)
     centre = LENGTH / 2 + rng.uniform(-0.5, 0.5, 2000)
     image = gaussian(centre, sigma=2, amplitude=60) + 20 + 2 * rng.standard_normal((2000, LENGTH))
     image = image.astype(np.float32)
     spread = {m: np.std(rows(image, options=StripeOptions(method=m)).centre_px - centre) for m in METHODS}
-    assert min(spread, key=spread.get) is StripeOptions().method
+    assert min(spread, key=spread.get) is StripeMethod.ZERO_CROSSING
 
 
 # Left in, 0.2 levels per px would move the zero crossing by b 2^1.5 sigma^2 / A = 0.011 px and the centre of mass by
 # b 2 R^3 / 3 / (sqrt(2 pi) sigma A), R = 2.25 sigma, 0.03 px. The tilt still acts on the width found and thus on where
 # the windows of the other two end, within the error with the phase that they have anyway.
 @pytest.mark.parametrize(
-    ("method", "limit"), [("zero-crossing", 0.003), ("centre-of-mass", 0.012), ("quadratic", 0.02)]
+    ("method", "limit"),
+    [("profile-fit", 0.005), ("zero-crossing", 0.003), ("centre-of-mass", 0.012), ("quadratic", 0.02)],
 )
 def test_linear_background_does_not_shift(method, limit):
     centre = phases()
@@ -371,7 +377,13 @@ def test_smoothing_along_lines_lowers_noise_and_is_off_by_default():
     assert turned == pytest.approx(together, abs=1e-5)
     changed = image.copy()
     changed[500] = 20
-    assert np.array_equal(np.delete(rows(changed).centre_px, 500), np.delete(alone, 500)), "lines influence each other"
+    others = np.delete(rows(changed).centre_px - alone, 500)
+    # The profile fit weighs pixels by a noise that it measures on some 250 lines together, to 4 %; centres feel that in
+    # second order only.
+    assert np.abs(others).max() < 0.05 * alone.std(), "lines influence each other"
+    changed = rows(changed, options=StripeOptions(method="zero-crossing")).centre_px
+    alone = rows(image, options=StripeOptions(method="zero-crossing")).centre_px
+    assert np.array_equal(np.delete(changed, 500), np.delete(alone, 500)), "lines influence each other"
 
 
 @settings(deadline=None, max_examples=40)

@@ -64,9 +64,10 @@ class Calibration(Description):
 
     ``window`` is None where none stands in the light's way, or where its effect was left to focal length and
     distortion. Without a window the calibration holds in the kind of medium in which the target was seen,
-    ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix ``T_camera_object`` of the OCS: X
-    normal to the sheet, Z along the laser's axis, Y along the stripe. ``stripe_along`` is as in the sensor description.
-    ``residuals`` are named figures of each step, ``provenance`` tells what the calibration was made from.
+    ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix
+    ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
+    ``stripe_along`` is as in the sensor description. ``residuals`` are named figures of each step, ``provenance`` tells
+    what the calibration was made from.
     """
 
     sensor_name: str

@@ -163,8 +163,8 @@ def gather(
     media = {capture.header.medium.kind for capture in air}
     if len(media) > 1 or (steps and media != {"air"}):
         raise CalibrationError(
-            f"the target was seen in {' and '.join(sorted(media))}: images of it are taken in air if a step standard is "
-            "to find the window, else all in the medium of use"
+            f"the target was seen in {' and '.join(sorted(media))}: take all images of it in air if a step standard "
+            "is to find the window, else all in the medium of use"
         )
     found = air_evidence(air, stripe=options.stripe, progress=progress)
     if not found.images:
@@ -185,7 +185,7 @@ def gather(
 
 
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
-    """Calibrate from what the captures show; ``start`` is a camera for nearly the same evidence. Errors: `calibrate`."""
+    """Calibrate from what the captures show, with the errors of `calibrate`; ``start`` is a camera nearly as sought."""
     sensor, found = evidence.sensor, evidence.air
     camera, unbiased = _camera(evidence, options, start)
     margin = lattice_spacing(found.target) / 2 if options.margin_mm is None else options.margin_mm

@@ -19,12 +19,12 @@ def stripe_png(measurement: Measurement) -> bytes | None:
         return None
     with Capture(measurement.capture.path) as capture:
         view = stripe_view(capture)
-    return None if view is None else _png(stripe_picture(view))
+    return None if view is None else png(stripe_picture(view))
 
 
 def cloud_png(measurement: Measurement) -> bytes | None:
     """Picture of a measurement's cloud; None without one."""
-    return None if measurement.cloud is None else _png(cloud_picture(measurement.cloud))
+    return None if measurement.cloud is None else png(cloud_picture(measurement.cloud))
 
 
 def data_uri(png: bytes) -> str:
@@ -44,16 +44,17 @@ def write_pictures(folder: str | Path, campaign: Campaign, *, overwrite: bool = 
     """
     written = []
     for measurement in campaign.measurements:
-        for kind, png in (("stripe", stripe_png(measurement)), ("cloud", cloud_png(measurement))):
-            if png is not None:
+        for kind, picture in (("stripe", stripe_png(measurement)), ("cloud", cloud_png(measurement))):
+            if picture is not None:
                 path = Path(folder) / f"{kind}-{measurement.name}.png"
                 with written_aside(path, overwrite=overwrite) as aside:
-                    aside.write_bytes(png)
+                    aside.write_bytes(picture)
                 written.append(path)
     return written
 
 
-def _png(picture: np.ndarray) -> bytes:
+def png(picture: np.ndarray) -> bytes:
+    """A picture (H, W, 3) as the bytes of a PNG file."""
     done, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not done:
         raise RuntimeError("OpenCV cannot encode a PNG")

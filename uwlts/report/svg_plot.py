@@ -80,15 +80,19 @@ class _Axis:
 
 def draw(path: Path, panels: Sequence[Panel]) -> None:
     """Write the panels, in one row, as an SVG file."""
+    path.write_text(svg(panels), encoding="utf-8")
+
+
+def svg(panels: Sequence[Panel]) -> str:
+    """The panels, in one row, as the text of an SVG picture."""
     entries = {item.name: item for panel in panels for item in (*panel.bands, *panel.curves)}
     width = len(panels) * WIDTH
     legend, height = _legend(list(entries.values()), width)
     body = [_panel(panel, number * WIDTH, f"clip{number}") for number, panel in enumerate(panels)]
-    path.write_text(
+    return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
         f'font-family="Helvetica, Arial, sans-serif" font-size="12" fill="{INK}">\n'
-        f'<rect width="{width}" height="{height}" fill="white"/>\n' + "\n".join([*body, legend]) + "\n</svg>\n",
-        encoding="utf-8",
+        f'<rect width="{width}" height="{height}" fill="white"/>\n' + "\n".join([*body, legend]) + "\n</svg>\n"
     )
 
 

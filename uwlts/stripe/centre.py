@@ -1,4 +1,4 @@
-"""The centre of a stripe within its window, by three methods.
+"""The centre of a stripe within its window, by four methods, of which `profile_fit` has a file of its own.
 
 All take the same `Lobe` and return (M,) positions counted from the window's first pixel, so that they differ in
 nothing but the method. The linear background between the lobe's flanks is taken out in each.
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from uwlts.stripe.lobe import Lobe
+from uwlts.stripe.profile_fit import fit_profiles
 from uwlts.stripe.result import FWHM_PER_SIGMA, StripeMethod
 
 _ITERATIONS = 6
@@ -36,7 +37,13 @@ def place_centre(method: StripeMethod, lobe: Lobe) -> tuple[np.ndarray, np.ndarr
     if method is StripeMethod.ZERO_CROSSING:
         centre, under = _zero_crossing(lobe, kernel)
     else:
-        centre = _centre_of_mass(lobe) if method is StripeMethod.CENTRE_OF_MASS else _quadratic(lobe)
+        match method:
+            case StripeMethod.CENTRE_OF_MASS:
+                centre = _centre_of_mass(lobe)
+            case StripeMethod.QUADRATIC:
+                centre = _quadratic(lobe)
+            case StripeMethod.PROFILE_FIT:
+                centre = fit_profiles(lobe)
         (under,) = _gaussian_moments(lobe, centre, kernel, 0)
     # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
     joint = 0.5 / math.pi * (1 / (sigma * sigma) + 1 / (kernel * kernel))

@@ -17,6 +17,7 @@ class StripeMethod(StrEnum):
     """How the centre is placed once the stripe is found."""
 
     CENTRE_OF_MASS = "centre-of-mass"
+    PROFILE_FIT = "profile-fit"
     QUADRATIC = "quadratic"
     ZERO_CROSSING = "zero-crossing"
 
@@ -60,7 +61,7 @@ class StripeOptions:
         whose full width at half maximum is at most this are measured. At least 8.
     smoothing_px : float
         Sigma of the Gaussian low-pass across the stripe, px, for detection, width and the quadratic fit. The other
-        two methods place the centre on the unsmoothed profile.
+        methods place the centre on the unsmoothed profile.
     smoothing_lines : int
         Odd number of neighbouring lines averaged beforehand; 1 averages none. More lines lower the noise of smooth
         surfaces and blur depth edges.
@@ -85,7 +86,7 @@ class StripeOptions:
         If a number lies outside the range stated above.
     """
 
-    method: StripeMethod = StripeMethod.ZERO_CROSSING
+    method: StripeMethod = StripeMethod.PROFILE_FIT
     peak: PeakRule = PeakRule.STRONGEST
     half_window_px: int = 16
     smoothing_px: float = 1.0

@@ -1,0 +1,194 @@
+"""Shots of the study of methods: each is rendered once and photographed often, with fresh speckle and noise."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+
+import cv2
+import numpy as np
+from stripe_cases import FACING, PLATE, Case, step_per_px
+
+from twin.detector import electrons_per_ms, grey_values
+from twin.effects import ALL
+from twin.fixed_pattern import fixed_pattern
+from twin.options import Options
+from twin.renderer import LaserFrame
+from twin.scene import Scene, load_scene
+from twin.speckle import Speckle, coherence
+from uwlts.sensor import Sensor
+
+FINE_SPP = 256
+"""Samples of the stripe itself: with 16, the few places in the pupil shift a blurred stripe by up to 0.2 px."""
+SMOOTHED_LINES = 33
+"""Scattered light of a plate varies slowly along the stripe; its random walks' noise is averaged over so many lines."""
+APART = 3.0
+"""From 2 renewal lengths of travel on, speckle is new."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place(Case):
+    """A case of which one frame is rendered; ``turned_deg`` turns a plate about X (slanted stripe) and Y (depth)."""
+
+    turned_deg: tuple[float, float] = (0.0, 0.0)
+
+    def scene(self) -> Scene:
+        changes = {"motion": {"start_mm": 0.0, "count": 1}, "medium": self.medium, "placement": "here"}
+        changes["placements"] = {"here": {"position_mm": [0.0, 0.0, self.z_mm]}}
+        if self.water is not None:
+            changes["water"] = self.water
+        if self.thing == "plane":
+            changes["objects"] = [PLATE | {"rotation_deg": [*self.turned_deg, 0.0]}]
+        return load_scene(self.thing, changes=changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """Light of a place without speckle and noise, and the truth (L,) in px where the surface faces the laser."""
+
+    sensor: Sensor
+    index: float
+    frame: LaserFrame
+    truth_px: np.ndarray
+    mm_per_px: np.ndarray
+    exposure_ms: float
+
+    def electrons(self, *, level: float = 1.0, speckle: int | None = None) -> np.ndarray:
+        """Mean electrons (H, W), with the speckle pattern of a number; ``level`` scales the automatic exposure."""
+        factors = 1.0 if speckle is None else self._grain(speckle)
+        light = electrons_per_ms(
+            self.frame.irradiance(factors), self.sensor.camera, self.sensor.detector,
+            wavelength_nm=self.sensor.laser.wavelength_nm,
+        )  # fmt: skip
+        return light * np.float32(level * self.exposure_ms)
+
+    def image(self, number: int, *, level: float = 1.0, speckle: bool = True) -> np.ndarray:
+        """Grey values (H, W) of a photograph with its own noise and, if wanted, speckle."""
+        camera, detector = self.sensor.camera, self.sensor.detector
+        return grey_values(
+            self.electrons(level=level, speckle=number if speckle else None), detector,
+            exposure_ms=level * self.exposure_ms, rng=np.random.default_rng(number),
+            pattern=fixed_pattern(detector, height=camera.height_px, width=camera.width_px),
+        )  # fmt: skip
+
+    def contrast(self) -> np.ndarray:
+        """Contrast (P,) of the speckle of the stripe's pixels before it is averaged over their areas."""
+        return self._coherence() * np.sqrt((1 + self.frame.polarisation**2) / 2)
+
+    def _coherence(self) -> np.ndarray:
+        laser = self.sensor.laser
+        return coherence(
+            self.frame.roughness_um, linewidth_nm=laser.linewidth_nm, wavelength_nm=laser.wavelength_nm,
+            index=self.index,
+        )  # fmt: skip
+
+    def _grain(self, number: int) -> np.ndarray:
+        frame = self.frame
+        speckle = Speckle(self.sensor.camera, wavelength_nm=self.sensor.laser.wavelength_nm, seed=1)
+        return speckle.factors(
+            frame.rows, frame.columns, travel_mm=number * APART * speckle.renewal_mm,
+            polarisation=frame.polarisation, coherence=self._coherence(),
+        )  # fmt: skip
+
+
+@cache
+def render(place: Place) -> Rendered:
+    """The place's light: the stripe with many samples, the light around it with all effects of the place."""
+    from twin.simulate import Studio
+    from twin.truth import true_stripe
+
+    scene, sensor = place.scene(), place.sensor()
+    still = place.effects.without("noise", "speckle")
+    whole = Studio(sensor, scene, Options(spp=place.spp, effects=still))
+    pose = whole.pose(next(scene.motion.shots()))
+    straight = still.without("multiple-scattering", "secondary-light")
+    fine = Studio(sensor.model_copy(update={"exposure": _fixed(sensor)}), scene, Options(effects=straight))
+    frame = fine.renderer.laser_frame(pose, spp=FINE_SPP)
+    around = whole.renderer.laser_frame(pose, spp=place.spp).scattered
+    if place.thing == "plane":
+        # A running sum of single precision may end a little below zero.
+        around = np.maximum(cv2.blur(around, (SMOOTHED_LINES, 1), borderType=cv2.BORDER_REPLICATE), 0)
+    truth = true_stripe(whole.renderer, pose)
+    used = np.isfinite(truth.centre_px) & (-truth.normal[:, 2] >= FACING)
+    step = step_per_px(place, truth.point_mm[None, :, 2])[0]
+    return Rendered(
+        sensor=sensor, index=whole.medium.refractive_index(sensor.laser.wavelength_nm),
+        frame=replace(frame, scattered=around), truth_px=np.where(used, truth.centre_px, np.nan),
+        mm_per_px=(step * truth.normal).sum(axis=-1), exposure_ms=whole.exposure_ms["laser"],
+    )  # fmt: skip
+
+
+def _fixed(sensor: Sensor):
+    """Any exposure, so that none is looked for."""
+    return sensor.exposure.model_copy(update={"laser_ms": 1.0})
+
+
+PLACES = {"near": -60.0, "stand-off": 0.0, "far": 90.0}
+CONVEX = ALL.without("secondary-light")
+"""For the pipe, which does not light itself."""
+
+
+def places() -> dict[str, Place]:
+    """What every method is tried on with all effects."""
+    square = {f"plane, {name}": Place(z_mm=z, spp=8) for name, z in PLACES.items()}
+    return square | {
+        "sphere, near": Place(thing="spheres", z_mm=-40.0, spp=8),
+        "sphere, far": Place(thing="spheres", z_mm=85.0, spp=8),
+        "step, stand-off": Place(thing="step", spp=32),
+        "PVC pipe, stand-off": Place(thing="pipe", effects=CONVEX, spp=8),
+    }
+
+
+def sweeps() -> dict[str, Place]:
+    """One thing changed on the plane."""
+    turned = {
+        f"turned {angle:+.0f}\N{DEGREE SIGN} about {'XY'[axis]}, {name}":
+            Place(z_mm=PLACES[name], spp=8, turned_deg=(angle, 0.0) if axis == 0 else (0.0, angle))
+        for axis in (0, 1) for name in (("near", "far") if axis == 0 else ("stand-off",)) for angle in (-30.0, 30.0)
+    }  # fmt: skip
+    optics = {
+        f"waist {waist:g} mm, f/{number:g}, {name}":
+            Place(z_mm=PLACES[name], spp=8, laser=(("waist_radius_mm", waist),), camera=(("f_number", number),))
+        for waist in (0.15, 0.6) for number in (2.8, 11.0) for name in ("near", "far")
+    }  # fmt: skip
+    water = {
+        f"turbidity {turbidity:g}, stand-off": Place(water=turbidity, spp=8 if turbidity < 2 else 32)
+        for turbidity in (0.0, 1.0, 2.0, 3.0)
+    }
+    return turned | optics | water
+
+
+LEVELS = (0.1, 0.3, 1.0, 2.0, 4.0, 8.0)
+"""Exposure over the automatic one, which brings the brightest light to 0.8 of the full well."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Bias (mean), standard deviation, and the latter of means of five lines, px; std in mm; share of lines found.
+
+    Centres more than 2 px off, at limbs and edges, are left out and counted in ``far_off``.
+    """
+
+    bias_px: float
+    std_px: float
+    five_px: float
+    std_mm: float
+    found: float
+    far_off: float
+
+    @classmethod
+    def of(cls, error_px: np.ndarray, mm_per_px: np.ndarray, used: np.ndarray) -> "Spread":
+        """From errors (F, L), NaN where nothing was found."""
+        near = np.abs(error_px) <= 2.0
+        error = np.where(near, error_px, np.nan)
+        count = error.shape[1] // 5 * 5
+        five = error[:, :count].reshape(len(error), -1, 5).mean(axis=2)
+        seen = np.isfinite(error_px)
+        return cls(
+            float(np.nanmean(error)), float(np.nanstd(error)), float(np.nanstd(five)),
+            float(np.nanstd(error * mm_per_px)), float(seen[:, used].mean()), float((seen & ~near).sum() / seen.sum()),
+        )  # fmt: skip
+
+
+def round_to_zero(value: float) -> float:
+    """No negative zero in tables."""
+    return 0.0 if math.isclose(value, 0.0, abs_tol=5e-4) else value

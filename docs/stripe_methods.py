@@ -1,0 +1,171 @@
+"""Methods of finding the stripe's centre and the circles' centres compared: tables of docs/stripe-methods.md.
+
+    python docs/stripe_methods.py [--frames 4]
+
+renders every place once, photographs it with fresh speckle and noise, and writes the tables between their markers.
+"""
+
+import argparse
+import math
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from circle_methods import circles_table
+from method_limits import bound_px, grain_px, spot_limit_px
+from method_shots import LEVELS, Place, Spread, places, render, round_to_zero, sweeps
+from stripe_cases import FILTERED, MASS, METHODS
+from stripe_tables import table, write_tables
+
+from twin.variant import use_variant
+from uwlts.console import progress_bar
+from uwlts.stripe import StripeMethod, StripeOptions, extract_stripe
+
+PAGE = Path(__file__).parent / "stripe-methods.md"
+FIT, FIT_FIVE, CROSSING = "profile fit", "profile fit, 5 lines averaged", "zero crossing"
+ALL_METHODS = {
+    FIT: StripeOptions(method="profile-fit"),
+    FIT_FIVE: StripeOptions(method="profile-fit", smoothing_lines=5),
+    **METHODS,
+}
+ONE_LINE = (FIT, MASS, "quadratic", CROSSING)
+TIMED = 40
+
+
+@cache
+def spread(place: Place, method: str, frames: int, level: float = 1.0, speckle: bool = True) -> Spread:
+    """Errors of one method over photographs of a place."""
+    shot, options = render(place), ALL_METHODS[method]
+    found = [extract_stripe(shot_image(place, n, level, speckle), stripe_along="width", options=options).centre_px
+             for n in range(frames)]  # fmt: skip
+    return Spread.of(np.stack(found) - shot.truth_px, shot.mm_per_px, np.isfinite(shot.truth_px))
+
+
+@cache
+def shot_image(place: Place, number: int, level: float, speckle: bool) -> np.ndarray:
+    """A photograph, made once for all methods."""
+    return render(place).image(number, level=level, speckle=speckle)
+
+
+def spread_table(frames: int) -> str:
+    """Standard deviation in mm by method and place, with all effects."""
+    head = ["std in mm", *places()]
+    return table(head, [[name, *(f"{spread(p, name, frames).std_mm:.4f}" for p in places().values())]
+                        for name in ALL_METHODS])  # fmt: skip
+
+
+def bias_table(frames: int) -> str:
+    """Mean error in px by method and place, with all effects, and its standard error."""
+    rows = [[name, *(_signed(spread(p, name, frames).bias_px) for p in places().values())] for name in ALL_METHODS]
+    errors = [_mean_error(spread(p, FIT, frames), p, frames) for p in places().values()]
+    return table(["bias in px", *places()], [*rows, ["standard error of the profile fit's", *errors]])
+
+
+def _mean_error(s: Spread, place: Place, frames: int) -> str:
+    lines = np.isfinite(render(place).truth_px).sum() * frames
+    return f"{s.std_px / math.sqrt(lines):.3f}"
+
+
+def sweep_table(frames: int) -> str:
+    """Bias and standard deviation in px where one thing differs."""
+    rows = []
+    for name, place in sweeps().items():
+        cells = [name]
+        for method in (FIT, MASS, CROSSING, FILTERED):
+            s = spread(place, method, frames)
+            cells += [_signed(s.bias_px), f"{s.std_px:.3f}"]
+        rows.append(cells)
+    methods = (FIT, MASS, CROSSING, FILTERED)
+    return table(["plane", *(f"{m}: {c}" for m in methods for c in ("bias px", "std px"))], rows)
+
+
+def exposure_table(frames: int) -> str:
+    """Bias and standard deviation in px by exposure, on the plane at the stand-off."""
+    place, rows = places()["plane, stand-off"], []
+    for level in LEVELS:
+        fit = spread(place, FIT, frames, level)
+        cells = [f"{level:g}", f"{100 * fit.found:.1f} %", _signed(fit.bias_px), f"{fit.std_px:.3f}"]
+        cells += [f"{spread(place, name, frames, level).std_px:.3f}" for name in (MASS, CROSSING, FILTERED)]
+        cells += [f"{spread(place, name, frames, level, False).std_px:.4f}" for name in (FIT, CROSSING)]
+        rows.append(cells)
+    head = ["exposure / automatic", "lines found", f"{FIT}: bias px", f"{FIT}: std px"]
+    head += [f"{name}: std px" for name in (MASS, CROSSING, FILTERED)]
+    return table([*head, f"without speckle, {FIT}: std px", f"without speckle, {CROSSING}: std px"], rows)
+
+
+def limits_table(frames: int) -> str:
+    """Standard deviations on single lines beside the limits, px."""
+    rows = []
+    wanted = {name: place for name, place in places().items() if name.startswith("plane")}
+    wanted |= {name: place for name, place in sweeps().items() if name.startswith("waist")}
+    for name, place in wanted.items():
+        shot = render(place)
+        cells = [name, f"{bound_px(shot, speckle=False):.4f}"]
+        cells += [f"{spread(place, m, frames, 1.0, False).std_px:.4f}" for m in ONE_LINE if m != "quadratic"]
+        cells += [f"{grain_px(shot):.2f}", f"{spot_limit_px(shot):.3f}", f"{bound_px(shot, speckle=True):.3f}"]
+        cells += [f"{spread(place, m, frames).std_px:.3f}" for m in ONE_LINE if m != "quadratic"]
+        rows.append(cells)
+    three = [m for m in ONE_LINE if m != "quadratic"]
+    head = ["plane, std px", "noise only: bound", *three, "speckle grain px", "limit of a spot", "limit of a line"]
+    return table([*head, *(f"all, {m}" for m in three)], rows)
+
+
+def lateral_table(frames: int) -> str:
+    """Standard deviations of single lines and of means of five neighbouring ones, px, and what edges lose."""
+    rows = []
+    for name in (FIT, FIT_FIVE, MASS, FILTERED):
+        cells = [name]
+        for place in ("plane, near", "plane, far"):
+            s = spread(places()[place], name, frames)
+            cells += [f"{s.std_px:.3f}", f"{s.five_px:.3f}"]
+        limb = spread(places()["sphere, near"], name, frames)
+        cells += [f"{100 * limb.far_off:.2f} %", f"{100 * limb.found:.1f} %"]
+        rows.append(cells)
+    head = ["plane, std px", *(f"{p}: {c}" for p in ("near", "far") for c in ("one line", "mean of five"))]
+    return table([*head, "sphere, near: more than 2 px off", "lines found"], rows)
+
+
+def time_table() -> str:
+    """Time of extraction per frame of 1280 lines, all effects."""
+    rows = []
+    for method in StripeMethod:
+        times = []
+        for name in ("plane, near", "plane, far"):
+            image, options = shot_image(places()[name], 0, 1.0, True), StripeOptions(method=method)
+            each = []
+            for _ in range(TIMED):
+                start = time.perf_counter()
+                extract_stripe(image, stripe_along="width", options=options)
+                each.append(1e3 * (time.perf_counter() - start))
+            times.append(f"{np.median(each):.1f}")
+        rows.append([str(method), *times])
+    return table(["method", "plane, near: ms", "plane, far: ms"], rows)
+
+
+def _signed(value: float) -> str:
+    return f"{round_to_zero(value):+.3f}"
+
+
+def main() -> None:
+    """Render, measure, write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--frames", type=int, default=4, help="photographs of a place (default 4)")
+    frames, start = parser.parse_args().frames, time.perf_counter()
+    use_variant()
+    wanted = [*places().values(), *sweeps().values()]
+    with progress_bar("places") as progress:
+        for number, place in enumerate(wanted, start=1):
+            render(place)
+            progress(number, len(wanted))
+    tables = {
+        "spread": spread_table(frames), "bias": bias_table(frames), "limits": limits_table(frames),
+        "sweeps": sweep_table(frames), "exposure": exposure_table(frames), "lateral": lateral_table(frames),
+        "time": time_table(), "circles": circles_table(),
+    }  # fmt: skip
+    write_tables(PAGE, tables)
+    print(f"{len(wanted)} places, {frames} photographs each, in {time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""Evaluates one campaign: calibrates by every method, measures every scan, and studies what the results rest on."""
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwlts.calibration.model import Calibration
+from uwlts.calibration.nominal import nominal_calibration
+from uwlts.calibration.polynomial_model import PolynomialCalibration
+from uwlts.calibration.procedure import CalibrationOptions, gather
+from uwlts.capture import Capture
+from uwlts.errors import CaptureError
+from uwlts.files import written_aside
+from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
+from uwlts.scan import find_stripes, reconstruct_stripes
+from uwlts.thesis.budget import spacing_budget
+from uwlts.thesis.folder import MEDIA, CampaignFolder
+from uwlts.thesis.measurements import THESIS, Measurement, measure_scan
+from uwlts.thesis.methods import POLYNOMIALS, PROPOSED, TWO, AnyCalibration, calibrations
+from uwlts.thesis.monte_carlo import propagate
+from uwlts.thesis.sphere_scan import SphereScan, sphere_scan
+from uwlts.thesis.window_study import window_choices
+
+RESULTS = "results.json"
+FORMAT, VERSION = "uwlts-thesis-results", 1
+TRIALS = 100
+_SHOWN_LINES = {"one end": 0.05, "middle": 0.5, "other end": 0.95}
+Progress = Callable[[str, int, int], None]
+
+
+def evaluate_campaign(
+    folder: CampaignFolder, *, trials: int = TRIALS, workers: int | None = None, overwrite: bool = False,
+    progress: Progress = lambda stage, done, total: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Results of a campaign as plain JSON, kept in its file results.json; read from there if it exists.
+
+    Raises
+    ------
+    CaptureError
+        A recording that the calibration needs is missing, or a file is damaged.
+    CalibrationError
+        The recordings do not determine a calibration.
+    """
+    path = folder.path / RESULTS
+    if path.is_file() and not overwrite:
+        return read_results(path)
+    calibrated = calibrations(folder, progress=lambda done, total: progress("calibrations", done, total))
+    measurements = _measured(folder, calibrated, workers, progress)
+    proposed = calibrated[PROPOSED, "water"]
+    scans = _sphere_scans(folder, proposed)
+    choices, profiles = window_choices(folder, proposed, scans)
+    results = {
+        "format": FORMAT,
+        "version": VERSION,
+        "measurements": [asdict(found) for found in measurements],
+        "window": {choice.images: asdict(choice) for choice in choices},
+        "window_profiles": profiles,
+        "two_refractions_distance_mm": calibrated[TWO, "water"].window.distance_mm,
+        "polynomials": {medium: _curves(calibrated[POLYNOMIALS, medium]) for medium in MEDIA},
+        "budget": _budget(folder, measurements, proposed, scans),
+        "monte_carlo": _monte_carlo(folder, scans, trials, progress),
+        "line_profiles": {side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
+    }
+    with written_aside(path, overwrite=True) as aside:
+        aside.write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
+    return results
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Results as `evaluate_campaign` has kept them; CaptureError where the file is damaged or newer."""
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CaptureError(f"cannot read {path}: {error}; remove it to evaluate the campaign again") from error
+    if (results.get("format"), results.get("version")) != (FORMAT, VERSION):
+        raise CaptureError(f"{path} holds no results that this program reads; remove it to evaluate again")
+    return results
+
+
+def _measured(
+    folder: CampaignFolder, calibrated: dict[tuple[str, str], AnyCalibration], workers: int | None, progress: Progress
+) -> list[Measurement]:
+    """All scans, several at a time."""
+    clouds = folder.path / "clouds"
+    clouds.mkdir(exist_ok=True)
+    scans = folder.scans()
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), context) as pool:
+        jobs = [pool.submit(measure_scan, scan, calibrated, clouds=clouds) for scan in scans]
+        found = []
+        for number, job in enumerate(jobs, start=1):
+            found.append(job.result())
+            progress("measurements", number, len(jobs))
+    return list(chain.from_iterable(found))
+
+
+def _sphere_scans(folder: CampaignFolder, calibration: Calibration) -> list[SphereScan]:
+    found = []
+    for scan in folder.scans():
+        if (scan.thing, scan.medium) == ("spheres", "water"):
+            with Capture(scan.path) as capture:
+                found.append(sphere_scan(capture, calibration, placement=scan.placement))
+    return found
+
+
+def _curves(calibration: PolynomialCalibration) -> dict[str, Any]:
+    """Z(v) and Y(Z) of an outer, the middle and the other outer profile line (Figures 58 and 59), and the residual."""
+    lines = {}
+    known = np.flatnonzero(np.isfinite(calibration.domains()[:, 0]))
+    for name, share in _SHOWN_LINES.items():
+        row = int(known[round(share * (len(known) - 1))])
+        low, high = calibration.domains()[row]
+        centres = np.linspace(low, high, 60)
+        number = calibration.first_line + row
+        points = reconstruct_by_polynomials(
+            calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
+        ).points_mm
+        lines[name] = {
+            "line": number, "centre_px": np.round(centres, 3).tolist(),
+            "y_mm": np.round(points[:, 1], 4).tolist(), "z_mm": np.round(points[:, 2], 4).tolist(),
+        }  # fmt: skip
+    return {"lines": lines, "residual_mm": calibration.residuals["depth"]["rms_mm"]}
+
+
+def _budget(
+    folder: CampaignFolder, measurements: list[Measurement], calibration: Calibration, scans: list[SphereScan]
+) -> dict[str, float]:
+    with Capture(folder.steps()[0]) as capture:
+        medium = capture.header.medium
+    wanted = ("spheres", "water", PROPOSED, THESIS)
+    spheres = [m for m in measurements if (m.thing, m.medium, m.method, m.processing) == wanted]
+    return spacing_budget(
+        calibration, scans, medium,
+        deviation_mm=max((m.figures_mm["STD"] for m in spheres if "STD" in m.figures_mm), default=0.0),
+    )  # fmt: skip
+
+
+def _monte_carlo(
+    folder: CampaignFolder, scans: list[SphereScan], trials: int, progress: Progress
+) -> list[dict[str, Any]]:
+    if trials == 0 or not scans:
+        return []
+    options = CalibrationOptions(refractions=1)
+    with ExitStack() as stack:
+        air = [stack.enter_context(Capture(folder.target("air")))]
+        steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
+        evidence, medium = gather(air, steps, options=options), steps[0].header.medium
+    found = propagate(
+        evidence, scans, medium, _knowledge(folder), options=options, trials=trials,
+        progress=lambda done, total: progress("Monte Carlo", done, total),
+    )  # fmt: skip
+    return [
+        {
+            "placement": each.placement, "observed_mm": each.observed_mm, "std_mm": each.std_mm(),
+            "interval_mm": each.interval_mm(), "contains_truth": each.contains_truth(), "trials": len(each.trials_mm),
+        }
+        for each in found
+    ]  # fmt: skip
+
+
+def _knowledge(folder: CampaignFolder) -> dict[str, float]:
+    """What is known of the inputs, from the plan that lies beside the campaigns; nothing without one."""
+    path = folder.path.parent / "plan.json"
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["campaign"]["imperfections"])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CaptureError(f"{path} does not tell the campaign's imperfections: {error}") from error
+
+
+def _line_profile(folder: CampaignFolder, side: str) -> dict[str, Any] | None:
+    """Stripe on the pipe by the calibration of a sensor that is as described: its length along Y and points, mm."""
+    path = folder.line(side)
+    if path is None:
+        return None
+    with Capture(path) as capture:
+        header = capture.header
+        cloud = reconstruct_stripes(capture, find_stripes(capture), nominal_calibration(header.sensor, header.medium))
+    points = cloud.cloud.points_mm[:, 1:]
+    return {"length_mm": float(np.ptp(points[:, 0])), "points_mm": np.round(points[::4], 3).tolist()}

@@ -1,0 +1,228 @@
+"""Uncertainty of the sphere spacing by propagating distributions through the whole pipeline (JCGM 101:2008).
+
+Each trial draws every input of the calibration and of the measurement from what is known of it, calibrates camera,
+sheet and window anew, reconstructs the spheres and measures their spacing. The inputs are perturbed about what was
+observed: circle centres, stripes, stage positions, the target's lattice, its tilt and bow, the step's height, the
+window's tilt and the water's index. The sheet's bow is not among them: the model has a plane.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwlts.calibration.evidence import AirEvidence, StepEvidence
+from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, Evidence, solve
+from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.sensor import Medium
+from uwlts.thesis.sphere_scan import SphereScan
+from uwlts.thesis.window_study import spacing_error
+
+COVERAGE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Propagated:
+    """Trials of the sphere spacing error, mm, of one scan, and the shortest interval that holds 95 % of them.
+
+    ``observed_mm`` is the error measured with the unperturbed calibration, ``trials_mm`` (T,) are the trials'.
+    """
+
+    placement: str
+    observed_mm: float
+    trials_mm: np.ndarray
+
+    def std_mm(self) -> float:
+        """Standard uncertainty of the spacing."""
+        return float(np.std(self.trials_mm, ddof=1))
+
+    def interval_mm(self) -> tuple[float, float]:
+        """Shortest interval of spacing errors that holds 95 % of the trials (JCGM 101, 7.7.4)."""
+        ordered = np.sort(self.trials_mm)
+        held = int(np.ceil(COVERAGE * len(ordered)))
+        widths = ordered[held - 1 :] - ordered[: len(ordered) - held + 1]
+        first = int(np.argmin(widths))
+        return float(ordered[first]), float(ordered[first + held - 1])
+
+    def contains_truth(self) -> bool:
+        """Whether the interval holds an error of zero, that is, the calibrated spacing."""
+        low, high = self.interval_mm()
+        return low <= 0 <= high
+
+
+def propagate(
+    evidence: Evidence,
+    scans: Sequence[SphereScan],
+    medium: Medium,
+    knowledge: Mapping[str, float],
+    *,
+    options: CalibrationOptions,
+    trials: int,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Propagated]:
+    """Propagate what is known of the inputs to the sphere spacing of every scan.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Of a calibration with step images.
+    scans : sequence of SphereScan
+    medium : Medium
+        In which step and spheres were recorded.
+    knowledge : mapping
+        Standard deviations and half widths by the names of the campaign's imperfections; what is missing counts as 0.
+    trials : int
+        At least 20.
+
+    Raises
+    ------
+    CalibrationError
+        The unperturbed evidence gives no calibration, or more than a tenth of the trials fail.
+    """
+    start = solve(evidence, options=options)
+    # Offsets of circle centres hardly change from trial to trial; they are taken out once.
+    if start.bias_px is not None:
+        images = [
+            replace(image, pixels=image.pixels - bias)
+            for image, bias in zip(evidence.air.images, start.bias_px, strict=True)
+        ]
+        evidence = replace(evidence, air=replace(evidence.air, images=images))
+        options = replace(options, correct_circles=False)
+    draw = _Draw(evidence, start, medium, knowledge, wavelength_nm=start.calibration.wavelength_nm)
+    found: list[list[float]] = []
+    for trial in range(trials):
+        try:
+            found.append(_trial(draw, scans, options, start, np.random.default_rng([seed, trial])))
+        except (CalibrationError, EvaluationError):
+            if trial + 1 - len(found) > max(2, trials // 10):
+                raise
+        progress(trial + 1, trials)
+    spacing = np.array(found)
+    return [
+        Propagated(scan.placement, spacing_error(start.calibration, scan), spacing[:, number])
+        for number, scan in enumerate(scans)
+    ]
+
+
+def _trial(
+    draw: "_Draw", scans: Sequence[SphereScan], options: CalibrationOptions, start: CalibrationResult,
+    rng: np.random.Generator,
+) -> list[float]:  # fmt: skip
+    perturbed = draw.evidence(rng)
+    calibration = solve(perturbed, options=options, start=start.camera).calibration
+    index = draw.index(rng)
+    lead, direction = draw.scan(rng)
+    errors = []
+    for scan in scans:
+        drawn = replace(
+            scan,
+            pixels=draw.stripe(scan.pixels, rng),
+            stage_mm=scan.stage_mm * (1 + lead),
+            stage_direction=_turned(scan.stage_direction, direction),
+        )
+        errors.append(spacing_error(calibration, drawn, medium_index=index))
+    return errors
+
+
+class _Draw:
+    """Draws inputs about those observed."""
+
+    def __init__(
+        self, evidence: Evidence, start: CalibrationResult, medium: Medium, knowledge: Mapping[str, float], *,
+        wavelength_nm: float,
+    ):  # fmt: skip
+        self._evidence, self._medium, self._wavelength = evidence, medium, wavelength_nm
+        self._known = {name: float(value) for name, value in knowledge.items()}
+        self._circle_px = start.camera.sigma_px
+        # Of a stripe's points about the sheet, seen from the camera: mm over the sine of the angle, mm per px.
+        depth = float(np.mean(start.stripe_points.points_mm[:, 2]))
+        crossing = abs(start.sheet.model.normal[2]) or 1.0
+        across = np.sqrt(max(1e-6, 1 - crossing**2))
+        self._stripe_px = start.sheet.rms_mm * start.calibration.camera.fx_px / depth / across
+        axis = np.linalg.inv(start.calibration.object_transform())[:3, 2]
+        self._seen_from = np.array([axis[0] / axis[2], axis[1] / axis[2], 0.0])
+        self._along_width = start.calibration.stripe_along == "width"
+
+    def _std(self, name: str) -> float:
+        return self._known.get(name, 0.0)
+
+    def evidence(self, rng: np.random.Generator) -> Evidence:
+        """The calibration's evidence with all of its inputs drawn."""
+        air, steps = self._air(self._evidence.air, rng), self._steps(rng)
+        plate = self._evidence.plate
+        tilt = self._std("window_tilt_std_deg") * rng.standard_normal(2)
+        turned = plate.model_copy(
+            update={"tilt_x_deg": plate.tilt_x_deg + float(tilt[0]), "tilt_y_deg": plate.tilt_y_deg + float(tilt[1])}
+        )
+        return replace(self._evidence, air=air, steps=steps, plate=turned)
+
+    def _air(self, air: AirEvidence, rng: np.random.Generator) -> AirEvidence:
+        tilt = np.radians(self._std("target_tilt_std_deg")) * rng.standard_normal(2)
+        lead = self._std("stage_lead_std") * rng.standard_normal()
+        bow = self._std("target_bow_std_mm") * rng.standard_normal()
+        shifts: dict[tuple[float, ...], np.ndarray] = {}
+        farthest = max(float(np.linalg.norm(image.points_mm, axis=1).max()) for image in air.images)
+        middle = np.mean([image.stage_mm for image in air.images])
+        images = []
+        for image in air.images:
+            printed = np.array(
+                [
+                    shifts.setdefault(
+                        tuple(point), self._std("circle_centre_std_mm") * np.append(rng.standard_normal(2), 0.0)
+                    )
+                    for point in image.points_mm.tolist()
+                ]
+            )
+            # A plate that is not square to the travel moves sideways on itself; what stands out from a bowed one
+            # seems shifted towards the camera's side, by the tangent of the angle it is seen at.
+            sideways = np.append(tilt, 0.0) * (image.stage_mm - middle)
+            out = bow * (np.linalg.norm(image.points_mm, axis=1, keepdims=True) / farthest) ** 2 * self._seen_from
+            stage = image.stage_mm + lead * (image.stage_mm - middle)
+            images.append(
+                replace(
+                    image,
+                    points_mm=image.points_mm + printed + sideways + out,
+                    pixels=image.pixels + self._circle_px * rng.standard_normal(image.pixels.shape),
+                    stage_mm=stage + self._std("stage_position_std_mm") * rng.standard_normal(),
+                )
+            )
+        return replace(air, images=images, stripes=[self.stripe(pixels, rng) for pixels in air.stripes])
+
+    def _steps(self, rng: np.random.Generator) -> list[StepEvidence]:
+        higher = self._std("step_height_half_width_mm") * rng.uniform(-1, 1)
+        index = self.index(rng)
+        return [
+            replace(
+                step,
+                pixels=self.stripe(step.pixels, rng),
+                standard=step.standard.model_copy(update={"height_mm": step.standard.height_mm + higher}),
+                medium_index=index,
+            )
+            for step in self._evidence.steps
+        ]
+
+    def index(self, rng: np.random.Generator) -> float:
+        """Index of the water at a temperature drawn."""
+        warmer = self._std("temperature_half_width_c") * rng.uniform(-1, 1)
+        warm = self._medium.model_copy(update={"temperature_c": self._medium.temperature_c + warmer})
+        return warm.refractive_index(self._wavelength)
+
+    def scan(self, rng: np.random.Generator) -> tuple[float, np.ndarray]:
+        """Relative error of the stage's lead, and by how much its travel is turned, in rad about two axes."""
+        lead = self._std("stage_lead_std") * rng.standard_normal()
+        return lead, np.radians(self._std("stage_misalignment_std_deg")) * rng.standard_normal(2)
+
+    def stripe(self, pixels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Stripe pixels (N, 2) with the noise that stripes on the target have, across the stripe."""
+        noise = np.zeros_like(pixels)
+        noise[:, 1 if self._along_width else 0] = self._stripe_px * rng.standard_normal(len(pixels))
+        return pixels + noise
+
+
+def _turned(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """A unit direction (3,) turned by two small angles about axes square to it."""
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    first /= np.linalg.norm(first)
+    turned = direction + angles[0] * first + angles[1] * np.cross(direction, first)
+    return turned / np.linalg.norm(turned)

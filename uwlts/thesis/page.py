@@ -1,0 +1,106 @@
+"""The reproduction's report: one HTML page that holds everything it shows and asks nothing of the network."""
+
+from collections.abc import Sequence
+from importlib.resources import files
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment
+from markupsafe import Markup
+
+import uwlts
+from uwlts.capture import Capture
+from uwlts.cloud import read_cloud
+from uwlts.report.cloud_picture import cloud_picture
+from uwlts.report.numbers import typographic
+from uwlts.report.pictures import data_uri, png
+from uwlts.report.stripe_picture import stripe_picture, stripe_view
+from uwlts.thesis.figures import (
+    comparison_figure,
+    line_figure,
+    polynomials_figures,
+    window_distance_figure,
+)
+from uwlts.thesis.folder import campaign_folders
+from uwlts.thesis.published import Published
+from uwlts.thesis.tables import MEAN, TableRow
+
+_TITLES = {
+    "Table 2": "spheres by the polynomials",
+    "Table 3": "planes by the polynomials",
+    "Table 4": "window distance by the step images used",
+    "Table 5": "one and two refractions",
+    "Table 6": "spheres by the proposed method",
+    "Table 7": "planes by the proposed method",
+    "Table 8": "sphere spacing error as a share of the volume's depth",
+    "Table 9": "uncertainty budget of the sphere spacing in water",
+    "Figure 58": "residual of the polynomials Z(v)",
+    "Figure 66": "objects without calibrated values: spread about the true surface after a best fit",
+    "Figure 67": "line length on the pipe",
+}
+
+
+def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[TableRow], published: Published) -> str:
+    """The page as text, with pictures from the first campaign in the folder."""
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["minus"] = typographic
+    template = environment.from_string(files("uwlts.thesis").joinpath("template.html.j2").read_text(encoding="utf-8"))
+    first = results[0]
+    z_of_v, y_of_z = polynomials_figures(first)
+    headline = [
+        row for row in rows if f", {MEAN}," in row.row and row.table in ("Table 2", "Table 3", "Table 6", "Table 7")
+    ]
+    shown = [row for row in rows if row.table == "Figure 66" and row.quantity == "STD" and ", thesis image" in row.row]
+    return template.render(
+        published=published.title,
+        campaigns=len(results),
+        headline=headline,
+        far_off=[row for row in headline if row.ratio is not None and not 1 / 1.5 <= row.ratio <= 1.5],
+        tables=[(name, _TITLES.get(name, ""), list(group)) for name, group in groupby(rows, lambda row: row.table)],
+        figures=[
+            ("Figure 66", "Means over the positions: bars are ours (blue in water, red in air), the line spans the "
+             "campaigns, diamonds are the thesis's.", Markup(comparison_figure([*headline, *shown]))),
+            ("Figure 45", "Points on a step for several window distances.", Markup(window_distance_figure(first))),
+            ("Figure 58", "Polynomials Z(v).", Markup(z_of_v)),
+            ("Figure 59", "Polynomials Y(Z).", Markup(y_of_z)),
+        ]
+        + ([("Figure 67", "Stripe on a 300 mm pipe.", Markup(line_figure(first)))] if first["line_profiles"] else []),
+        monte_carlo=_monte_carlo(results),
+        failures=[
+            (number, m) for number, result in enumerate(results) for m in result["measurements"] if m["failure"]
+        ],
+        pictures=_pictures(folder),
+        version=uwlts.__version__,
+    )  # fmt: skip
+
+
+def _monte_carlo(results: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """How often the Monte-Carlo interval and the budget's hold the truth."""
+    trials = [each for result in results for each in result["monte_carlo"]]
+    if not trials:
+        return None
+    expanded = [
+        abs(each["observed_mm"]) <= result["budget"]["expanded"] for result in results for each in result["monte_carlo"]
+    ]
+    return {
+        "intervals": [
+            (number, each) for number, result in enumerate(results) for each in result["monte_carlo"]
+        ],
+        "held": sum(each["contains_truth"] for each in trials),
+        "budget_held": sum(expanded),
+        "count": len(trials),
+    }  # fmt: skip
+
+
+def _pictures(folder: Path) -> list[tuple[str, str, str]]:
+    """Name, stripe and cloud of the objects of the first campaign that have a coloured cloud."""
+    campaign = campaign_folders(folder)[0]
+    found = []
+    for cloud in sorted((campaign.path / "clouds").glob("*-proposed.ply")):
+        name = cloud.stem.removesuffix("-proposed")
+        with Capture(campaign.path / f"{name}.h5") as capture:
+            view = stripe_view(capture)
+        stripe = "" if view is None else data_uri(png(stripe_picture(view)))
+        found.append((name, stripe, data_uri(png(cloud_picture(read_cloud(cloud))))))
+    return found

@@ -1,0 +1,204 @@
+"""The thesis's tables with ours beside theirs: one row for every value, over all campaigns."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from uwlts.thesis.folder import MEDIA, STEP_PLACES
+from uwlts.thesis.measurements import OURS, THESIS, VARIANTS
+from uwlts.thesis.methods import FORGOTTEN, POLYNOMIALS, PROPOSED, SINGLE, TWO
+from uwlts.thesis.published import Published
+
+MEAN = "mean"
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """One value of a table: published, and ours in every campaign; errors count without their sign."""
+
+    table: str
+    row: str
+    quantity: str
+    published: float | None
+    ours: tuple[float, ...]
+
+    @property
+    def mean(self) -> float | None:
+        """Mean of ours over the campaigns."""
+        return float(np.mean(self.ours)) if self.ours else None
+
+    @property
+    def ratio(self) -> float | None:
+        """Our mean over the published value."""
+        return self.mean / self.published if self.published and self.mean is not None else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As the summary file holds it."""
+        return {
+            "table": self.table,
+            "row": self.row,
+            "quantity": self.quantity,
+            "published": self.published,
+            "ours_mean": self.mean,
+            "ours_min": min(self.ours, default=None),
+            "ours_max": max(self.ours, default=None),
+        }
+
+
+def all_rows(results: Sequence[dict[str, Any]], published: Published) -> list[TableRow]:
+    """Rows of all tables from the results of campaigns (`uwlts.thesis.evaluation`)."""
+    spheres, planes = ("spheres", ("PE", "STD", "SSE")), ("plane", ("RE", "STD"))
+    seen = _Seen(results, published)
+    rows = [
+        *seen.objects("Table 2", *spheres, POLYNOMIALS, THESIS),
+        *seen.objects("Table 3", *planes, POLYNOMIALS, THESIS),
+        *_window(results, published),
+        *_refractions(seen),
+        *seen.objects("Table 6", *spheres, PROPOSED, THESIS),
+        *seen.objects("Table 7", *planes, PROPOSED, THESIS),
+        *_shares(seen),
+        *_budget(results, published),
+        *_line(results, published),
+    ]
+    for method in (PROPOSED, POLYNOMIALS, TWO, SINGLE):
+        table = f"Our stripe centre, {method}"
+        rows += [*seen.objects(table, *spheres, method, OURS), *seen.objects(table, *planes, method, OURS)]
+    rows += seen.objects("Experiment: window forgotten in air", "spheres", ("SSE",), FORGOTTEN, THESIS)
+    for processing in VARIANTS:
+        rows += seen.objects(f"Experiment: {processing}", "spheres", ("PE", "STD"), PROPOSED, processing)
+    for thing, name in (("spheres", "PE of all points"), ("plane", "RE of all points")):
+        rows += seen.objects("Experiment: no point left out", thing, (name,), PROPOSED, THESIS)
+    return [*rows, *_free_forms(seen)]
+
+
+def _collected(results: Sequence[dict[str, Any]], value: Callable[[dict[str, Any]], float | None]) -> tuple[float, ...]:
+    """A value of every campaign that has it, without its sign."""
+    found = (value(result) for result in results)
+    return tuple(abs(number) for number in found if number is not None)
+
+
+def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
+    """Rows of one quantity and their mean over the positions, campaign by campaign."""
+    yield from rows
+    theirs = [row.published for row in rows]
+    complete = [row.ours for row in rows if row.ours]
+    counts = {len(values) for values in complete}
+    if complete and len(counts) == 1:
+        yield TableRow(
+            rows[0].table, name, rows[0].quantity,
+            None if None in theirs else float(np.mean(theirs)), tuple(np.mean(complete, axis=0).tolist()),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """All campaigns' measurements, looked up by what was measured and how."""
+
+    results: Sequence[dict[str, Any]]
+    published: Published
+
+    def figures(
+        self, thing: str, place: str, medium: str, method: str, processing: str, name: str
+    ) -> tuple[float, ...]:
+        """A figure of every campaign that has it, without its sign."""
+        wanted = {"thing": thing, "placement": place, "medium": medium, "method": method, "processing": processing}
+        return tuple(
+            abs(found["figures_mm"][name])
+            for result in self.results
+            for found in result["measurements"]
+            if wanted.items() <= found.items() and name in found["figures_mm"]
+        )
+
+    def objects(self, table: str, thing: str, names: Sequence[str], method: str, processing: str) -> Iterator[TableRow]:
+        """Rows of a thing's positions in both media and their means; published values are those of the same method."""
+        source = method if method in (PROPOSED, POLYNOMIALS) else PROPOSED
+        for medium, name in product(MEDIA, names):
+            rows = []
+            for number, place in enumerate(self.published.positions(thing)):
+                theirs = self.published.value(thing, source, medium, name.removesuffix(" of all points"), number)
+                ours = self.figures(thing, place, medium, method, processing, name)
+                rows.append(TableRow(table, f"{thing}, {place}, {medium}", name, theirs, ours))
+            if any(row.ours for row in rows):
+                yield from _with_mean(rows, f"{thing}, {MEAN}, {medium}")
+
+
+def _window(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
+    sets = [(f"{place} {n}", (place, n - 1)) for place in STEP_PLACES for n in (1, 2, 3)]
+    sets += [(place, (place, 3)) for place in STEP_PLACES] + [("all", ("all",))]
+    for quantity, key, source in (
+        ("window distance", "distance_mm", "window"),
+        ("mean SSE", "mean_sse_mm", "window_sse"),
+    ):
+        for name, path in sets:
+            ours = _collected(results, lambda r, n=name, k=key: r["window"].get(n, {}).get(k))
+            yield TableRow("Table 4", f"step images: {name}", quantity, published.value(source, *path), ours)
+    ours = _collected(results, lambda r: r["two_refractions_distance_mm"])
+    yield TableRow(
+        "Table 4", "two refractions, all", "window distance", published.value("window", "two_refractions"), ours
+    )
+
+
+def _refractions(seen: _Seen) -> Iterator[TableRow]:
+    for (key, method), name in product((("one", PROPOSED), ("two", TWO)), ("STD", "SSE")):
+        rows = [
+            TableRow(
+                "Table 5", f"{key} refraction{'s' if key == 'two' else ''}, {place}", name,
+                seen.published.value("refractions", key, name, number),
+                seen.figures("spheres", place, "water", method, THESIS, name),
+            )
+            for number, place in enumerate(seen.published.positions("spheres"))
+        ]  # fmt: skip
+        yield from _with_mean(rows, f"{key} refraction{'s' if key == 'two' else ''}, {MEAN}")
+
+
+def _shares(seen: _Seen) -> Iterator[TableRow]:
+    for medium, method in product(MEDIA, (POLYNOMIALS, PROPOSED)):
+        rows = [r for r in seen.objects("Table 8", "spheres", ("SSE",), method, THESIS) if f"{MEAN}, {medium}" in r.row]
+        depth = seen.published.value("depth_mm", medium)
+        for mean in rows:
+            shares = tuple(100 * value / depth for value in mean.ours)
+            theirs = seen.published.value("share_percent", medium, method)
+            yield TableRow("Table 8", f"{method}, {medium}", "SSE over depth, %", theirs, shares)
+
+
+def _budget(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
+    names = list(published.content["budget"])
+    for name in names:
+        ours = _collected(results, lambda r, n=name: r["budget"].get(n))
+        yield TableRow("Table 9", name.replace("_", " "), _unit_of(name), published.value("budget", name), ours)
+
+
+def _unit_of(name: str) -> str:
+    known = {"degrees_of_freedom": "effective", "expanded": "U, 95 %", "correction": "C", "largest_error": "C + U"}
+    return known.get(name, "u")
+
+
+def _line(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
+    theirs = {"width": published.value("line", "length_mm"), "height": None}
+    for side, length in theirs.items():
+        ours = _collected(results, lambda r, s=side: r["line_profiles"].get(s, {}).get("length_mm"))
+        yield TableRow(
+            "Figure 67", f"300 mm pipe at the stand-off, stripe along the {side}", "line length", length, ours
+        )
+    for medium in MEDIA:
+        ours = _collected(results, lambda r, m=medium: r["polynomials"][m]["residual_mm"])
+        theirs_mm = published.value("line", "polynomial_residual_mm")
+        yield TableRow("Figure 58", f"Z(v) in {medium}", "residual", theirs_mm, ours)
+
+
+def _free_forms(seen: _Seen) -> Iterator[TableRow]:
+    """STD of the objects of Figure 66 whose values the thesis draws and does not print."""
+    keys = {
+        tuple(found[key] for key in ("thing", "placement", "medium", "method", "processing"))
+        for result in seen.results
+        for found in result["measurements"]
+        if found["thing"] in ("pipe", "head", "weld")
+    }
+    for key in sorted(keys):
+        thing, _, medium, method, processing = key
+        for name in ("STD", "diameter error") if thing == "pipe" else ("STD",):
+            row = f"{thing}, {medium}, {method}, {processing} image processing"
+            yield TableRow("Figure 66", row, name, None, seen.figures(*key, name))
