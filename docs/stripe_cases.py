@@ -17,9 +17,9 @@ from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor
 from uwlts.stripe import StripeOptions, extract_stripe
 
-DEFAULT, MASS, FILTERED = "zero crossing", "centre of mass", "5x5 mean, quadratic"
+CROSSING, MASS, FILTERED = "zero crossing", "centre of mass", "5x5 mean, quadratic"
 METHODS = {
-    DEFAULT: StripeOptions(method="zero-crossing"),
+    CROSSING: StripeOptions(method="zero-crossing"),
     MASS: StripeOptions(method="centre-of-mass"),
     "quadratic": StripeOptions(method="quadratic"),
     # A mean of five pixels has a standard deviation of sqrt((25 - 1) / 12) px.
@@ -97,7 +97,7 @@ class Frames:
     crop: np.ndarray
     crop_at: tuple[int, int]
 
-    def spread(self, method: str = DEFAULT) -> "Spread":
+    def spread(self, method: str = CROSSING) -> "Spread":
         """Bias and spread over all used lines."""
         error = np.where(self.used, self.error_px[method], np.nan)
         return Spread.of(error, error * self.mm_per_px, found=float(np.isfinite(error)[self.used].mean()))
@@ -154,9 +154,9 @@ def measure(case: Case) -> Frames:
         truth, image = true_stripe(studio.renderer, studio.pose(shot)), studio.image(shot, index)
         truths.append(truth)
         found = {name: extract_stripe(image, stripe_along="width", options=wanted) for name, wanted in METHODS.items()}
-        widths.append(found[DEFAULT].width_px)
+        widths.append(found[CROSSING].width_px)
         centres.append({name: stripe.centre_px for name, stripe in found.items()})
-        centres[-1][VERTEX] = np.where(np.isfinite(found[DEFAULT].centre_px), _vertex(image), np.nan)
+        centres[-1][VERTEX] = np.where(np.isfinite(found[CROSSING].centre_px), _vertex(image), np.nan)
         if crop is None:
             middle = image.shape[1] // 2
             corner = (int(np.nan_to_num(truth.centre_px[middle])) - CROP_PX // 2, middle)

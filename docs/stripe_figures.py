@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from stripe_cases import CROP_PX, DEFAULT, MASS, Frames, measure
+from stripe_cases import CROP_PX, CROSSING, MASS, Frames, measure
 from stripe_plan import (
     DEPTHS,
     F_NUMBERS,
@@ -138,7 +138,7 @@ def _gloss(plan: Plan, path: Path) -> None:
         middles, curves = (edges[1:] + edges[:-1]) / 2, []
         for (_, name), colour in zip([key for key in cases if key[0] == thing], COLOURS, strict=False):
             frames = measure(cases[thing, name])
-            error, y = np.where(frames.used, frames.error_px[DEFAULT], np.nan), frames.point_mm[..., 1]
+            error, y = np.where(frames.used, frames.error_px[CROSSING], np.nan), frames.point_mm[..., 1]
             inside = [error[(y >= a) & (y < b) & np.isfinite(error)] for a, b in pairwise(edges)]
             bias = [float(np.median(part)) if part.size else math.nan for part in inside]
             curves.append(Curve(name, middles, bias, colour, marked=False, dashed="light" in name))
@@ -177,7 +177,7 @@ def _strips(plan: Plan, path: Path) -> None:
             first_row, first = frames.crop_at
             lines = np.arange(CROP_PX)
             x = left + ZOOM * (lines + 0.5)
-            truth, error = (v[0, first : first + CROP_PX] for v in (frames.truth_px, frames.error_px[DEFAULT]))
+            truth, error = (v[0, first : first + CROP_PX] for v in (frames.truth_px, frames.error_px[CROSSING]))
             y = top + ZOOM * (truth - first_row + 0.5)
             line(picture, np.column_stack([x, y]), colour=ORANGE)
             for a, b in zip(x, y + ZOOM * error, strict=True):

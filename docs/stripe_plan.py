@@ -21,9 +21,7 @@ CORE = ("noise", "fixed-pattern", "speckle", "defocus")
 DEPTHS = (-80.0, -60.0, -30.0, 0.0, 30.0, 60.0, 90.0, 120.0)
 F_NUMBERS = (2.8, 4.0, 5.6, 8.0, 11.0, 16.0)
 TURBIDITIES = (0.0, 1.0, 2.0, 2.5, 3.0)
-WALK_SAMPLES = (4, 16, 32)
 LEVELS = (0.2, 0.4, 0.8, 1.2, 1.6, 2.4, 4.0, 8.0)
-PROFILES = {"plane": 150, "spheres": 38}
 THESIS_STD = {
     ("plane", "water"): {"near": (0.07, 0.10), "stand-off": (0.10, 0.09), "far": (0.10, 0.09)},
     ("plane", "air"): {"near": (0.05, 0.09), "stand-off": (0.06, 0.07), "far": (0.05, 0.06)},
@@ -31,11 +29,6 @@ THESIS_STD = {
     ("spheres", "air"): {"near": (0.095, 0.085), "stand-off": (0.09, 0.08), "far": (0.085, 0.075)},
 }
 """Thesis, Tables 2, 3, 6, 7, mm: polynomial and proposed method, square planes, means of two positions of spheres."""
-THESIS_RANGE = {
-    "plane": {"near": 0.62, "stand-off": 0.50, "far": 0.50},
-    "spheres": {"near": 0.675, "stand-off": 0.51, "far": 0.47},
-}
-"""RE and PE in water in mm, proposed method (Tables 6 and 7), means of two positions of the spheres."""
 
 
 def exactly(*names: str) -> Effects:
@@ -94,10 +87,6 @@ class Plan:
             for name, effects in rows.items() for water in TURBIDITIES
         }  # fmt: skip
 
-    def walks(self) -> dict[int, Case]:
-        """Scatter in harbour water by samples per pixel, to tell the renderer's own noise from the light's."""
-        return {spp: self.case(ROWS["only scatter"], water=3.0, frames=1, spp=spp) for spp in WALK_SAMPLES}
-
     def gloss(self) -> dict[tuple[str, str], Case]:
         rows = {
             "diffuse": NONE, "glossy": exactly("gloss"), "diffuse, light between surfaces": exactly("secondary-light"),
@@ -133,16 +122,6 @@ class Plan:
             for name, change in changes.items() for place, z in PLACES["plane"].items()
         }  # fmt: skip
 
-    def thesis(self) -> dict[tuple[str, str, str], Case]:
-        """By object, medium and place; the spheres in water with all their profiles."""
-        return {
-            (thing, medium, place): self.case(
-                exactly(*CORE, "gloss"), thing=thing, medium=medium, z_mm=z,
-                frames=PROFILES[thing] if (thing, medium) == ("spheres", "water") else self.frames,
-            )
-            for thing in PLACES for medium in ("water", "air") for place, z in PLACES[thing].items()
-        }  # fmt: skip
-
     def pictures(self) -> dict[tuple[str, str], Case]:
         """One frame each, by water and row."""
         rows = ("none", "only defocus", "only speckle", "only noise", NAME_ALL)
@@ -153,6 +132,6 @@ class Plan:
         """All cases, each once."""
         studies = (
             self.effects("plane"), self.effects("spheres"), self.depth(), self.f_number(), self.turbidity(),
-            self.walks(), self.gloss(), self.exposure(), self.unknown(), self.thesis(), self.pictures(),
+            self.gloss(), self.exposure(), self.unknown(), self.pictures(),
         )  # fmt: skip
         return list(dict.fromkeys(case for study in studies for case in study.values()))

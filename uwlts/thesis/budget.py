@@ -44,16 +44,15 @@ def spacing_budget(
         for sign in (1, -1)
     )
     ends = [each.refractive_index(calibration.wavelength_nm) for each in (warm, cold)]
-    half_width = abs(ends[0] - ends[1]) / 2
     changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in ends]
-    per_index = np.mean(np.abs(np.subtract(*changes))) / (2 * half_width)
+    by_index = float(np.mean(np.abs(np.subtract(*changes)))) / 2
     expansion = thermal_expansion_mm(
         length_mm=scans[0].spacing_mm, alpha_per_k=_EXPANSION_PER_K, temperature_change_k=TEMPERATURE_HALF_WIDTH_C
     )
     resolution = _SUBPIXEL * mm_per_px(calibration, scans[0].medium_index)
     budget = combine(
         [
-            Source(name="index", half_width=half_width, distribution="uniform", sensitivity=float(per_index)),
+            Source(name="index", half_width=by_index, distribution="uniform"),
             Source(name="expansion", half_width=expansion, distribution="uniform"),
             Source(name="resolution", half_width=resolution / 2, distribution="uniform"),
             Source(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),

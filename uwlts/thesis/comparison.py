@@ -10,10 +10,8 @@ from typing import Any
 from uwlts.files import written_aside
 from uwlts.thesis.page import report_page
 from uwlts.thesis.published import Published
-from uwlts.thesis.tables import MEAN, TableRow, all_rows
+from uwlts.thesis.tables import MEAN, TableRow, all_rows, headline_rows
 
-LARGEST_RATIO = 1.5
-"""Our means should be within this factor of the published ones."""
 _COLUMNS = ("table", "row", "quantity", "published", "ours_mean", "ours_min", "ours_max")
 
 
@@ -38,13 +36,6 @@ def write_comparison(
         with written_aside(folder / name, overwrite=overwrite) as aside:
             aside.write_text(text, encoding="utf-8")
     return rows
-
-
-def headline_rows(rows: Sequence[TableRow]) -> list[TableRow]:
-    """The means over the positions of Tables 2, 3, 6 and 7, by which a reproduction is judged."""
-    return [
-        row for row in rows if row.table in ("Table 2", "Table 3", "Table 6", "Table 7") and f", {MEAN}," in row.row
-    ]
 
 
 def markdown(rows: Sequence[TableRow], results: Sequence[dict[str, Any]]) -> str:

@@ -81,7 +81,8 @@ def read_results(path: Path) -> dict[str, Any]:
         results = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise CaptureError(f"cannot read {path}: {error}; remove it to evaluate the campaign again") from error
-    if (results.get("format"), results.get("version")) != (FORMAT, VERSION):
+    known = isinstance(results, dict) and (results.get("format"), results.get("version")) == (FORMAT, VERSION)
+    if not known:
         raise CaptureError(f"{path} holds no results that this program reads; remove it to evaluate again")
     return results
 
@@ -134,6 +135,8 @@ def _curves(calibration: PolynomialCalibration) -> dict[str, Any]:
 def _budget(
     folder: CampaignFolder, measurements: list[Measurement], calibration: Calibration, scans: list[SphereScan]
 ) -> dict[str, float]:
+    if len(scans) < 2:
+        return {}
     with Capture(folder.steps()[0]) as capture:
         medium = capture.header.medium
     wanted = ("spheres", "water", PROPOSED, THESIS)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from uwlts.report.canvas import ticks
 from uwlts.report.svg_plot import COLOURS, FAINT, INK, Curve, Panel, svg
 from uwlts.thesis.tables import TableRow
 
@@ -55,15 +56,14 @@ def line_figure(result: dict[str, Any]) -> str:
 def comparison_figure(rows: Sequence[TableRow]) -> str:
     """Figure 66: means over the positions, ours as bars with the campaigns' range, the published ones as diamonds."""
     width = _LABEL + _ROOM + 70
-    largest = max([max(row.ours) for row in rows if row.ours] + [row.published or 0.0 for row in rows]) * 1.05
+    largest = max([0.02, *(max(row.ours) for row in rows if row.ours), *(row.published or 0.0 for row in rows)]) * 1.05
     parts, y = [], 30.0
 
     def at(value: float) -> float:
         return _LABEL + _ROOM * value / largest
 
-    step = next(s for s in (0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10) if largest / s <= 10)
     height = y + len(rows) * (_BAR + _GAP) + 34
-    for mark in np.arange(0, largest, step):
+    for mark in ticks(0.0, largest, count=10):
         parts.append(f'<line x1="{at(mark):.1f}" y1="20" x2="{at(mark):.1f}" y2="{height - 30}" stroke="{FAINT}"/>')
         parts.append(f'<text x="{at(mark):.1f}" y="{height - 14}" text-anchor="middle">{mark:g}</text>')
     for row in rows:
@@ -94,7 +94,7 @@ def comparison_figure(rows: Sequence[TableRow]) -> str:
 
 
 def _columns(points: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
-    found = np.array(points, float)
+    found = np.array(points, float).reshape(-1, 2)
     found = found[np.isfinite(found).all(axis=1)]
     return found[:, 0], found[:, 1]
 

@@ -45,12 +45,14 @@ def low_passed(image: np.ndarray, *, tolerance: float) -> np.ndarray:
 
 def _peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: int) -> np.ndarray:
     """Vertices (N,) of parabolas through pixels on either side of the largest one of columns (N,) near rows (N,)."""
-    around = np.arange(-_SEARCHED_PX, _SEARCHED_PX + 1)
+    # Of several largest ones, those of a plateau, the nearest to the stripe's place is taken.
+    around = np.array(sorted(range(-_SEARCHED_PX, _SEARCHED_PX + 1), key=abs))
     rows = np.clip(np.rint(near_px).astype(int)[:, None] + around, 0, len(smooth) - 1)
     top = rows[np.arange(len(line)), smooth[rows, line[:, None]].argmax(axis=1)]
     offset = np.arange(-half, half + 1)
     rows = np.clip(top[:, None] + offset, 0, len(smooth) - 1)
-    second, first, _ = np.linalg.pinv(np.vander(offset, 3)) @ smooth[rows, line[:, None]].T
-    # A plateau has no vertex; its middle is the best guess.
+    # Below the largest one, so that a plateau is exactly zero. It has no vertex; the place is the best guess.
+    below = smooth[rows, line[:, None]] - smooth[top, line][:, None]
+    second, first, _ = np.linalg.pinv(np.vander(offset, 3)) @ below.T
     vertex = np.where(second < 0, -first / np.where(second < 0, 2 * second, 1.0), 0.0)
     return top + np.clip(vertex, -half, half)

@@ -13,6 +13,7 @@ import numpy as np
 
 from uwlts.calibration.evidence import AirEvidence, StepEvidence
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, Evidence, solve
+from uwlts.camera import project
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.sensor import Medium
 from uwlts.thesis.sphere_scan import SphereScan
@@ -135,14 +136,10 @@ class _Draw:
         self._evidence, self._medium, self._wavelength = evidence, medium, wavelength_nm
         self._known = {name: float(value) for name, value in knowledge.items()}
         self._circle_px = start.camera.sigma_px
-        # Of a stripe's points about the sheet, seen from the camera: mm over the sine of the angle, mm per px.
-        depth = float(np.mean(start.stripe_points.points_mm[:, 2]))
-        crossing = abs(start.sheet.model.normal[2]) or 1.0
-        across = np.sqrt(max(1e-6, 1 - crossing**2))
-        self._stripe_px = start.sheet.rms_mm * start.calibration.camera.fx_px / depth / across
-        axis = np.linalg.inv(start.calibration.object_transform())[:3, 2]
-        self._seen_from = np.array([axis[0] / axis[2], axis[1] / axis[2], 0.0])
-        self._along_width = start.calibration.stripe_along == "width"
+        self._across = 1 if start.calibration.stripe_along == "width" else 0
+        self._stripe_px = _stripe_noise_px(start, self._across)
+        # Entrance pupil in the target's frame, of every image.
+        self._pupils = [-pose[:3, :3].T @ pose[:3, 3] for pose in start.camera.target_poses]
 
     def _std(self, name: str) -> float:
         return self._known.get(name, 0.0)
@@ -158,14 +155,16 @@ class _Draw:
         return replace(self._evidence, air=air, steps=steps, plate=turned)
 
     def _air(self, air: AirEvidence, rng: np.random.Generator) -> AirEvidence:
-        tilt = np.radians(self._std("target_tilt_std_deg")) * rng.standard_normal(2)
+        # The target may be turned against the stage's travel, and the travel against the laser's axis.
+        turn = np.hypot(self._std("target_tilt_std_deg"), self._std("stage_misalignment_std_deg"))
+        tilt = np.radians(turn) * rng.standard_normal(2)
         lead = self._std("stage_lead_std") * rng.standard_normal()
         bow = self._std("target_bow_std_mm") * rng.standard_normal()
         shifts: dict[tuple[float, ...], np.ndarray] = {}
         farthest = max(float(np.linalg.norm(image.points_mm, axis=1).max()) for image in air.images)
         middle = np.mean([image.stage_mm for image in air.images])
         images = []
-        for image in air.images:
+        for image, pupil in zip(air.images, self._pupils, strict=True):
             printed = np.array(
                 [
                     shifts.setdefault(
@@ -175,9 +174,10 @@ class _Draw:
                 ]
             )
             # A plate that is not square to the travel moves sideways on itself; what stands out from a bowed one
-            # seems shifted towards the camera's side, by the tangent of the angle it is seen at.
+            # is seen where its ray meets the flat one.
             sideways = np.append(tilt, 0.0) * (image.stage_mm - middle)
-            out = bow * (np.linalg.norm(image.points_mm, axis=1, keepdims=True) / farthest) ** 2 * self._seen_from
+            height = bow * (np.linalg.norm(image.points_mm, axis=1, keepdims=True) / farthest) ** 2
+            out = height * (image.points_mm - pupil) / pupil[2] * (1.0, 1.0, 0.0)
             stage = image.stage_mm + lead * (image.stage_mm - middle)
             images.append(
                 replace(
@@ -216,8 +216,20 @@ class _Draw:
     def stripe(self, pixels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Stripe pixels (N, 2) with the noise that stripes on the target have, across the stripe."""
         noise = np.zeros_like(pixels)
-        noise[:, 1 if self._along_width else 0] = self._stripe_px * rng.standard_normal(len(pixels))
+        noise[:, self._across] = self._stripe_px * rng.standard_normal(len(pixels))
         return pixels + noise
+
+
+def _stripe_noise_px(start: CalibrationResult, across: int) -> float:
+    """Root mean square distance in the image, across the stripe, of its points on the target from the sheet."""
+    used, normal = start.sheet.used, np.array(start.sheet.model.normal)
+    points = start.stripe_points.points_mm[used]
+    faces = start.camera.target_poses[start.stripe_points.image[used], :3, 2]
+    # A point whose stripe centre is wrong has moved on the target, square to the sheet's line on it.
+    along = normal - (faces @ normal)[:, None] * faces
+    moves = along * (start.sheet.residuals_mm[used] / (along @ normal))[:, None]
+    apart = project(start.camera.model, points) - project(start.camera.model, points - moves)
+    return float(np.sqrt(np.mean(apart[:, across] ** 2)))
 
 
 def _turned(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from uwlts.report.cloud_picture import cloud_picture
 from uwlts.report.numbers import typographic
 from uwlts.report.pictures import data_uri, png
 from uwlts.report.stripe_picture import stripe_picture, stripe_view
+from uwlts.thesis.differences import differences, far_off
 from uwlts.thesis.figures import (
     comparison_figure,
     line_figure,
@@ -24,8 +25,9 @@ from uwlts.thesis.figures import (
 )
 from uwlts.thesis.folder import campaign_folders
 from uwlts.thesis.published import Published
-from uwlts.thesis.tables import MEAN, TableRow
+from uwlts.thesis.tables import LARGEST_RATIO, TableRow, headline_rows
 
+_MOST_COLUMNS = 3
 _TITLES = {
     "Table 2": "spheres by the polynomials",
     "Table 3": "planes by the polynomials",
@@ -33,11 +35,16 @@ _TITLES = {
     "Table 5": "one and two refractions",
     "Table 6": "spheres by the proposed method",
     "Table 7": "planes by the proposed method",
-    "Table 8": "sphere spacing error as a share of the volume's depth",
+    "Table 8": "largest sphere spacing error as a share of the volume's depth",
     "Table 9": "uncertainty budget of the sphere spacing in water",
     "Figure 58": "residual of the polynomials Z(v)",
     "Figure 66": "objects without calibrated values: spread about the true surface after a best fit",
     "Figure 67": "line length on the pipe",
+    "Experiment: window forgotten in air": "scans through the window by a calibration made without it",
+    "Experiment: thesis, mean of 5x5": "a plain mean for LabVIEW's low-pass filter",
+    "Experiment: thesis, fit over 3 px": "a narrower quadratic",
+    "Experiment: thesis, fit over 7 px": "a wider quadratic",
+    "Experiment: no point left out": "ranges over all points",
 }
 
 
@@ -48,16 +55,18 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
     template = environment.from_string(files("uwlts.thesis").joinpath("template.html.j2").read_text(encoding="utf-8"))
     first = results[0]
     z_of_v, y_of_z = polynomials_figures(first)
-    headline = [
-        row for row in rows if f", {MEAN}," in row.row and row.table in ("Table 2", "Table 3", "Table 6", "Table 7")
-    ]
+    headline = headline_rows(rows)
     shown = [row for row in rows if row.table == "Figure 66" and row.quantity == "STD" and ", thesis image" in row.row]
     return template.render(
         published=published.title,
         campaigns=len(results),
         headline=headline,
-        far_off=[row for row in headline if row.ratio is not None and not 1 / 1.5 <= row.ratio <= 1.5],
-        tables=[(name, _TITLES.get(name, ""), list(group)) for name, group in groupby(rows, lambda row: row.table)],
+        far_off=far_off(headline),
+        far=LARGEST_RATIO,
+        tables=[
+            (name, _TITLES.get(name, ""), *_folded(list(group))) for name, group in groupby(rows, lambda row: row.table)
+        ],
+        differences=differences(rows),
         figures=[
             ("Figure 66", "Means over the positions: bars are ours (blue in water, red in air), the line spans the "
              "campaigns, diamonds are the thesis's.", Markup(comparison_figure([*headline, *shown]))),
@@ -73,6 +82,16 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
         pictures=_pictures(folder),
         version=uwlts.__version__,
     )  # fmt: skip
+
+
+def _folded(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[TableRow | None]]]]:
+    """A table's quantities side by side: their names, and by row one value for each of them."""
+    quantities = list(dict.fromkeys(row.quantity for row in rows))
+    if len(quantities) > _MOST_COLUMNS:
+        return ["value"], [(f"{row.row}, {row.quantity}", [row]) for row in rows]
+    values = {(row.row, row.quantity): row for row in rows}
+    names = dict.fromkeys(row.row for row in rows)
+    return quantities, [(name, [values.get((name, quantity)) for quantity in quantities]) for name in names]
 
 
 def _monte_carlo(results: Sequence[dict[str, Any]]) -> dict[str, Any] | None:

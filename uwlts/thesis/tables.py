@@ -13,6 +13,8 @@ from uwlts.thesis.methods import FORGOTTEN, POLYNOMIALS, PROPOSED, SINGLE, TWO
 from uwlts.thesis.published import Published
 
 MEAN = "mean"
+LARGEST_RATIO = 1.5
+"""Our means should be within this factor of the published ones."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,13 @@ def all_rows(results: Sequence[dict[str, Any]], published: Published) -> list[Ta
     return [*rows, *_free_forms(seen)]
 
 
+def headline_rows(rows: Sequence[TableRow]) -> list[TableRow]:
+    """The means over the positions of Tables 2, 3, 6 and 7, by which a reproduction is judged."""
+    return [
+        row for row in rows if row.table in ("Table 2", "Table 3", "Table 6", "Table 7") and f", {MEAN}," in row.row
+    ]
+
+
 def _collected(results: Sequence[dict[str, Any]], value: Callable[[dict[str, Any]], float | None]) -> tuple[float, ...]:
     """A value of every campaign that has it, without its sign."""
     found = (value(result) for result in results)
@@ -81,9 +90,9 @@ def _collected(results: Sequence[dict[str, Any]], value: Callable[[dict[str, Any
 
 
 def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
-    """Rows of one quantity and their mean over the positions, campaign by campaign."""
+    """Rows of one quantity and their mean over the positions that were measured, campaign by campaign."""
     yield from rows
-    theirs = [row.published for row in rows]
+    theirs = [row.published for row in rows if row.ours]
     complete = [row.ours for row in rows if row.ours]
     counts = {len(values) for values in complete}
     if complete and len(counts) == 1:
@@ -155,17 +164,19 @@ def _refractions(seen: _Seen) -> Iterator[TableRow]:
 
 
 def _shares(seen: _Seen) -> Iterator[TableRow]:
+    """The thesis's percentages are those of the largest error, though it calls them the division of the error."""
     for medium, method in product(MEDIA, (POLYNOMIALS, PROPOSED)):
-        rows = [r for r in seen.objects("Table 8", "spheres", ("SSE",), method, THESIS) if f"{MEAN}, {medium}" in r.row]
+        places = seen.published.positions("spheres")
+        found = [seen.figures("spheres", place, medium, method, THESIS, "SSE") for place in places]
         depth = seen.published.value("depth_mm", medium)
-        for mean in rows:
-            shares = tuple(100 * value / depth for value in mean.ours)
-            theirs = seen.published.value("share_percent", medium, method)
-            yield TableRow("Table 8", f"{method}, {medium}", "SSE over depth, %", theirs, shares)
+        complete = [errors for errors in found if len(errors) == len(seen.results)] if depth else []
+        shares = tuple((100 / depth * np.max(complete, axis=0)).tolist()) if complete else ()
+        theirs = seen.published.value("share_percent", medium, method)
+        yield TableRow("Table 8", f"{method}, {medium}", "largest SSE over depth, %", theirs, shares)
 
 
 def _budget(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
-    names = list(published.content["budget"])
+    names = list(published.content.get("budget", {}))
     for name in names:
         ours = _collected(results, lambda r, n=name: r["budget"].get(n))
         yield TableRow("Table 9", name.replace("_", " "), _unit_of(name), published.value("budget", name), ours)
