@@ -58,8 +58,9 @@ class Imperfections(Description):
 class Recording(Description):
     """A scene to record in each of some media and at each of some placements.
 
-    Files are called ``name``, or SCENE-PLACEMENT-MEDIUM unless a name is given. ``motion`` changes the scene's.
-    ``stripe_along`` turns the camera. ``as_described`` records with the sensor as described, free of imperfections.
+    ``scene`` is a name, or a path that starts at the campaign's folder if it is relative. Files are called ``name``, or
+    SCENE-PLACEMENT-MEDIUM unless a name is given. ``motion`` changes the scene's. ``stripe_along`` turns the camera.
+    ``as_described`` records with the sensor as described, free of imperfections.
     """
 
     scene: str
@@ -72,7 +73,10 @@ class Recording(Description):
 
 
 class Campaign(Description):
-    """What is recorded with which sensor. ``as_built`` is the sensor that the imperfections are laid over."""
+    """What is recorded with which sensor. ``as_built`` is the sensor that the imperfections are laid over.
+
+    Sensors are names, or paths that start at the campaign's folder if they are relative.
+    """
 
     title: str
     sensor: str
@@ -95,7 +99,17 @@ class Take:
 def load_campaign(name_or_path: str | Path) -> Campaign:
     """Campaign by name (``thesis``) or path; DescriptionError where it is none."""
     path = find(name_or_path, FOLDER)
-    return validated(Campaign, read_table(path, FOLDER), path)
+    campaign = validated(Campaign, read_table(path, FOLDER), path)
+    recordings = tuple(
+        recording.model_copy(update={"scene": _from_folder(path.parent, recording.scene)})
+        for recording in campaign.recordings
+    )
+    sensors = {key: _from_folder(path.parent, getattr(campaign, key)) for key in ("sensor", "as_built")}
+    return campaign.model_copy(update=sensors | {"recordings": recordings})
+
+
+def _from_folder(folder: Path, name_or_path: str) -> str:
+    return str(folder / name_or_path) if name_or_path.endswith(".toml") else name_or_path
 
 
 def campaign_names() -> list[str]:
@@ -113,7 +127,7 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     """
     drawn = _Drawn(campaign, seed)
     found = [
-        _take(campaign, recording, scene, drawn, every=every)
+        _take(recording, scene, drawn, every=every)
         for recording in campaign.recordings
         for scene in _scenes(recording)
     ]
@@ -132,9 +146,9 @@ def _scenes(recording: Recording) -> Iterator[Scene]:
             yield load_scene(recording.scene, changes=changes | {"motion": motion})
 
 
-def _take(campaign: Campaign, recording: Recording, scene: Scene, drawn: "_Drawn", *, every: int) -> Take:
-    name = recording.name or f"{recording.scene}-{scene.placement}-{scene.medium}"
-    sensor = load_sensor(campaign.sensor)
+def _take(recording: Recording, scene: Scene, drawn: "_Drawn", *, every: int) -> Take:
+    name = recording.name or f"{Path(recording.scene).stem}-{scene.placement}-{scene.medium}"
+    sensor = drawn.described
     built = sensor if recording.as_described else drawn.sensor
     if recording.stripe_along is not None:
         sensor, built = (_turned(each, recording.stripe_along) for each in (sensor, built))
@@ -145,7 +159,8 @@ def _take(campaign: Campaign, recording: Recording, scene: Scene, drawn: "_Drawn
     rng = np.random.default_rng([drawn.seed, *name.encode()])
     if not recording.as_described:
         scene = drawn.as_it_really_is(scene, rng)
-        built = drawn.with_true_water(built, calibrating=scene.target is not None or recording.scene == "step")
+        calibrating = scene.target is not None or Path(recording.scene).stem == "step"
+        built = drawn.with_true_water(built, calibrating=calibrating)
     return Take(name, scene, sensor, built, int(rng.integers(2**31)))
 
 
@@ -163,6 +178,7 @@ class _Drawn:
 
     def __init__(self, campaign: Campaign, seed: int):
         self.seed, self._size = seed, campaign.imperfections
+        self.described = load_sensor(campaign.sensor)
         self._rng = np.random.default_rng([seed, 0])
         size = self._size
         tilt_x, tilt_y = (size.window_tilt_std_deg * self._rng.standard_normal(2)).tolist()
@@ -203,7 +219,7 @@ class _Drawn:
     def as_it_really_is(self, scene: Scene, rng: np.random.Generator) -> Scene:
         """The scene with its target's, step's and stage's errors; ``rng`` draws those of this recording alone."""
         objects = [self._real(thing, scene, rng) for thing in scene.objects]
-        if (scene.artefact or {}).get("kind") == "step":
+        if self._lower_step != 0 and (scene.artefact or {}).get("kind") == "step":
             objects[_lower_block(scene)] = _moved(objects[_lower_block(scene)], (0.0, 0.0, self._lower_step))
         motion = scene.motion
         positions = np.array([motion.start_mm + index * motion.step_mm for index in range(motion.count)])
@@ -228,12 +244,17 @@ class _Drawn:
 
 
 def _lower_block(scene: Scene) -> int:
-    """Number of the block whose face towards the sensor lies farthest away."""
+    """Number of the block whose face towards the sensor lies farthest away; DescriptionError where there are none."""
     blocks = {
         number: thing.position_mm[2] - thing.size_mm[2] / 2
         for number, thing in enumerate(scene.objects)
         if isinstance(thing, Block)
     }
+    if len(blocks) < 2:
+        raise DescriptionError(
+            f"{scene.title}: a step standard of {len(blocks)} blocks has no height to change: build it of two, or set "
+            "step_height_half_width_mm to 0"
+        )
     return max(blocks, key=blocks.get)
 
 

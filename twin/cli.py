@@ -168,6 +168,8 @@ def reproduce(
             raise DescriptionError(f"{name} is {value}; it must be at least 1")
     if first < 0:
         raise DescriptionError(f"first is {first}; a seed must not be negative")
+    if trials != 0 and trials < 20:
+        raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
     description = load_campaign(campaign)
     folder = out or Path("runs") / Path(campaign).stem
     with progress_bar(f"rendering {description.title}") as progress:

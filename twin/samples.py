@@ -39,8 +39,10 @@ def lattice(count: int, axes: int) -> np.ndarray:
         free = [coprime[k] for k in spread if coprime[k] not in taken] or coprime
         steps.append(min(free, key=lambda k: merit @ _kernel(index * k % count / count)))
         merit = merit * _kernel(index * steps[-1] % count / count)
-    # Counted from half a step on, every point has its mirror image about the cube's middle among the others.
-    return np.stack([(index + 0.5) * step / count % 1 for step in steps])
+    # Counted from half a step on, every point has its mirror image about the cube's middle among the others. Half an
+    # even step would lead to the strips' edges; of an odd count, the step or its negative is odd.
+    odd = [step if step % 2 else count - step for step in steps]
+    return np.stack([(index + 0.5) * step / count % 1 for step in odd])
 
 
 def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -277,9 +277,7 @@ class Motion(Description):
             if vector is not None and np.linalg.norm(vector) < 1e-9:
                 raise ValueError(f"direction {vector} has no length")
         if self.position_errors_mm and len(self.position_errors_mm) != self.count:
-            raise ValueError(
-                f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions"
-            )
+            raise ValueError(f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions")
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
         if self.speed_mm_per_s > 0 and len(self.lights) > 1:

@@ -66,7 +66,8 @@ def calibrate(
     Parameters
     ----------
     air
-        Captures of the target in air: at every stage position one image under the lamp and one with the laser.
+        Captures of the target in air: at every stage position one image under the lamp and one with the laser. All
+        taken in the medium of use, and without steps, they give a calibration of a single viewpoint for that medium.
     step
         Captures of the step standard in the medium of use; without them the calibration is for air only.
     out
@@ -410,10 +411,12 @@ def thesis(
 
     if trials != 0 and trials < 20:
         raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
-    tables = load_published(published)
+    if workers is not None and workers < 1:
+        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    tables, campaigns = load_published(published), campaign_folders(folder)
     refuse_unsuitable(folder / "report.html", overwrite=overwrite)
     results = []
-    for campaign in campaign_folders(folder):
+    for campaign in campaigns:
         with progress_bar(f"evaluating {campaign.path.name}") as progress:
             results.append(
                 evaluate_campaign(

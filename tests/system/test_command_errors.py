@@ -40,8 +40,9 @@ pixel_size_um = 42.4
 """
 COMMANDS = {"twin": twin_cli.main, "uwlts": uwlts_cli.main}
 SUBCOMMANDS = [
-    "twin simulate", "twin scenes",
-    "uwlts info", "uwlts calibrate", "uwlts nominal", "uwlts reconstruct", "uwlts evaluate", "uwlts report",
+    "twin simulate", "twin reproduce", "twin scenes",
+    "uwlts info", "uwlts calibrate", "uwlts polynomials", "uwlts design", "uwlts nominal", "uwlts reconstruct",
+    "uwlts evaluate", "uwlts report", "uwlts thesis",
 ]  # fmt: skip
 
 
@@ -154,6 +155,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert exit_code(*line.split()) == 0, line
     dry = read_calibration(folder / "calibration.json").model_copy(update={"window": None})
     write_calibration(folder / "dry.json", dry)
+    (folder / "campaigns" / "campaign-0").mkdir(parents=True)
     (folder / "campaign").mkdir()
     for name in ("scan.h5", "scan.ply", "scan.evaluation.json", "calibration.json"):
         shutil.copy(folder / name, folder / "campaign" / name)
@@ -215,13 +217,23 @@ def test_version(command, program: str):
         ("uwlts calibrate --air air.h5 --out x.json --refractions 3", "3"),
         ("uwlts calibrate --air air.h5 --out x.json --poses wild", "wild"),
         ("uwlts calibrate --air air.h5 --out x.json --distortion k9", "k9"),
+        ("uwlts polynomials --out x.json", "--target"),
+        ("uwlts polynomials --target air.h5", "--out"),
+        ("uwlts polynomials --target air.h5 --out x.json --degree six", "six"),
+        ("uwlts design thesis", "--medium"),
+        ("uwlts design --medium water", "SENSOR"),
         ("uwlts nominal thesis --out x.json", "--medium"),
         ("uwlts evaluate scan.ply", "--out"),
         ("uwlts report", "requires an argument"),
+        ("uwlts thesis", "requires an argument"),
+        ("uwlts thesis campaign --trials many", "many"),
         ("twin simulate --out x.h5", "SCENE"),
         ("twin simulate spheres", "--out"),
         ("twin simulate spheres --out x.h5 --spp many", "many"),
         ("twin simulate spheres --out x.h5 --variant scalar_rgb", "scalar_rgb"),
+        ("twin reproduce --campaigns several", "several"),
+        ("twin reproduce --variant scalar_rgb", "scalar_rgb"),
+        ("twin reproduce --resume", "--resume"),
         ("twin scenes all", "all"),
     ],
 )
@@ -266,11 +278,16 @@ PLACES = {
     "reconstruct, calibration": ("uwlts reconstruct scan.h5 --calibration {} --out x.ply", {"calibration.json"}),
     "calibrate, air": ("uwlts calibrate --air {} --out x.json", set()),
     "calibrate, step": ("uwlts calibrate --air air.h5 --step {} --out x.json", set()),
+    "polynomials, target": ("uwlts polynomials --target {} --out x.json", set()),
+    "design, sensor": ("uwlts design {} --medium water", {"sensor.toml"}),
     "nominal, sensor": ("uwlts nominal {} --medium water --out x.json", {"sensor.toml"}),
     "evaluate, cloud": ("uwlts evaluate {} --out x.json", {"scan.ply"}),
     "evaluate, artefact": ("uwlts evaluate scan.ply --artefact {} --out x.json", {"artefact.toml"}),
     "evaluate, truth": ("uwlts evaluate scan.ply --truth {} --out x.json", set()),
     "report, reference": ("uwlts report campaign --reference {}", set()),
+    "thesis, folder": ("uwlts thesis {}", set()),
+    "thesis, published": ("uwlts thesis campaigns --published {}", set()),
+    "reproduce, campaign": ("twin reproduce {} --campaigns 1 --out x", set()),
     "simulate, scene": ("twin simulate {} --sensor sensor.toml --out x.h5", {"scene.toml"}),
     "simulate, sensor": ("twin simulate scene.toml --sensor {} --out x.h5", {"sensor.toml"}),
     "simulate, as built": ("twin simulate scene.toml --sensor sensor.toml --as-built {} --out x.h5", {"sensor.toml"}),
@@ -430,6 +447,29 @@ def test_calibration_without_target(fails, folder: Path, tmp_path: Path, air: st
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("files", ["--air scan.h5 --step scan.h5", "--air air.h5 scan.h5"])
+def test_targets_that_were_not_all_seen_in_one_medium(fails, folder: Path, tmp_path: Path, monkeypatch, files: str):
+    monkeypatch.chdir(folder)
+    fails("uwlts", "calibrate", *files.split(), "--out", tmp_path / "x.json", says="error: the target was seen in ")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ("--target air.h5", "target"),
+        ("--target black.h5", "target"),
+        ("--target no-frames.h5", "error: "),
+        ("--target air.h5 scan.h5", "error: "),
+        ("--target air.h5 --degree 0", "degree"),
+        ("--target air.h5 --degree -2", "degree"),
+    ],
+)
+def test_polynomials_without_target(fails, folder: Path, tmp_path: Path, monkeypatch, options: str, says: str):
+    monkeypatch.chdir(folder)
+    fails("uwlts", "polynomials", *options.split(), "--out", tmp_path / "x.json", says=says)
+    assert list(tmp_path.iterdir()) == []
+
+
 # --- evaluation
 
 
@@ -490,8 +530,9 @@ def test_simulation_that_cannot_be(fails, folder: Path, monkeypatch, options: st
     fails("twin", "simulate", *options.split(), says=says)
 
 
-def test_nominal_calibration_in_an_unknown_medium(fails, tmp_path: Path):
+def test_unknown_medium(fails, tmp_path: Path):
     fails("uwlts", "nominal", "thesis", "--medium", "milk", "--out", tmp_path / "x.json", says="milk")
+    fails("uwlts", "design", "thesis", "--medium", "milk", says="knows the media air, water, not 'milk'")
 
 
 def test_reports_that_cannot_be(fails, folder: Path, tmp_path: Path):
@@ -505,9 +546,55 @@ def test_reports_that_cannot_be(fails, folder: Path, tmp_path: Path):
     fails("uwlts", "report", folder / "campaign", "--out", out, says="missing does not exist")
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ("no-campaign", "nothing is called 'no-campaign'; known are thesis"),
+        ("no-campaign.toml", "no description at no-campaign.toml"),
+        ("--campaigns 0", "campaigns is 0; it must be at least 1"),
+        ("--campaigns -3", "campaigns is -3"),
+        ("--first -1", "first is -1; a seed must not be negative"),
+        ("--every 0", "every is 0"),
+        ("--workers 0", "workers is 0"),
+        ("--spp 0", "spp is 0"),
+        ("--trials 5", "trials is 5: take 20 or more, or 0"),
+        ("--trials -20", "trials is -20"),
+        ("--out scan.h5", "cannot use the folder scan.h5"),
+        ("--out scan.h5/runs", "cannot use the folder scan.h5/runs"),
+    ],
+)
+def test_reproductions_that_cannot_be(fails, folder: Path, monkeypatch, options: str, says: str):
+    monkeypatch.chdir(folder)
+    fails("twin", "reproduce", *options.split(), says=says)
+
+
+def test_theses_that_cannot_be(fails, tmp_path: Path):
+    fails("uwlts", "thesis", tmp_path / "missing", says="missing holds no campaign")
+    (tmp_path / "runs").mkdir()
+    fails("uwlts", "thesis", tmp_path / "runs", says="runs holds no campaign: a folder called campaign-0, campaign-1")
+    place = tmp_path / "runs" / "campaign-0"
+    place.mkdir()
+    fails("uwlts", "thesis", tmp_path / "runs", says="campaign-0 has no ")
+    (place / "results.json").write_text("{", encoding="utf-8")
+    fails("uwlts", "thesis", tmp_path / "runs", says="results.json")
+    for text in ("[]", '{"format": "uwlts-thesis-results", "version": 0}'):
+        (place / "results.json").write_text(text, encoding="utf-8")
+        fails("uwlts", "thesis", tmp_path / "runs", says="holds no results that this program reads")
+    fails("uwlts", "thesis", tmp_path / "runs", "--again", says="campaign-0 has no ")
+    fails("uwlts", "thesis", tmp_path / "runs", "--trials", "5", says="trials is 5: take 20 or more, or 0")
+    fails("uwlts", "thesis", tmp_path / "runs", "--trials", "-1", says="trials is -1")
+    fails("uwlts", "thesis", tmp_path / "runs", "--workers", "0", says="workers is 0; it must be at least 1")
+    fails("uwlts", "thesis", tmp_path / "runs", "--published", "thesis", says="holds no published tables")
+    (tmp_path / "runs" / "report.html").write_text("precious", encoding="utf-8")
+    fails("uwlts", "thesis", tmp_path / "runs", says="report.html exists already")
+    assert (tmp_path / "runs" / "report.html").read_text(encoding="utf-8") == "precious"
+
+
 # --- outputs
 
 OUTPUTS = {
+    "calibrate": "uwlts calibrate --air air.h5 --out {}",
+    "polynomials": "uwlts polynomials --target air.h5 --out {}",
     "reconstruct": "uwlts reconstruct scan.h5 --calibration calibration.json --out {}",
     "nominal": "uwlts nominal sensor.toml --medium water --out {}",
     "evaluate": "uwlts evaluate scan.ply --out {}",

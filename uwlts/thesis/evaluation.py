@@ -1,13 +1,11 @@
 """Evaluates one campaign: calibrates by every method, measures every scan, and studies what the results rest on."""
 
 import json
-import multiprocessing
-import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict
-from itertools import chain
+from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +21,13 @@ from uwlts.files import written_aside
 from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
 from uwlts.scan import find_stripes, reconstruct_stripes
 from uwlts.thesis.budget import spacing_budget
-from uwlts.thesis.folder import MEDIA, CampaignFolder
+from uwlts.thesis.folder import MEDIA, CampaignFolder, ScanFile
 from uwlts.thesis.measurements import THESIS, Measurement, measure_scan
 from uwlts.thesis.methods import POLYNOMIALS, PROPOSED, TWO, AnyCalibration, calibrations
 from uwlts.thesis.monte_carlo import propagate
 from uwlts.thesis.sphere_scan import SphereScan, sphere_scan
 from uwlts.thesis.window_study import window_choices
+from uwlts.workers import work_through
 
 RESULTS = "results.json"
 FORMAT, VERSION = "uwlts-thesis-results", 1
@@ -41,7 +40,7 @@ def evaluate_campaign(
     folder: CampaignFolder, *, trials: int = TRIALS, workers: int | None = None, overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Results of a campaign as plain JSON, kept in its file results.json; read from there if it exists.
+    """Results of a campaign as plain JSON, kept in its file results.json; read from there if no recording is newer.
 
     Raises
     ------
@@ -51,7 +50,7 @@ def evaluate_campaign(
         The recordings do not determine a calibration.
     """
     path = folder.path / RESULTS
-    if path.is_file() and not overwrite:
+    if path.is_file() and not overwrite and not _has_newer_recordings(folder.path, path):
         return read_results(path)
     calibrated = calibrations(folder, progress=lambda done, total: progress("calibrations", done, total))
     measurements = _measured(folder, calibrated, workers, progress)
@@ -75,6 +74,11 @@ def evaluate_campaign(
     return results
 
 
+def _has_newer_recordings(folder: Path, results: Path) -> bool:
+    finished = results.stat().st_mtime_ns
+    return any(path.stat().st_mtime_ns > finished for path in folder.glob("*.h5"))
+
+
 def read_results(path: Path) -> dict[str, Any]:
     """Results as `evaluate_campaign` has kept them; CaptureError where the file is damaged or newer."""
     try:
@@ -93,15 +97,20 @@ def _measured(
     """All scans, several at a time."""
     clouds = folder.path / "clouds"
     clouds.mkdir(exist_ok=True)
-    scans = folder.scans()
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), context) as pool:
-        jobs = [pool.submit(measure_scan, scan, calibrated, clouds=clouds) for scan in scans]
-        found = []
-        for number, job in enumerate(jobs, start=1):
-            found.append(job.result())
-            progress("measurements", number, len(jobs))
+    scans, numbers = folder.scans(), count(1)
+    found = work_through(
+        partial(_measure, calibrated, clouds), scans, workers=workers,
+        heard=lambda _: progress("measurements", next(numbers), len(scans)),
+    )  # fmt: skip
     return list(chain.from_iterable(found))
+
+
+def _measure(
+    calibrated: dict[tuple[str, str], AnyCalibration], clouds: Path, scan: ScanFile, tell: Callable[[None], None]
+) -> list[Measurement]:
+    found = measure_scan(scan, calibrated, clouds=clouds)
+    tell(None)
+    return found
 
 
 def _sphere_scans(folder: CampaignFolder, calibration: Calibration) -> list[SphereScan]:

@@ -30,7 +30,7 @@ AnyCalibration = Calibration | PolynomialCalibration
 def calibrations(
     folder: CampaignFolder, *, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> dict[tuple[str, str], AnyCalibration]:
-    """Calibrations by method and medium; those made before are read from the folder ``calibrations``.
+    """Calibrations by method and medium; those made since the recordings are read from the folder ``calibrations``.
 
     Raises
     ------
@@ -51,13 +51,15 @@ def calibrations(
     place = folder.path / "calibrations"
     place.mkdir(exist_ok=True)
     found: dict[tuple[str, str], AnyCalibration] = {}
+    evidence = [*folder.steps(), *(folder.target(kind) for kind in ("air", "bare", "water"))]
+    newest = max(path.stat().st_mtime_ns for path in evidence)
     for number, ((method, medium), make) in enumerate(made.items()):
         progress(number, len(made))
         path = place / f"{method.replace(' ', '-')}-{medium}.json"
         read = read_polynomials if method == POLYNOMIALS else read_calibration
         write = write_polynomials if method == POLYNOMIALS else write_calibration
-        if not path.is_file():
-            write(path, make())
+        if not path.is_file() or path.stat().st_mtime_ns < newest:
+            write(path, make(), overwrite=True)
         found[method, medium] = read(path)
     progress(len(made), len(made))
     return found

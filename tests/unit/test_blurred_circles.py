@@ -1,0 +1,111 @@
+"""Circles out of focus: found and centred, by a longer reach across the edge where the short one fails."""
+
+import math
+
+import numpy as np
+import pytest
+
+from uwlts.targets import ellipses, find_circles
+
+DARK, BRIGHT = 40.0, 200.0
+SPACING, COLUMNS, ROWS = 70, 6, 5
+SHAPE = ((ROWS + 1) * SPACING, (COLUMNS + 1) * SPACING)
+SHORT = ellipses.REACHES_PX[:1]
+
+
+def places():
+    """True centres (N, 2) of a lattice, each at a sub-pixel phase of its own."""
+    u, v = np.meshgrid(np.arange(1, COLUMNS + 1) * SPACING, np.arange(1, ROWS + 1) * SPACING)
+    lattice = np.column_stack([u.ravel(), v.ravel()])
+    return lattice + np.random.default_rng(0).uniform(-0.5, 0.5, lattice.shape)
+
+
+def sharp(radius):
+    """Share of a point (u, v) from the circle's centre that is covered: all or nothing."""
+    return lambda u, v: (np.hypot(u, v) < radius).astype(float)
+
+
+def blurred(radius, blur):
+    """Share of a disc of radius ``blur`` that a larger disc covers: the area of the lens that both have in common."""
+
+    def share(u, v):
+        d = np.clip(np.hypot(u, v), radius - blur + 1e-9, radius + blur - 1e-9)
+        of_large = np.arccos((d**2 + radius**2 - blur**2) / (2 * d * radius))
+        of_small = np.arccos((d**2 + blur**2 - radius**2) / (2 * d * blur))
+        kite = np.sqrt((radius + blur - d) * (d + radius - blur) * (d - radius + blur) * (d + radius + blur)) / 2
+        return (radius**2 * of_large + blur**2 * of_small - kite) / (np.pi * blur**2)
+
+    return share
+
+
+def in_steps(radius, blur, count):
+    """The same where light comes through ``count`` points of the pupil only, evenly spread by the golden angle."""
+    turn = np.arange(count) * np.pi * (3 - math.sqrt(5))
+    points = blur * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    points -= points.mean(axis=0)
+    return lambda u, v: sum(sharp(radius)(u - a, v - b) for a, b in points) / count
+
+
+def photograph(share, *, samples, bright=True, noise=0.0):
+    """Image of the lattice, each pixel the mean of samples x samples points."""
+    image, side = np.zeros(SHAPE), 2 * (SPACING // 2)
+    within = (np.arange(side)[:, None] + (np.arange(samples) + 0.5) / samples - 0.5).ravel()
+    for cu, cv in places():
+        u0, v0 = round(cu) - side // 2, round(cv) - side // 2
+        fine = share(within + u0 - cu, (within + v0 - cv)[:, None])
+        image[v0 : v0 + side, u0 : u0 + side] = fine.reshape(side, samples, side, samples).mean((1, 3))
+    levels = DARK + (BRIGHT - DARK) * (image if bright else 1 - image)
+    return np.clip(np.rint(levels + noise * np.random.default_rng(1).normal(size=SHAPE)), 0, 255).astype(np.uint8)
+
+
+def errors_px(found):
+    """Distances (N,) of the found centres from the true ones; each circle must be found once."""
+    apart = np.linalg.norm(found.centres[:, None] - places(), axis=2)
+    assert sorted(apart.argmin(axis=1).tolist()) == list(range(COLUMNS * ROWS))
+    return apart.min(axis=1)
+
+
+def rms(errors):
+    return math.sqrt(np.mean(errors**2))
+
+
+# The band in which pixels count by their share reaches 5.3 px to either side of the ellipse, for an edge that is a ramp
+# over the whole short reach. It holds a blur of 4 px: what is left is rounding to grey levels, 0.29 / 160 over the root
+# of some hundred pixels of the edge, and the sampling of the levels beside it. Of a blur of 6 px it cuts off the last
+# 0.7 px, unevenly with the pixels' phase: measured 0.02 px for the large circles, 0.06 px for the small ones.
+@pytest.mark.parametrize("bright", [True, False])
+@pytest.mark.parametrize(("blur", "limit"), [(4.0, 0.003), (6.0, 0.07)])
+@pytest.mark.parametrize("radius", [12.5, 17.0, 25.0])
+def test_blurred_circles_are_found_and_centred(radius, blur, limit, bright):
+    assert rms(errors_px(find_circles(photograph(blurred(radius, blur), samples=3, bright=bright)))) < limit
+
+
+def test_noise_moves_blurred_circles_by_its_share_of_the_contrast():
+    noise = 2.0
+    errors = errors_px(find_circles(photograph(blurred(25.0, 4.0), samples=3, noise=noise)))
+    # A band of half width B around a circle of radius r holds 4 pi r B pixels at the distance r, each of which pulls
+    # the centroid by noise / contrast / (pi r^2) of its distance: sqrt(2 B / (pi r)) noise / contrast a coordinate. The
+    # levels inside and outside, read from 48 pixels each, add about as much again, twice; B is 5.3 px.
+    alone = math.sqrt(2) * math.sqrt(2 * 5.3 / (math.pi * 25.0)) * noise / (BRIGHT - DARK)
+    assert 0.5 * alone < rms(errors) < 4 * alone
+
+
+@pytest.mark.parametrize(("radius", "count", "blur"), [(14.0, 16, 6.0), (14.0, 8, 4.0), (20.0, 8, 6.0)])
+def test_edges_in_steps_need_the_longer_reach(radius, count, blur, monkeypatch):
+    image = photograph(in_steps(radius, blur, count), samples=5)
+    # Steps lie in the image as they do in the pupil, the same on opposite sides: rounding is left, as above.
+    assert rms(errors_px(find_circles(image))) < 0.004
+    monkeypatch.setattr(ellipses, "REACHES_PX", SHORT)
+    assert len(find_circles(image)) < (1 - ellipses.MISSED_SHARE) * COLUMNS * ROWS
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+@pytest.mark.parametrize("share", [sharp(6.0), sharp(14.0), blurred(14.0, 1.5)])
+def test_images_in_focus_are_measured_as_with_the_short_reach_alone(share, noise, monkeypatch):
+    image = photograph(share, samples=6, noise=noise)
+    found = find_circles(image)
+    assert len(found) == COLUMNS * ROWS
+    monkeypatch.setattr(ellipses, "REACHES_PX", SHORT)
+    alone = find_circles(image)
+    np.testing.assert_array_equal(found.centres, alone.centres)
+    np.testing.assert_array_equal(found.shapes, alone.shapes)
