@@ -127,9 +127,7 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     """
     drawn = _Drawn(campaign, seed)
     found = [
-        _take(recording, scene, drawn, every=every)
-        for recording in campaign.recordings
-        for scene in _scenes(recording)
+        _take(recording, scene, drawn, every=every) for recording in campaign.recordings for scene in _scenes(recording)
     ]
     doubled = {take.name for take in found if sum(other.name == take.name for other in found) > 1}
     if doubled:

@@ -37,7 +37,7 @@ def work_through(
 
     Jobs are begun in their order. What one of them tells on the way is passed to ``heard`` in this process. When an
     exception leaves this function, KeyboardInterrupt stops the jobs that are under way, and no process is left.
-    ``workers`` is the number of processes, that of the processors unless given.
+    ``workers`` is the number of processes, that of the processors unless given; one works in this process.
 
     Raises
     ------
@@ -46,6 +46,8 @@ def work_through(
     SetupError
         A process has ended before its job.
     """
+    if workers == 1:
+        return [work(job, heard) for job in jobs]
     waiting, results = deque(enumerate(jobs)), {}
     begun: list[_Worker] = []
     try:

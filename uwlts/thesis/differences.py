@@ -19,7 +19,7 @@ def differences(rows: Sequence[TableRow]) -> list[str]:
     sentences = [
         _said(
             "Standard deviation and range come from speckle and from how the peak is found. With LabVIEW's low-pass "
-            "filter, which leaves pixels within 40 % of their neighbours as they are, and a quadratic over five pixels, "
+            "filter, which leaves pixels within 40 % of their neighbours as they are, and a quadratic over 5 pixels, "
             "the spheres in water spread by {} mm (published 0.115); with a plain 5x5 mean it would be {} mm, with a "
             "quadratic over three pixels {} mm, over seven {} mm. Our own profile fit leaves {} mm.",
             mean("Table 6", "water", "STD"),

@@ -42,6 +42,8 @@ def evaluate_campaign(
 ) -> dict[str, Any]:  # fmt: skip
     """Results of a campaign as plain JSON, kept in its file results.json; read from there if no recording is newer.
 
+    Kept results without the Monte-Carlo propagation, or with another number of trials, are completed.
+
     Raises
     ------
     CaptureError
@@ -51,7 +53,12 @@ def evaluate_campaign(
     """
     path = folder.path / RESULTS
     if path.is_file() and not overwrite and not _has_newer_recordings(folder.path, path):
-        return read_results(path)
+        results = read_results(path)
+        if trials in (0, results["trials"]):
+            return results
+        calibrated = calibrations(folder)
+        scans = _sphere_scans(folder, calibrated[PROPOSED, "water"])
+        return _kept(path, results | _monte_carlo(folder, scans, trials, workers, progress))
     calibrated = calibrations(folder, progress=lambda done, total: progress("calibrations", done, total))
     measurements = _measured(folder, calibrated, workers, progress)
     proposed = calibrated[PROPOSED, "water"]
@@ -66,9 +73,13 @@ def evaluate_campaign(
         "two_refractions_distance_mm": calibrated[TWO, "water"].window.distance_mm,
         "polynomials": {medium: _curves(calibrated[POLYNOMIALS, medium]) for medium in MEDIA},
         "budget": _budget(folder, measurements, proposed, scans),
-        "monte_carlo": _monte_carlo(folder, scans, trials, progress),
         "line_profiles": {side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
     }
+    return _kept(path, results | _monte_carlo(folder, scans, trials, workers, progress))
+
+
+def _kept(path: Path, results: dict[str, Any]) -> dict[str, Any]:
+    """The results, after they have been written to their file."""
     with written_aside(path, overwrite=True) as aside:
         aside.write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
     return results
@@ -157,26 +168,28 @@ def _budget(
 
 
 def _monte_carlo(
-    folder: CampaignFolder, scans: list[SphereScan], trials: int, progress: Progress
-) -> list[dict[str, Any]]:
+    folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: Progress
+) -> dict[str, Any]:
+    """Intervals of every scan of spheres, and the number of trials they rest on."""
     if trials == 0 or not scans:
-        return []
+        return {"monte_carlo": [], "trials": trials}
     options = CalibrationOptions(refractions=1)
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(folder.target("air")))]
         steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
         evidence, medium = gather(air, steps, options=options), steps[0].header.medium
     found = propagate(
-        evidence, scans, medium, _knowledge(folder), options=options, trials=trials,
+        evidence, scans, medium, _knowledge(folder), options=options, trials=trials, workers=workers,
         progress=lambda done, total: progress("Monte Carlo", done, total),
     )  # fmt: skip
-    return [
+    intervals = [
         {
             "placement": each.placement, "observed_mm": each.observed_mm, "std_mm": each.std_mm(),
-            "interval_mm": each.interval_mm(), "contains_truth": each.contains_truth(), "trials": len(each.trials_mm),
+            "interval_mm": each.interval_mm(), "contains_truth": each.contains_truth(),
         }
         for each in found
     ]  # fmt: skip
+    return {"monte_carlo": intervals, "trials": trials}
 
 
 def _knowledge(folder: CampaignFolder) -> dict[str, float]:

@@ -8,18 +8,22 @@ window's tilt and the water's index. The sheet's bow is not among them: the mode
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
 
 import numpy as np
 
 from uwlts.calibration.evidence import AirEvidence, StepEvidence
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, Evidence, solve
 from uwlts.camera import project
-from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.sensor import Medium
 from uwlts.thesis.sphere_scan import SphereScan
 from uwlts.thesis.window_study import spacing_error
+from uwlts.workers import work_through
 
 COVERAGE = 0.95
+LEAST_TRIALS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +64,7 @@ def propagate(
     options: CalibrationOptions,
     trials: int,
     seed: int = 0,
+    workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Propagated]:
     """Propagate what is known of the inputs to the sphere spacing of every scan.
@@ -75,12 +80,18 @@ def propagate(
         Standard deviations and half widths by the names of the campaign's imperfections; what is missing counts as 0.
     trials : int
         At least 20.
+    workers : int, optional
+        Trials made at a time; as many as there are processors unless given.
 
     Raises
     ------
+    RangeError
+        There are fewer than 20 trials.
     CalibrationError
         The unperturbed evidence gives no calibration, or more than a tenth of the trials fail.
     """
+    if trials < LEAST_TRIALS:
+        raise RangeError(f"{trials} trials tell no 95 % interval: make at least {LEAST_TRIALS}")
     start = solve(evidence, options=options)
     # Offsets of circle centres hardly change from trial to trial; they are taken out once.
     if start.bias_px is not None:
@@ -91,15 +102,14 @@ def propagate(
         evidence = replace(evidence, air=replace(evidence.air, images=images))
         options = replace(options, correct_circles=False)
     draw = _Draw(evidence, start, medium, knowledge, wavelength_nm=start.calibration.wavelength_nm)
-    found: list[list[float]] = []
-    for trial in range(trials):
-        try:
-            found.append(_trial(draw, scans, options, start, np.random.default_rng([seed, trial])))
-        except (CalibrationError, EvaluationError):
-            if trial + 1 - len(found) > max(2, trials // 10):
-                raise
-        progress(trial + 1, trials)
-    spacing = np.array(found)
+    numbers = count(1)
+    made = work_through(
+        partial(_trial, draw, scans, options, start, seed), range(trials), workers=workers,
+        heard=lambda _: progress(next(numbers), trials),
+    )  # fmt: skip
+    spacing = np.array([errors for errors in made if errors is not None])
+    if trials - len(spacing) > trials // 10:
+        raise CalibrationError(f"{trials - len(spacing)} of {trials} trials give no calibration or no spheres")
     return [
         Propagated(scan.placement, spacing_error(start.calibration, scan), spacing[:, number])
         for number, scan in enumerate(scans)
@@ -107,6 +117,18 @@ def propagate(
 
 
 def _trial(
+    draw: "_Draw", scans: Sequence[SphereScan], options: CalibrationOptions, start: CalibrationResult, seed: int,
+    number: int, tell: Callable[[None], None],
+) -> list[float] | None:  # fmt: skip
+    """Sphere spacing errors of one trial; None where its inputs give no calibration or no spheres."""
+    tell(None)
+    try:
+        return _errors(draw, scans, options, start, np.random.default_rng([seed, number]))
+    except (CalibrationError, EvaluationError):
+        return None
+
+
+def _errors(
     draw: "_Draw", scans: Sequence[SphereScan], options: CalibrationOptions, start: CalibrationResult,
     rng: np.random.Generator,
 ) -> list[float]:  # fmt: skip

@@ -99,15 +99,18 @@ def _monte_carlo(results: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     trials = [each for result in results for each in result["monte_carlo"]]
     if not trials:
         return None
-    expanded = [
-        abs(each["observed_mm"]) <= result["budget"]["expanded"] for result in results for each in result["monte_carlo"]
+    held = [
+        abs(each["observed_mm"]) <= result["budget"]["expanded"]
+        for result in results
+        if "expanded" in result["budget"]
+        for each in result["monte_carlo"]
     ]
     return {
         "intervals": [
             (number, each) for number, result in enumerate(results) for each in result["monte_carlo"]
         ],
         "held": sum(each["contains_truth"] for each in trials),
-        "budget_held": sum(expanded),
+        "budget_held": sum(held),
         "count": len(trials),
     }  # fmt: skip
 
