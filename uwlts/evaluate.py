@@ -38,7 +38,8 @@ def parse_artefact(table: dict[str, Any]) -> Artefact:
 
 
 def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, source: str) -> Judgement:
-    """Evaluate a cloud. Its points are coloured by their deviation from the artefact's fit, else from the truth.
+    """Evaluate a cloud. Its points are coloured by their deviation from the artefact's fit, else from the true surface
+    after a best fit.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, 
     if truth is not None:
         compared, fitted = _against_truth(cloud, truth)
         content["truth"] = compared.as_dict() | {"after_best_fit": fitted.as_dict()}
-        deviation = compared.distance_mm
+        deviation = fitted.distance_mm
     if artefact is not None:
         evaluation = evaluate_cloud(cloud, artefact)
         content |= {"artefact": artefact.model_dump(mode="json"), "evaluation": evaluation.as_dict()}

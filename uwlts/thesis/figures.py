@@ -8,7 +8,8 @@ import numpy as np
 
 from uwlts.report.canvas import ticks
 from uwlts.report.svg_plot import COLOURS, FAINT, INK, Curve, Panel, svg
-from uwlts.thesis.tables import TableRow
+from uwlts.thesis.methods import POLYNOMIALS, PROPOSED
+from uwlts.thesis.tables import MEAN, TableRow
 
 _BAR, _GAP, _LABEL, _ROOM = 15, 12, 300, 560
 
@@ -20,9 +21,12 @@ def window_distance_figure(result: dict[str, Any]) -> str:
         y, z = _columns(profile["points_mm"])
         name = f"d = {profile['distance_mm']:.1f} mm"
         curves.append(Curve(name, y, z, COLOURS[number], joined=False))
-    return svg(
-        [Panel("One step image for different window distances", "Y / mm", "Z / mm", curves, y_range=_range(curves))]
-    )
+    title = "One step image for different window distances"
+    whole = Panel(title, "Y / mm", "Z / mm", curves, y_range=_range(curves))
+    if not curves:
+        return svg([whole])
+    nearest = min(float(np.min(curve.y)) for curve in curves)
+    return svg([whole, Panel("Its upper tread", "Y / mm", "Z / mm", curves, y_range=(nearest - 0.2, nearest + 1.2))])
 
 
 def polynomials_figures(result: dict[str, Any]) -> tuple[str, str]:
@@ -72,7 +76,7 @@ def comparison_figure(rows: Sequence[TableRow]) -> str:
         colour = COLOURS[0] if "water" in row.row else COLOURS[3]
         middle = y + _BAR / 2
         parts.append(
-            f'<text x="{_LABEL - 8}" y="{middle + 4}" text-anchor="end">{escape(f"{row.quantity}: {row.row}")}</text>'
+            f'<text x="{_LABEL - 8}" y="{middle + 4}" text-anchor="end">{escape(_label(row))}</text>'
             f'<rect x="{_LABEL}" y="{y}" width="{at(row.mean) - _LABEL:.1f}" height="{_BAR}" fill="{colour}" '
             'fill-opacity="0.75"/>'
             f'<line x1="{at(min(row.ours)):.1f}" y1="{middle}" x2="{at(max(row.ours)):.1f}" y2="{middle}" '
@@ -91,6 +95,13 @@ def comparison_figure(rows: Sequence[TableRow]) -> str:
         f'<rect width="{width}" height="{height}" fill="white"/>{"".join(parts)}'
         f'<text x="{_LABEL + _ROOM + 8}" y="{height - 14}">mm</text></svg>'
     )
+
+
+def _label(row: TableRow) -> str:
+    """What a bar shows: quantity, object, medium and method."""
+    method = {"Table 2": POLYNOMIALS, "Table 3": POLYNOMIALS, "Table 6": PROPOSED, "Table 7": PROPOSED}.get(row.table)
+    shown = row.row.replace(f", {MEAN}", "").removesuffix(", thesis image processing")
+    return f"{row.quantity}: {shown}" + (f", {method}" if method else "")
 
 
 def _columns(points: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ from uwlts.thesis.figures import (
     window_distance_figure,
 )
 from uwlts.thesis.folder import campaign_folders
+from uwlts.thesis.methods import FORGOTTEN
 from uwlts.thesis.published import Published
 from uwlts.thesis.tables import LARGEST_RATIO, TableRow, headline_rows
 
@@ -56,7 +57,12 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
     first = results[0]
     z_of_v, y_of_z = polynomials_figures(first)
     headline = headline_rows(rows)
-    shown = [row for row in rows if row.table == "Figure 66" and row.quantity == "STD" and ", thesis image" in row.row]
+    shown = [
+        row
+        for row in rows
+        if row.table == "Figure 66" and row.quantity == "STD" and row.row.endswith("thesis image processing")
+        and FORGOTTEN not in row.row
+    ]  # fmt: skip
     return template.render(
         published=published.title,
         campaigns=len(results),
