@@ -121,7 +121,7 @@ def reproduce(
     campaign: str = "thesis",
     *,
     out: Path | None = None,
-    campaigns: int = 3,
+    campaigns: int = 2,
     first: int = 0,
     every: int = 1,
     spp: int = 16,

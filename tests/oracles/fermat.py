@@ -47,7 +47,7 @@ def least_time_crossings(start: np.ndarray, ends: np.ndarray, faces: list[Face],
         step = -np.linalg.solve(spread.T @ hessian @ spread, (gradient @ spread)[..., None])[..., 0]
         move = (step @ spread.T).reshape(crossings.shape)
         crossings = crossings + _useful_share(start, ends, crossings, move, indices)[:, None, None] * move
-        if np.abs(move).max() < 1e-11:
+        if np.abs(move).max() < 1e-10:
             return crossings  # the error left is of the order of this move's square
     raise ArithmeticError(f"the path of least time was not found: last move {np.abs(move).max():g} mm")
 
