@@ -23,9 +23,10 @@ def window_distance_figure(result: dict[str, Any]) -> str:
         curves.append(Curve(name, y, z, COLOURS[number], joined=False))
     title = "One step image for different window distances"
     whole = Panel(title, "Y / mm", "Z / mm", curves, y_range=_range(curves))
-    if not curves:
+    depths = np.concatenate([np.empty(0), *(curve.y for curve in curves)])
+    if not len(depths):
         return svg([whole])
-    nearest = min(float(np.min(curve.y)) for curve in curves)
+    nearest = float(depths.min())
     return svg([whole, Panel("Its upper tread", "Y / mm", "Z / mm", curves, y_range=(nearest - 0.2, nearest + 1.2))])
 
 
