@@ -157,7 +157,7 @@ def _take(recording: Recording, scene: Scene, drawn: "_Drawn", *, every: int) ->
     rng = np.random.default_rng([drawn.seed, *name.encode()])
     if not recording.as_described:
         scene = drawn.as_it_really_is(scene, rng)
-        calibrating = scene.target is not None or Path(recording.scene).stem == "step"
+        calibrating = scene.target is not None or _shows_step(scene)
         built = drawn.with_true_water(built, calibrating=calibrating)
     return Take(name, scene, sensor, built, int(rng.integers(2**31)))
 
@@ -207,17 +207,14 @@ class _Drawn:
         """The sensor in water of the true temperature."""
         warmer = self._warmer_calibrating if calibrating else self._warmer_measuring
         media = {
-            name: medium if medium.kind == "air" else medium.model_copy(
-                update={"temperature_c": medium.temperature_c + warmer}
-            )
-            for name, medium in sensor.media.items()
-        }  # fmt: skip
+            name: medium if medium.kind == "air" else medium.warmer_by(warmer) for name, medium in sensor.media.items()
+        }
         return sensor.model_copy(update={"media": media})
 
     def as_it_really_is(self, scene: Scene, rng: np.random.Generator) -> Scene:
         """The scene with its target's, step's and stage's errors; ``rng`` draws those of this recording alone."""
-        objects = [self._real(thing, scene, rng) for thing in scene.objects]
-        if self._lower_step != 0 and (scene.artefact or {}).get("kind") == "step":
+        objects = [self._real(thing, rng) for thing in scene.objects]
+        if self._lower_step != 0 and _shows_step(scene):
             objects[_lower_block(scene)] = _moved(objects[_lower_block(scene)], (0.0, 0.0, self._lower_step))
         motion = scene.motion
         positions = np.array([motion.start_mm + index * motion.step_mm for index in range(motion.count)])
@@ -233,12 +230,17 @@ class _Drawn:
         }
         return _with_motion(scene.model_copy(update={"objects": tuple(objects)}), **changes)
 
-    def _real(self, thing: AnyObject, scene: Scene, rng: np.random.Generator) -> AnyObject:
+    def _real(self, thing: AnyObject, rng: np.random.Generator) -> AnyObject:
         if not isinstance(thing, CirclePlate):
             return thing
         tilt = self._size.target_tilt_std_deg * rng.standard_normal(2)
         turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
         return thing.model_copy(update=self._target | {"rotation_deg": tuple(turned.tolist())})
+
+
+def _shows_step(scene: Scene) -> bool:
+    """Whether the step standard stands before the sensor."""
+    return (scene.artefact or {}).get("kind") == "step"
 
 
 def _lower_block(scene: Scene) -> int:

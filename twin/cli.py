@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 import uwlts
+from twin.campaign import campaign_names, load_campaign
 from twin.effects import ALL, NONE
 from twin.options import Options
 from twin.scene import load_scene, scene_names
@@ -160,7 +161,6 @@ def reproduce(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    from twin.campaign import load_campaign
     from twin.reproduce import record_campaigns
 
     for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
@@ -195,7 +195,7 @@ def scenes() -> None:
         scene = load_scene(name)
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     print(f"sensors: {', '.join(names('sensors'))}")
-    print(f"campaigns: {', '.join(names('campaigns'))}")
+    print(f"campaigns: {', '.join(campaign_names())}")
     print(f"waters: {', '.join(water_names())}, or a turbidity from 0 to 3")
 
 

@@ -12,6 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 
+from uwlts.console import INTERRUPTED
+
 FOLDER = Path("runs/demo")
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
@@ -72,7 +74,8 @@ def main() -> int:
 
 def _run(line: str) -> int:
     """Run a command and print what it says once it has ended; its exit code."""
-    print(f"$ {line}", flush=True)
+    sys.stdout.write(f"$ {line}\n")  # at once: print would write the line's end on its own, among other lines
+    sys.stdout.flush()
     program, *arguments = shlex.split(line)
     done = subprocess.run(
         [sys.executable, "-m", f"{program}.cli", *arguments], check=False, capture_output=True, text=True
@@ -83,4 +86,8 @@ def _run(line: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)

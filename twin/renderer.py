@@ -334,7 +334,8 @@ class Renderer:
             if shifted:
                 shift_u, shift_v = (to_jit(mi.Float, axis) for axis in pupil_shifts(rows, columns))
                 u, v = u + dr.gather(mi.Float, shift_u, pixel), v + dr.gather(mi.Float, shift_v, pixel)
-            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u - dr.floor(u), v - dr.floor(v)))
+                u, v = u - dr.floor(u), v - dr.floor(v)
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
         travel_mm = None if pose.travel is None else pose.travel.at(row, places[-1])
         bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
         values = light(pose, bundle, travel_mm, *rest)

@@ -146,9 +146,7 @@ def weld_surface(weld: Weld) -> tuple[np.ndarray, np.ndarray]:
             "make its ripples longer or lower, or its beads fewer or shorter"
         )
     x, y = np.meshgrid(*((along, across) if weld.along == "x" else (across, along)), indexing="ij")
-    corner = np.arange(x.size).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
-    return _locked(np.stack([x, y, -weld_height(weld, x, y)], axis=-1).reshape(-1, 3), _quads(a, b, c, d))
+    return _locked(np.stack([x, y, -weld_height(weld, x, y)], axis=-1).reshape(-1, 3), _grid_faces(x.shape))
 
 
 def _bead_middles(weld: Weld) -> np.ndarray:
@@ -167,6 +165,12 @@ def _wave(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A smooth irregular function between -1 and 1, with waves of 2 to 8 units of ``place``."""
     frequency, phase = rng.uniform(1 / 8, 1 / 2, 4), rng.uniform(0, 2 * np.pi, 4)
     return np.mean([np.sin(2 * np.pi * f * place + p) for f, p in zip(frequency, phase, strict=True)], axis=0)
+
+
+def _grid_faces(shape: tuple[int, int]) -> np.ndarray:
+    """Triangles (F, 3) between the vertices of a grid (rows, columns), numbered row by row."""
+    corner = np.arange(shape[0] * shape[1]).reshape(shape)
+    return _quads(*(part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])))
 
 
 def _quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -191,7 +195,4 @@ def bowed_plate(
     u, v = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1))
     x, y = (u - 0.5) * width_mm, (0.5 - v) * height_mm
     z = bow_mm * (x**2 + y**2) / (0.25 * (width_mm**2 + height_mm**2))
-    first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    right, below = first + 1, first + cells + 1
-    faces = np.concatenate([np.stack([first, right, below], 1), np.stack([right, below + 1, below], 1)])
-    return np.stack([x, y, z], -1).reshape(-1, 3), faces, np.stack([u, v], -1).reshape(-1, 2)
+    return np.stack([x, y, z], -1).reshape(-1, 3), _grid_faces(x.shape), np.stack([u, v], -1).reshape(-1, 2)

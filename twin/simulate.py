@@ -19,7 +19,7 @@ from twin.scene import CirclePlate, Scene, Shot
 from twin.speckle import Speckle, coherence
 from twin.truth import FrameTruth, depth_map, no_stripe, true_stripe
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
-from uwlts.errors import DescriptionError, DesignError, OutputError
+from uwlts.errors import DesignError, OutputError
 from uwlts.library import validated
 from uwlts.placement import camera_from_object
 from uwlts.sensor import Medium, Sensor
@@ -33,11 +33,7 @@ BRIGHT_SHARE = 0.98
 
 def medium_of(sensor: Sensor, scene: Scene) -> Medium:
     """The medium that a scene names, from the sensor's list, with the scene's water if it has one of its own."""
-    if scene.medium not in sensor.media:
-        raise DescriptionError(
-            f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{scene.medium}'"
-        )
-    medium = sensor.media[scene.medium]
+    medium = sensor.medium(scene.medium)
     if scene.water is None:
         return medium
     kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}

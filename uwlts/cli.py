@@ -3,7 +3,7 @@
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -11,9 +11,6 @@ import uwlts
 from uwlts.console import progress_bar, run
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files import refuse_unsuitable
-
-if TYPE_CHECKING:
-    from uwlts.sensor import Medium, Sensor
 
 app = App(
     name="uwlts",
@@ -184,7 +181,7 @@ def design(sensor: str, *, medium: str) -> None:
     from uwlts.library import load_sensor
 
     described = load_sensor(sensor)
-    print("\n".join(table_lines(design_table(described, _medium_of(described, medium)))))
+    print("\n".join(table_lines(design_table(described, described.medium(medium)))))
 
 
 @app.command
@@ -209,7 +206,7 @@ def nominal(sensor: str, *, medium: str, out: Path, overwrite: Flag = False) -> 
     from uwlts.library import load_sensor
 
     described = load_sensor(sensor)
-    write_calibration(out, nominal_calibration(described, _medium_of(described, medium)), overwrite=overwrite)
+    write_calibration(out, nominal_calibration(described, described.medium(medium)), overwrite=overwrite)
     print(f"wrote {out}")
 
 
@@ -427,12 +424,6 @@ def thesis(
     rows = write_comparison(folder, results, tables, overwrite=overwrite)
     print(markdown(rows, results), end="")
     print(f"wrote {folder / 'report.html'}, summary.json, tables.csv and summary.md")
-
-
-def _medium_of(sensor: "Sensor", name: str) -> "Medium":
-    if name not in sensor.media:
-        raise DescriptionError(f"the sensor '{sensor.name}' knows the media {', '.join(sensor.media)}, not '{name}'")
-    return sensor.media[name]
 
 
 def _read_toml(path: Path) -> dict[str, object]:

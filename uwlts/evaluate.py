@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from uwlts.cloud import PointCloud
 from uwlts.errors import CaptureError, EvaluationError
 from uwlts.files import written_aside
+from uwlts.json_file import read_json
 from uwlts.metrology.artefacts import Artefact, evaluate_cloud
 from uwlts.metrology.truth import TruthComparison, best_fit_motion, compare_with_truth
 from uwlts.truth import Truth
@@ -86,12 +87,7 @@ def write_evaluation(path: str | Path, judgement: Judgement, *, overwrite: bool 
 
 def read_evaluation(path: str | Path) -> dict[str, Any]:
     """Content of an evaluation file; CaptureError where it is missing, foreign, newer or damaged."""
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CaptureError(f"cannot read the evaluation {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path} is not an evaluation, or is truncated: {error}") from error
-    if not isinstance(content, dict) or (content.get("format"), content.get("version")) != (FORMAT, VERSION):
+    content = read_json(path, called="evaluation")
+    if (content.get("format"), content.get("version")) != (FORMAT, VERSION):
         raise CaptureError(f"{path} is JSON but not an evaluation that this program reads (version {VERSION})")
     return content

@@ -25,9 +25,13 @@ _LARGEST_INDEX_CHANGE = 1e-3
 
 @dataclass(frozen=True)
 class Scan:
-    """A reconstructed capture: its cloud, and what became of the profile lines of all laser images."""
+    """A reconstructed capture: its cloud, and what became of the profile lines of all laser images.
+
+    ``stripe`` (N,) tells from which of the capture's `FoundStripes` each point of the cloud comes.
+    """
 
     cloud: PointCloud
+    stripe: np.ndarray
     lines_by_status: dict[str, int]
     rays_by_status: dict[str, int]
 
@@ -198,7 +202,7 @@ def reconstruct_stripes(
     header, frame = capture.header, stripes.frame
     found = _points(capture, calibration, stripes.line, stripes.centre_px, frame, index)
     points = _posed(found.points_mm, capture, frame)
-    good = found.status == RayStatus.OK
+    good = np.flatnonzero(found.status == RayStatus.OK)
     cloud = PointCloud(
         points_mm=points[good], intensity=stripes.amplitude[good], frame=frame[good], line=stripes.line[good],
         metadata={
@@ -208,7 +212,7 @@ def reconstruct_stripes(
     )  # fmt: skip
     rays = np.bincount(found.status, minlength=len(RayStatus))
     by_status = {status.name.lower(): int(rays[status]) for status in RayStatus}
-    return Scan(cloud, stripes.lines_by_status, by_status)
+    return Scan(cloud, good, stripes.lines_by_status, by_status)
 
 
 def _points(

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from uwlts import media, waters
+from uwlts.errors import DescriptionError
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -228,6 +229,10 @@ class Medium(Description):
             wavelength_nm=wavelength_nm, temperature_c=self.temperature_c, salinity_g_kg=self.salinity_g_kg
         )
 
+    def warmer_by(self, kelvin: float) -> "Medium":
+        """The same medium at another temperature."""
+        return self.model_copy(update={"temperature_c": self.temperature_c + kelvin})
+
     def absorption_per_mm(self, wavelength_nm: float) -> float:
         """Absorption coefficient a in 1/mm; RangeError outside the tables."""
         if self.absorption_per_m is not None:
@@ -396,6 +401,12 @@ class Sensor(Description):
     stage: Stage
     volume: Volume
     media: dict[str, Medium]
+
+    def medium(self, name: str) -> Medium:
+        """One of the sensor's media; DescriptionError where it has none of this name."""
+        if name not in self.media:
+            raise DescriptionError(f"the sensor '{self.name}' knows the media {', '.join(self.media)}, not '{name}'")
+        return self.media[name]
 
     @model_validator(mode="after")
     def _one_wavelength(self) -> "Sensor":

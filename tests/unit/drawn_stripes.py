@@ -14,10 +14,10 @@ STAGE_MM = np.arange(-20.0, 21.0, 4.0)
 SIGMA_PX, AMPLITUDE, DARK = 1.4, 180.0, 8.0
 
 
-def coarse_sensor():
+def coarse_sensor(*, window_mounted):
     """The thesis's sensor with a quarter of the pixels, a lens without distortion and a window square to its axis."""
     sensor = built_sensor()
-    window = sensor.camera.window.model_copy(update={"mounted": True})
+    window = sensor.camera.window.model_copy(update={"mounted": window_mounted})
     camera = sensor.camera.model_copy(
         update={
             "width_px": 640, "height_px": 512, "pixel_size_um": 10.6, "principal_point_px": (322.0, 254.0),
@@ -27,11 +27,11 @@ def coarse_sensor():
     return sensor.model_copy(update={"camera": camera})
 
 
-SENSOR = coarse_sensor()
+SENSOR = coarse_sensor(window_mounted=True)
 SHAPE = (SENSOR.camera.height_px, SENSOR.camera.width_px)
 
 
-def stripe_image(pieces, *, noise=1.0, seed=0):
+def stripe_image(pieces, rng):
     """A Gaussian line through the pixels (N, 2) of each piece; where pieces share a column, the last is in front."""
     centre, columns = np.full(SHAPE[1], -100.0), np.arange(SHAPE[1])
     for pixels in pieces:
@@ -40,7 +40,7 @@ def stripe_image(pieces, *, noise=1.0, seed=0):
         centre[here] = np.interp(columns[here], pixels[order, 0], pixels[order, 1])
     rows = np.arange(SHAPE[0])[:, None]
     image = DARK + AMPLITUDE * np.exp(-(((rows - centre) / SIGMA_PX) ** 2) / 2)
-    image += noise * np.random.default_rng(seed).normal(size=SHAPE)
+    image += rng.normal(size=SHAPE)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
@@ -49,7 +49,8 @@ def step_image(depth_mm, *, tilt=0.0, shift_mm=0.0, **step):
     points = step_profile(depth_mm, tilt=tilt, shift_mm=shift_mm, **step)
     block = np.abs(np.linspace(-75, 75, len(points)) - shift_mm) < 30
     left, middle, right = np.split(points, np.flatnonzero(np.diff(block.astype(int))) + 1)
-    return stripe_image([through_window(SENSOR, piece) for piece in (left, right, middle)])
+    pieces = [through_window(SENSOR, piece) for piece in (left, right, middle)]
+    return stripe_image(pieces, np.random.default_rng(0))
 
 
 def sphere_profiles(depth_mm):

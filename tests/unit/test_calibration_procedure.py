@@ -8,7 +8,6 @@ import pytest
 
 from tests.unit.calibration_views import (
     WATER,
-    built_sensor,
     lattice,
     lens_of,
     stage_images,
@@ -16,13 +15,14 @@ from tests.unit.calibration_views import (
     stripes_on_target,
     through_window,
 )
+from tests.unit.drawn_stripes import coarse_sensor, stripe_image
 from uwlts.calibration.camera_poses import CameraOptions
 from uwlts.calibration.model import read_calibration, write_calibration
 from uwlts.calibration.procedure import CalibrationOptions, calibrate
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.placement import camera_from_object, laser_pose
-from uwlts.sensor import Distortion, Medium
+from uwlts.sensor import Medium
 
 POSITIONS = np.arange(5) * 40.0
 PLATE = {
@@ -30,20 +30,7 @@ PLATE = {
 }  # fmt: skip
 
 
-def coarse_sensor():
-    """The thesis's sensor with a quarter of the pixels and a lens without distortion, as captures describe it."""
-    sensor = built_sensor()
-    window = sensor.camera.window.model_copy(update={"mounted": False})
-    camera = sensor.camera.model_copy(
-        update={
-            "width_px": 640, "height_px": 512, "pixel_size_um": 10.6, "principal_point_px": (322.0, 254.0),
-            "distortion": Distortion(), "window": window,
-        }
-    )  # fmt: skip
-    return sensor.model_copy(update={"camera": camera})
-
-
-SENSOR = coarse_sensor()
+SENSOR = coarse_sensor(window_mounted=False)
 SHAPE = (SENSOR.camera.height_px, SENSOR.camera.width_px)
 
 
@@ -62,18 +49,6 @@ def plate_image(pose, rng):
             dotted = np.isin(i + 100 * j, (0, 2, 200)) & (radius < 1.25)
             bright += (radius < 3.0) & ~dotted & (np.maximum(abs(i), abs(j)) <= 8)
     image = cv2.GaussianBlur(25 + 180 * bright / 9, (0, 0), 0.7) + rng.normal(0, 1, SHAPE)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
-
-
-def stripe_image(pieces, rng):
-    """A Gaussian line through the pixels of each piece; where pieces share a column, the later one is in front."""
-    centre, columns = np.full(SHAPE[1], -100.0), np.arange(SHAPE[1])
-    for pixels in pieces:
-        here = (columns >= pixels[:, 0].min()) & (columns <= pixels[:, 0].max())
-        order = np.argsort(pixels[:, 0])
-        centre[here] = np.interp(columns[here], pixels[order, 0], pixels[order, 1])
-    rows = np.arange(SHAPE[0])[:, None]
-    image = 8 + 180 * np.exp(-(((rows - centre) / 1.4) ** 2) / 2) + rng.normal(0, 1, SHAPE)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 

@@ -32,7 +32,9 @@ EXACT = nominal_calibration(SENSOR)
 @pytest.fixture(scope="module")
 def spheres(tmp_path_factory):
     """A scan of two spheres at the stand-off in water."""
-    images = [stripe_image(profile, seed=number) for number, profile in enumerate(sphere_profiles(15.0))]
+    images = [
+        stripe_image(profile, np.random.default_rng(number)) for number, profile in enumerate(sphere_profiles(15.0))
+    ]
     path = tmp_path_factory.mktemp("scan") / "spheres-standoff-water.h5"
     return write(path, images, stage_mm=STAGE_MM, artefact=SPHERES)
 
@@ -61,7 +63,12 @@ def test_stripes_are_sorted_by_sphere(spheres):
 
 def test_a_scan_without_its_spheres_is_refused(tmp_path):
     plane = np.column_stack([np.arange(20, 600), np.full(580, 250.0)])
-    path = write(tmp_path / "plane.h5", [stripe_image([plane])] * 3, stage_mm=[0.0, 1.0, 2.0], artefact=SPHERES)
+    path = write(
+        tmp_path / "plane.h5",
+        [stripe_image([plane], np.random.default_rng(0))] * 3,
+        stage_mm=[0.0, 1.0, 2.0],
+        artefact=SPHERES,
+    )
     with Capture(path) as capture, pytest.raises(EvaluationError):
         sphere_scan(capture, EXACT, placement="here")
 

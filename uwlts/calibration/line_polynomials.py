@@ -6,6 +6,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from uwlts.errors import CalibrationError
+from uwlts.metrology.robust_fit import MAD_TO_STD
 
 MOST_SMOOTH = 8
 """Degree of the coefficients over the lines."""
@@ -15,7 +16,6 @@ _LINES_PER_DEGREE = 10
 # Smallest singular value over the largest one: a full view has 0.1, one cut to a triangle some thousandths.
 _DETERMINED = 1e-6
 _STRAYS = 5.0
-_MAD_TO_STD = 1.4826
 _ROUNDS = 20
 _RETURNING_ROUNDS = 10
 
@@ -93,7 +93,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
                 "line at all depths"
             )
         residuals = y - design @ solution
-        spread = _MAD_TO_STD * np.median(np.abs(residuals[used]))
+        spread = MAD_TO_STD * np.median(np.abs(residuals[used]))
         # Rounding alone must not make strays of exact data.
         within = np.abs(residuals) <= max(_STRAYS * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:

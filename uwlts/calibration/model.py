@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from uwlts.errors import CaptureError
 from uwlts.files import written_aside
+from uwlts.json_file import described, read_json
 from uwlts.sensor import Description, Distortion, Positive, Vector
 
 FORMAT = "uwlts-calibration"
@@ -88,15 +88,20 @@ class Calibration(Description):
         _require_unit(self.sheet.normal, "the sheet's normal")
         if self.window is not None:
             _require_unit(self.window.normal, "the window's normal")
-        try:
-            json.dumps([self.residuals, self.provenance], allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
+        require_plain_json(self.residuals, self.provenance)
         return self
 
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""
         return np.array(self.camera_from_object)
+
+
+def require_plain_json(residuals: dict[str, Any], provenance: dict[str, Any]) -> None:
+    """Refuse what a calibration's file cannot hold; ValueError."""
+    try:
+        json.dumps([residuals, provenance], allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
 
 
 def _is_rigid(matrix: Matrix4) -> bool:
@@ -122,18 +127,7 @@ def write_calibration(path: str | Path, calibration: Calibration, *, overwrite: 
 
 def read_calibration(path: str | Path) -> Calibration:
     """Read a calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CaptureError(f"cannot read the calibration {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path} is not a calibration, or is truncated: {error}") from error
-    if not isinstance(content, dict) or content.pop("format", None) != FORMAT:
-        raise CaptureError(f'{path} is JSON but not a calibration: expected "format": "{FORMAT}"')
-    if (version := content.pop("version", None)) != VERSION:
-        raise CaptureError(f"{path} has version {version}; this program reads {VERSION}")
-    try:
-        return Calibration.model_validate(content)
-    except ValidationError as error:
-        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
-        raise CaptureError(f"{path} is not a valid calibration: {details}") from error
+    return described(
+        read_json(path, called="calibration"), Calibration, path=path, format=FORMAT, version=VERSION,
+        called="calibration", foreign="not a calibration",
+    )  # fmt: skip

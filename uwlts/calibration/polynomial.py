@@ -132,7 +132,7 @@ def fit_polynomials(
             f"{100 * rejected:.0f} % of the stripe points do not lie on the polynomials of the others: check the stage "
             "positions, and that the stripe falls on the target"
         )
-    gap = int(_LARGEST_GAP * _line_count(header))
+    gap = int(_LARGEST_GAP * header.sensor.camera.lines())
     domains = line_domains(stripes.lines[kept], stripes.pose[kept], stripes.centres_px[kept], largest_gap=gap)
     first = int(stripes.lines[kept].min())
     rows = [slice(first - fit.first_line, first - fit.first_line + len(domains)) for fit in (depth, along)]
@@ -174,11 +174,6 @@ def fit_polynomials(
     }
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
     return PolynomialResult(calibration, stripes, maps, depth, along, warnings)
-
-
-def _line_count(header: CaptureHeader) -> int:
-    camera = header.sensor.camera
-    return camera.width_px if camera.stripe_along == "width" else camera.height_px
 
 
 def _fit_figures(fit: LinePolynomials, lines: np.ndarray, pose: np.ndarray) -> dict[str, Any]:

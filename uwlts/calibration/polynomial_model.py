@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from uwlts.calibration.model import Calibration, read_calibration
-from uwlts.errors import CaptureError
+from uwlts.calibration.model import Calibration, read_calibration, require_plain_json
 from uwlts.files import written_aside
+from uwlts.json_file import described, read_json
 from uwlts.sensor import Description, Medium, Positive
 
 FORMAT = "uwlts-polynomials"
@@ -73,10 +73,7 @@ class PolynomialCalibration(Description):
         known = [domain for domain in self.domains_px if domain is not None]
         if not known or not all(low <= a <= b <= high for a, b in known):
             raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
-        try:
-            json.dumps([self.residuals, self.provenance], allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
+        require_plain_json(self.residuals, self.provenance)
         return self
 
     def domains(self) -> np.ndarray:
@@ -94,31 +91,13 @@ def write_polynomials(path: str | Path, calibration: PolynomialCalibration, *, o
 
 def read_polynomials(path: str | Path) -> PolynomialCalibration:
     """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    content = _content(path)
-    if content.pop("format", None) != FORMAT:
-        raise CaptureError(f'{path} is JSON but no polynomial calibration: expected "format": "{FORMAT}"')
-    if (version := content.pop("version", None)) != VERSION:
-        raise CaptureError(f"{path} has version {version}; this program reads {VERSION}")
-    try:
-        return PolynomialCalibration.model_validate(content)
-    except ValidationError as error:
-        # A damaged table would be told of number by number.
-        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()[:5])
-        raise CaptureError(f"{path} is not a valid polynomial calibration: {details}") from error
+    return described(
+        read_json(path, called="calibration"), PolynomialCalibration, path=path, format=FORMAT, version=VERSION,
+        called="polynomial calibration", foreign="no polynomial calibration",
+    )  # fmt: skip
 
 
 def read_any_calibration(path: str | Path) -> Calibration | PolynomialCalibration:
     """Read a calibration of either kind, told by its "format"; CaptureError as from `read_calibration`."""
-    return read_polynomials(path) if _content(path).get("format") == FORMAT else read_calibration(path)
-
-
-def _content(path: str | Path) -> dict[str, Any]:
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CaptureError(f"cannot read the calibration {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path} is not a calibration, or is truncated: {error}") from error
-    if not isinstance(content, dict):
-        raise CaptureError(f'{path} is JSON but not a calibration: expected an object with a "format"')
-    return content
+    kind = read_json(path, called="calibration").get("format")
+    return read_polynomials(path) if kind == FORMAT else read_calibration(path)

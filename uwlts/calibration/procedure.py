@@ -15,7 +15,7 @@ from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
 from uwlts.calibration.summary import camera_figures, sheet_figures, window_figures
 from uwlts.calibration.target_image import TargetImage
-from uwlts.calibration.window import WindowSolution, label_step, solve_window
+from uwlts.calibration.window import StepImage, WindowSolution, label_step, solve_window
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.placement import camera_from_object, laser_pose
@@ -282,17 +282,7 @@ def _window(
     used, images, warnings = [], [], []
     for step in evidence.steps:
         try:
-            images.append(
-                label_step(
-                    calibration,
-                    window,
-                    step.pixels,
-                    height_mm=step.standard.height_mm,
-                    medium_index=step.medium_index,
-                    edge_mm=step.standard.edge_mm,
-                    reference=step.standard.reference,
-                )
-            )
+            images.append(step_image(calibration, window, step))
             used.append(step)
         except EvaluationError as error:
             warnings.append(f"{step.source}: left out, {error}")
@@ -301,6 +291,15 @@ def _window(
             "no step image can be used for the window's distance; " + "; ".join([*evidence.warnings, *warnings][:3])
         )
     return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
+
+
+def step_image(calibration: Calibration, window: WindowModel, step: StepEvidence) -> StepImage:
+    """A stripe on the step standard with its treads told apart; EvaluationError where it does not show two."""
+    standard = step.standard
+    return label_step(
+        calibration, window, step.pixels, height_mm=standard.height_mm, medium_index=step.medium_index,
+        edge_mm=standard.edge_mm, reference=standard.reference,
+    )  # fmt: skip
 
 
 def nominal_window(plate: Window, sensor: Sensor, *, refractions: Literal[1, 2]) -> WindowModel:

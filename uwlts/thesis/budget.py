@@ -39,11 +39,10 @@ def spacing_budget(
     """
     errors = np.array([spacing_error(calibration, scan) for scan in scans])
     correction = float(np.mean(np.abs(errors)))
-    warm, cold = (
-        medium.model_copy(update={"temperature_c": medium.temperature_c + sign * TEMPERATURE_HALF_WIDTH_C})
+    ends = [
+        medium.warmer_by(sign * TEMPERATURE_HALF_WIDTH_C).refractive_index(calibration.wavelength_nm)
         for sign in (1, -1)
-    )
-    ends = [each.refractive_index(calibration.wavelength_nm) for each in (warm, cold)]
+    ]
     changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in ends]
     by_index = float(np.mean(np.abs(np.subtract(*changes)))) / 2
     expansion = thermal_expansion_mm(

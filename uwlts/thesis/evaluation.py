@@ -19,11 +19,11 @@ from uwlts.capture import Capture
 from uwlts.errors import CaptureError
 from uwlts.files import written_aside
 from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
-from uwlts.scan import find_stripes, reconstruct_stripes
+from uwlts.scan import AnyCalibration, reconstruct_capture
 from uwlts.thesis.budget import spacing_budget
 from uwlts.thesis.folder import MEDIA, CampaignFolder, ScanFile
 from uwlts.thesis.measurements import THESIS, Measurement, measure_scan
-from uwlts.thesis.methods import POLYNOMIALS, PROPOSED, TWO, AnyCalibration, calibrations
+from uwlts.thesis.methods import POLYNOMIALS, PROPOSED, TWO, calibrations
 from uwlts.thesis.monte_carlo import propagate
 from uwlts.thesis.sphere_scan import SphereScan, sphere_scan
 from uwlts.thesis.window_study import window_choices
@@ -210,6 +210,6 @@ def _line_profile(folder: CampaignFolder, side: str) -> dict[str, Any] | None:
         return None
     with Capture(path) as capture:
         header = capture.header
-        cloud = reconstruct_stripes(capture, find_stripes(capture), nominal_calibration(header.sensor, header.medium))
-    points = cloud.cloud.points_mm[:, 1:]
+        scan = reconstruct_capture(capture, nominal_calibration(header.sensor, header.medium))
+    points = scan.cloud.points_mm[:, 1:]
     return {"length_mm": float(np.ptp(points[:, 0])), "points_mm": np.round(points[::4], 3).tolist()}

@@ -10,10 +10,11 @@ from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
 from uwlts.evaluate import Judgement, judge, parse_artefact
-from uwlts.scan import find_stripes, reconstruct_stripes
+from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
+from uwlts.scan import AnyCalibration, find_stripes, reconstruct_stripes
 from uwlts.thesis.folder import ScanFile
 from uwlts.thesis.image_processing import thesis_stripes
-from uwlts.thesis.methods import METHODS, PROPOSED, AnyCalibration
+from uwlts.thesis.methods import METHODS, PROPOSED
 from uwlts.truth import read_truth, truth_path
 
 THESIS, OURS = "thesis", "ours"
@@ -23,8 +24,6 @@ VARIANTS = {
     "thesis, fit over 7 px": {"fitted_px": 7},
 }  # fmt: skip
 """Other readings of the thesis's text, tried on the spheres by the proposed method."""
-VDI_LEFT_OUT = 0.003
-"""Share of the points that VDI/VDE 2634 lets a range leave out."""
 _SHOWN = ("pipe", "head", "weld")
 """Things whose coloured clouds are kept for the report."""
 
@@ -94,7 +93,7 @@ def _figures(judgement: Judgement) -> dict[str, float]:
 def _range_within(deviation_mm: np.ndarray) -> float:
     """Range of deviations (N,), NaN where not evaluated, without the largest 0.3 %."""
     used = deviation_mm[np.isfinite(deviation_mm)]
-    kept = used[np.argsort(np.abs(used))[: len(used) - int(VDI_LEFT_OUT * len(used))]]
+    kept = used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]
     return float(np.ptp(kept))
 
 

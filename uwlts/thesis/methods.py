@@ -14,17 +14,17 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from uwlts.calibration.model import Calibration, read_calibration, write_calibration
+from uwlts.calibration.model import Calibration, write_calibration
 from uwlts.calibration.polynomial import calibrate_polynomials
-from uwlts.calibration.polynomial_model import PolynomialCalibration, read_polynomials, write_polynomials
+from uwlts.calibration.polynomial_model import PolynomialCalibration, read_any_calibration, write_polynomials
 from uwlts.calibration.procedure import CalibrationOptions, calibrate
 from uwlts.capture import Capture
+from uwlts.scan import AnyCalibration
 from uwlts.thesis.folder import CampaignFolder
 
 PROPOSED, TWO, POLYNOMIALS, SINGLE = "proposed", "two refractions", "polynomials", "single viewpoint"
 FORGOTTEN = "window forgotten"
 METHODS = {"air": (PROPOSED, POLYNOMIALS, FORGOTTEN), "water": (PROPOSED, TWO, POLYNOMIALS, SINGLE)}
-AnyCalibration = Calibration | PolynomialCalibration
 
 
 def calibrations(
@@ -40,11 +40,9 @@ def calibrations(
         The recordings do not determine a calibration.
     """
     made = {
-        (PROPOSED, "air"): lambda: _rays(folder.target("air"), [], refractions=1),
         (PROPOSED, "water"): lambda: _rays(folder.target("air"), folder.steps(), refractions=1),
         (TWO, "water"): lambda: _rays(folder.target("bare"), folder.steps(), refractions=2),
         (SINGLE, "water"): lambda: _rays(folder.target("water"), [], refractions=1),
-        (FORGOTTEN, "air"): lambda: _rays(folder.target("bare"), [], refractions=1),
         (POLYNOMIALS, "air"): lambda: _polynomials(folder.target("air")),
         (POLYNOMIALS, "water"): lambda: _polynomials(folder.target("water")),
     }
@@ -56,12 +54,14 @@ def calibrations(
     for number, ((method, medium), make) in enumerate(made.items()):
         progress(number, len(made))
         path = place / f"{method.replace(' ', '-')}-{medium}.json"
-        read = read_polynomials if method == POLYNOMIALS else read_calibration
         write = write_polynomials if method == POLYNOMIALS else write_calibration
         if not path.is_file() or path.stat().st_mtime_ns < newest:
             write(path, make(), overwrite=True)
-        found[method, medium] = read(path)
+        found[method, medium] = read_any_calibration(path)
     progress(len(made), len(made))
+    # In air nothing but camera and sheet is used of a calibration.
+    for method, source in ((PROPOSED, PROPOSED), (FORGOTTEN, TWO)):
+        found[method, "air"] = found[source, "water"].model_copy(update={"window": None})
     return found
 
 

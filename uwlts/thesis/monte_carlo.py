@@ -227,8 +227,7 @@ class _Draw:
     def index(self, rng: np.random.Generator) -> float:
         """Index of the water at a temperature drawn."""
         warmer = self._std("temperature_half_width_c") * rng.uniform(-1, 1)
-        warm = self._medium.model_copy(update={"temperature_c": self._medium.temperature_c + warmer})
-        return warm.refractive_index(self._wavelength)
+        return self._medium.warmer_by(warmer).refractive_index(self._wavelength)
 
     def scan(self, rng: np.random.Generator) -> tuple[float, np.ndarray]:
         """Relative error of the stage's lead, and by how much its travel is turned, in rad about two axes."""

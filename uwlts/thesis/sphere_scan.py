@@ -8,8 +8,7 @@ from uwlts.capture import Capture
 from uwlts.metrology.artefact_descriptions import SphereStandard
 from uwlts.metrology.sphere_evaluation import evaluate_spheres
 from uwlts.metrology.sphere_fit import fit_sphere
-from uwlts.scan import find_stripes, reconstruct_stripes
-from uwlts.thesis.methods import AnyCalibration
+from uwlts.scan import AnyCalibration, find_stripes, reconstruct_stripes
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,16 +52,15 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
     """
     standard = SphereStandard.model_validate(capture.header.artefact)
     stripes = find_stripes(capture)
-    cloud = reconstruct_stripes(capture, stripes, calibration).cloud
-    evaluation = evaluate_spheres(cloud.points_mm, standard)
+    scan = reconstruct_stripes(capture, stripes, calibration)
+    evaluation = evaluate_spheres(scan.cloud.points_mm, standard)
     centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
     radii = np.array(standard.diameters_mm) / 2
     used = np.isfinite(evaluation.deviation_mm)
-    away = np.abs(np.linalg.norm(cloud.points_mm[used, None] - centres, axis=2) - radii)
-    along_width = capture.header.sensor.camera.stripe_along == "width"
-    number = {key: place for place, key in enumerate(zip(stripes.frame.tolist(), stripes.line.tolist(), strict=True))}
-    kept = np.array([number[key] for key in zip(cloud.frame[used].tolist(), cloud.line[used].tolist(), strict=True)])
+    away = np.abs(np.linalg.norm(scan.cloud.points_mm[used, None] - centres, axis=2) - radii)
+    kept = scan.stripe[used]
     line, centre = stripes.line[kept], stripes.centre_px[kept]
+    along_width = capture.header.sensor.camera.stripe_along == "width"
     return SphereScan(
         placement=placement,
         pixels=np.stack((line, centre) if along_width else (centre, line), axis=1).astype(float),

@@ -7,8 +7,8 @@ import numpy as np
 
 from uwlts.calibration.evidence import step_evidence
 from uwlts.calibration.model import Calibration
-from uwlts.calibration.procedure import nominal_window
-from uwlts.calibration.window import StepImage, label_step, solve_window, step_profile
+from uwlts.calibration.procedure import nominal_window, step_image
+from uwlts.calibration.window import StepImage, solve_window, step_profile
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.reconstruction import reconstruct_pixels
@@ -89,11 +89,5 @@ def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, 
             described = nominal_window(
                 capture.header.sensor.camera.window, capture.header.sensor, refractions=calibration.window.refractions
             )
-        found[place] = [
-            label_step(
-                calibration, described, step.pixels, height_mm=step.standard.height_mm,
-                medium_index=step.medium_index, edge_mm=step.standard.edge_mm, reference=step.standard.reference,
-            )
-            for step in evidence
-        ]  # fmt: skip
+        found[place] = [step_image(calibration, described, step) for step in evidence]
     return found
