@@ -186,8 +186,65 @@ def reproduce(
 
 
 @app.command
+def sweep(
+    study: str,
+    *,
+    out: Path | None = None,
+    designs: int | None = None,
+    verify: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    overwrite: Annotated[bool, Parameter(negative="")] = False,
+    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
+) -> None:
+    """Find the sensor to build: judge many designs by formulas, improve the best, and render some to make sure.
+
+    Run again, it goes on where it was stopped; several machines may run it on one folder at the same time. OUT holds
+    report.html, designs.csv, summary.json and the winning design as winner.toml, which twin simulate takes as --sensor.
+
+    Example: twin sweep baseline-angle --out runs/baseline-angle
+
+    Parameters
+    ----------
+    study
+        Name (see: twin scenes) or path of the study's description.
+    out
+        Folder for all results; runs/STUDY unless given.
+    designs
+        How many designs a random, Sobol or optimised study judges, in place of what the study says.
+    verify
+        How many designs are rendered beside the base sensor, 0 for none at all, in place of what the study says.
+    workers
+        Processes of this machine; as many as there are processors unless given.
+    scheduler
+        Address of a Dask scheduler, such as tcp://host:8786, whose workers are used in place of this machine's.
+    overwrite
+        Remove what an earlier sweep has left in the folder.
+    variant
+        Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
+    """
+    from twin.study.crew import crew
+    from twin.study.description import load_study
+    from twin.study.sweep import clear, outcome_lines
+    from twin.study.sweep import sweep as run_sweep
+
+    if workers is not None and workers < 1:
+        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    described = load_study(study, designs=designs, verify=verify)
+    folder = out or Path("runs") / Path(study).stem
+    if overwrite:
+        clear(folder)
+    with crew(workers=workers, scheduler=scheduler) as hands, progress_bar(described.title) as progress:
+        outcome = run_sweep(
+            described, folder, hands, variant=variant, progress=lambda what, done, total: progress(done, total)
+        )
+    print("\n".join(outcome_lines(described, outcome)))
+    print(f"wrote {folder / 'report.html'}, designs.csv, summary.json and winner.toml")
+
+
+@app.command
 def scenes() -> None:
-    """List the scenes, sensors, campaigns and waters that ship with the program.
+    """List the scenes, sensors, campaigns, studies and waters that ship with the program.
 
     Example: twin scenes
     """
@@ -196,6 +253,7 @@ def scenes() -> None:
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
     print(f"sensors: {', '.join(names('sensors'))}")
     print(f"campaigns: {', '.join(campaign_names())}")
+    print(f"studies: {', '.join(names('studies'))}")
     print(f"waters: {', '.join(water_names())}, or a turbidity from 0 to 3")
 
 

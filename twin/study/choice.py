@@ -1,0 +1,91 @@
+"""Which of a study's designs to build, and which others to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from twin.study.description import Study
+from twin.study.designs import Design, built, described, judged, row_of
+from twin.study.page import Marked
+from twin.study.pareto import pareto
+from twin.study.refinement import refined
+from uwlts.errors import DesignError, UwltsError
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The base sensor if it works, then the best design, then the refined one if it is better: the last one wins."""
+
+    marked: tuple[Marked, ...]
+    further: tuple[Marked, ...]
+    notes: tuple[str, ...]
+
+
+def choose(study: Study, columns: dict[str, np.ndarray]) -> Chosen:
+    """The best design by the first objective among those that meet the constraints, and others to be looked at.
+
+    Where none meets them, the one that misses them least is taken, and said so. ``further`` are designs spread over
+    the Pareto front, as many as the study wants rendered beside the best.
+
+    Raises
+    ------
+    DesignError
+        No design works.
+    """
+    marked, notes = [], []
+    base = study.base()
+    try:
+        marked.append(Marked(f"{base.name} (as described)", base, described(study, "base", base)))
+    except UwltsError as error:
+        notes.append(f"The base sensor itself cannot work: {error}.")
+    violation = columns["violation"]
+    if not np.isfinite(violation).any():
+        raise DesignError(
+            f"none of {len(violation)} designs can work; the first one: {columns['failure'][0]}: widen the ranges"
+        )
+    costs = np.stack([_cost(columns[o.figure], o.goal) for o in study.objectives], axis=1)
+    meets = violation == 0
+    if not meets.any():
+        notes.append("No design meets all constraints; the chosen one misses them least.")
+        meets = violation == violation.min()
+    costs[~meets] = np.inf
+    best = int(np.argmin(costs[:, 0]))
+    front = np.flatnonzero(meets)[pareto(costs[meets])]
+    winner = _design(study, columns, best)
+    marked.append(Marked(f"best of the sweep (design {winner.number})", built(study, winner), row_of(columns, best)))
+    if study.refine and (better := refined(study, winner, _better_than(study, columns, best))) is not None:
+        marked.append(Marked("refined along the gradient", built(study, better), row_of(judged(study, [better]), 0)))
+    front = front[np.argsort(costs[front, 0])]
+    spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
+    others = [_design(study, columns, int(place)) for place in spread if place != best][: max(study.verify - 1, 0)]
+    further = [Marked(f"on the Pareto front (design {d.number})", built(study, d), row_of(judged(study, [d]), 0))
+               for d in others]  # fmt: skip
+    return Chosen(tuple(marked), tuple(further), tuple(notes))
+
+
+def _better_than(study: Study, columns: dict[str, np.ndarray], place: int) -> Callable[[Design], bool]:
+    """Whether a design is better than one of the sweep, judged alike."""
+    objective = study.objectives[0]
+    best = _cost(columns[objective.figure][place], objective.goal)
+
+    def better(design: Design) -> bool:
+        found = judged(study, [design])
+        cost = _cost(found[objective.figure][0], objective.goal)
+        return bool(found["violation"][0] <= columns["violation"][place] and cost < best - 1e-6 * abs(best))
+
+    return better
+
+
+def _cost(values: Any, goal: str) -> Any:
+    """What is to be small; NaN, where the objective has no value, is the worst."""
+    cost = values if goal == "minimise" else -values
+    return np.where(np.isnan(cost), np.inf, cost)
+
+
+def _design(study: Study, columns: dict[str, np.ndarray], place: int) -> Design:
+    row = row_of(columns, place)
+    return Design(row["design"], {name: row[name] for name in study.free()})

@@ -1,0 +1,187 @@
+"""Description of a study: a base sensor, what is free, what is wanted, and how the designs are chosen."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from twin.study.figures import FIGURES
+from twin.study.parameters import Follow
+from uwlts.errors import DescriptionError
+from uwlts.library import find, load_sensor, read_table, validated
+from uwlts.sensor import Description, Medium, NotNegative, Sensor
+
+FOLDER = "studies"
+Value = float | int | str | bool
+
+
+class Variable(Description):
+    """A free number of the sensor's description: from ``least`` to ``most``, or one of ``values``.
+
+    A grid takes ``steps`` of a range, evenly spaced, in their logarithm where ``scale`` is "log".
+    """
+
+    least: float | None = None
+    most: float | None = None
+    steps: Annotated[int, Field(ge=2, le=100000)] = 11
+    scale: Literal["linear", "log"] = "linear"
+    values: tuple[Value, ...] | None = None
+
+    @model_validator(mode="after")
+    def _range_or_values(self) -> Variable:
+        ends = (self.least, self.most)
+        if (self.values is None) == (None in ends) or (self.values is not None and any(e is not None for e in ends)):
+            raise ValueError("give least and most, or values")
+        if self.values is not None:
+            if not self.values:
+                raise ValueError("values is empty")
+        elif not self.least < self.most:
+            raise ValueError(f"least {self.least:g} must be smaller than most {self.most:g}")
+        elif self.scale == "log" and self.least <= 0:
+            raise ValueError(f"a log scale needs a least above 0, found {self.least:g}")
+        return self
+
+    def at(self, share: float) -> Value:
+        """The value at a share from 0 to 1 of the range, or of the list."""
+        if self.values is not None:
+            return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
+        if self.scale == "log":
+            return float(math.exp(math.log(self.least) + share * math.log(self.most / self.least)))
+        return self.least + share * (self.most - self.least)
+
+    def grid(self) -> list[Value]:
+        """All values of a grid."""
+        if self.values is not None:
+            return list(self.values)
+        return [self.at(k / (self.steps - 1)) for k in range(self.steps)]
+
+
+class Objective(Description):
+    """A figure to make as small or as large as possible."""
+
+    figure: str
+    goal: Literal["minimise", "maximise"] = "minimise"
+
+
+class Constraint(Description):
+    """Bounds of a figure."""
+
+    least: float | None = None
+    most: float | None = None
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Constraint:
+        if self.least is None and self.most is None:
+            raise ValueError("give least, most, or both")
+        if self.least is not None and self.most is not None and self.least > self.most:
+            raise ValueError(f"least {self.least:g} is above most {self.most:g}")
+        return self
+
+
+class Sampling(Description):
+    """How designs are chosen: all of a grid, at random, by a Sobol sequence, or by an optimiser (NSGA-II).
+
+    ``designs`` is their number where it is not the grid's; ``batch`` designs are judged at a time.
+    """
+
+    kind: Literal["grid", "random", "sobol", "optimise"] = "grid"
+    designs: Annotated[int, Field(ge=1, le=100_000_000)] = 4096
+    seed: Annotated[int, Field(ge=0)] = 0
+    batch: Annotated[int, Field(ge=1, le=100_000)] = 1000
+
+
+class Study(Description):
+    """A study as read from TOML.
+
+    ``variables`` are free numbers or words of the sensor's description, by their path (``camera.focal_length_mm``);
+    ``choices`` are named alternatives that set several paths at once, such as cameras that can be bought. ``follow``
+    is what is set anew for every design as one would on the bench, see `twin.study.parameters.followed`.
+    ``refine`` lets the best design be improved along the gradient; ``verify`` is how many of the best are rendered, in
+    addition to the base sensor.
+    """
+
+    title: str
+    sensor: str = "thesis"
+    medium: str = "water"
+    reflectance: Annotated[float, Field(gt=0, le=1)] = 0.5
+    water_depth_m: NotNegative = 100.0
+    variables: dict[str, Variable] = {}
+    choices: dict[str, dict[str, dict[str, Value]]] = {}
+    follow: tuple[Follow, ...] = ()
+    sampling: Sampling = Sampling()
+    objectives: Annotated[tuple[Objective, ...], Field(min_length=1)] = (Objective(figure="sigma_z_rms_mm"),)
+    constraints: dict[str, Constraint] = {}
+    refine: bool = True
+    verify: Annotated[int, Field(ge=0, le=1000)] = 2
+    verify_tolerance: Annotated[float, Field(gt=1)] = 1.5
+
+    @model_validator(mode="after")
+    def _figures_known(self) -> Study:
+        asked = [objective.figure for objective in self.objectives] + list(self.constraints)
+        if unknown := [name for name in asked if name not in FIGURES]:
+            raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
+        if not self.variables and not self.choices:
+            raise ValueError("nothing is free: give variables or choices")
+        if twice := set(self.variables) & set(self.choices):
+            raise ValueError(f"{', '.join(sorted(twice))}: a choice needs a name of its own")
+        if empty := [name for name, options in self.choices.items() if not options]:
+            raise ValueError(f"choices.{empty[0]} has no options")
+        return self
+
+    def free(self) -> dict[str, Variable]:
+        """All that is free, in order: variables, then choices by the names of their options."""
+        return self.variables | {name: Variable(values=tuple(options)) for name, options in self.choices.items()}
+
+    def base(self) -> Sensor:
+        """The base sensor."""
+        return load_sensor(self.sensor)
+
+    def medium_of(self, sensor: Sensor) -> Medium:
+        """The study's medium of a sensor."""
+        return sensor.medium(self.medium)
+
+
+def load_study(name_or_path: str | Path, *, designs: int | None = None, verify: int | None = None) -> Study:
+    """Study by name (``baseline-angle``) or path; a sensor beside it is found by its file name.
+
+    ``designs`` and ``verify`` replace what the study says of them.
+
+    Raises
+    ------
+    DescriptionError
+        The study is not valid, or a path does not exist in the sensor's description.
+    """
+    path = find(name_or_path, FOLDER)
+    table = read_table(path, FOLDER)
+    beside = path.parent / str(table.get("sensor", ""))
+    if beside.suffix == ".toml" and beside.is_file():
+        table["sensor"] = str(beside)
+    if designs is not None:
+        table["sampling"] = table.get("sampling", {}) | {"designs": designs}
+    if verify is not None:
+        table["verify"] = verify
+    study = validated(Study, table, path)
+    sensor = study.base()
+    study.medium_of(sensor)
+    paths = list(study.variables)
+    paths += [key for options in study.choices.values() for option in options.values() for key in option]
+    known = sensor.model_dump()
+    for name in paths:
+        _require_path(known, name, path)
+    return study
+
+
+def _require_path(known: dict[str, Any], name: str, source: Path) -> None:
+    table: Any = known
+    for key in name.split("."):
+        if not isinstance(table, dict) or key not in table:
+            there = ", ".join(table) if isinstance(table, dict) else "nothing"
+            raise DescriptionError(
+                f"{source}: the sensor's description has no '{name}': there is no '{key}', but {there}"
+            )
+        table = table[key]
+    if isinstance(table, dict):
+        raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(table)}")

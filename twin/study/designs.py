@@ -1,0 +1,143 @@
+"""Designs of a study: values of what is free, the sensor that they describe, and what the formulas say of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, reduce
+from typing import Any
+
+import numpy as np
+
+from twin.study.description import Study, Value
+from twin.study.figures import FIGURES, Figures, figures_of
+from twin.study.parameters import followed, numbers_of, parameters_of, stacked
+from uwlts.errors import DesignError, UwltsError
+from uwlts.library import find, read_table, validated
+from uwlts.sensor import Sensor
+
+
+@dataclass(frozen=True)
+class Design:
+    """One design: its number in the study, and the value of everything that is free."""
+
+    number: int
+    values: dict[str, Value]
+
+
+def sensor_of(study: Study, design: Design) -> Sensor:
+    """The design's sensor, before anything follows the stand-off.
+
+    Raises
+    ------
+    DescriptionError, RangeError
+        The values make no valid description.
+    """
+    changes: dict[str, Any] = {}
+    for name, value in design.values.items():
+        for path, one in study.choices[name][value].items() if name in study.choices else ((name, value),):
+            changes[path] = one
+    return validated(Sensor, _changed(_base_table(study.sensor), changes), f"design {design.number}")
+
+
+def built(study: Study, design: Design) -> Sensor:
+    """The design's sensor as it is to be built, with everything set that follows the stand-off."""
+    sensor = sensor_of(study, design)
+    found = followed(np, parameters_of([sensor], [study.medium_of(sensor)]), study.follow)
+    numbers = {
+        "focus": {"camera.focus_distance_mm": found.focus_mm},
+        "waist": {"laser.waist_distance_mm": found.waist_distance_mm},
+        "volume": {"volume.near_mm": found.near_mm, "volume.far_mm": found.far_mm},
+    }
+    changes = {path: float(value.item()) for name in study.follow for path, value in numbers[name].items()}
+    table = _changed(sensor.model_dump(exclude_none=True), changes)
+    return validated(Sensor, table, f"design {design.number}")
+
+
+@cache
+def _base_table(name: str) -> dict[str, Any]:
+    return read_table(find(name, "sensors"), "sensors")
+
+
+def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """A table with values at paths replaced; the table itself stays as it is."""
+    table = dict(table)
+    for path, value in changes.items():
+        *parents, key = path.split(".")
+        place = table
+        for parent in parents:
+            place[parent] = dict(place.get(parent, {}))
+            place = place[parent]
+        place[key] = value
+    return table
+
+
+def judged(study: Study, designs: Sequence[Design]) -> dict[str, np.ndarray]:
+    """What the formulas say of N designs, as columns (N,).
+
+    "design" is the number; the values of what is free and all `Figures` follow by their names; "violation" tells by how
+    much the constraints are missed (0: not at all), "failure" why a design cannot work (""). A design that fails has
+    figures NaN and an infinite violation.
+    """
+    numbers, failures = {}, [""] * len(designs)
+    for place, design in enumerate(designs):
+        try:
+            sensor = sensor_of(study, design)
+            numbers[place] = numbers_of(sensor, study.medium_of(sensor))
+        except UwltsError as error:
+            failures[place] = str(error)
+    columns = {"design": np.array([design.number for design in designs])}
+    columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
+    columns |= {name: np.full(len(designs), math.nan) for name in FIGURES}
+    columns["violation"] = np.full(len(designs), math.inf)
+    if numbers:
+        places = np.array(list(numbers))
+        figures, reasons = figures_of(
+            stacked(list(numbers.values())),
+            reflectance=study.reflectance, water_depth_m=study.water_depth_m, follow=study.follow,
+        )  # fmt: skip
+        for place, reason in zip(places, reasons, strict=True):
+            failures[place] = reason
+        works = np.array([not reason for reason in reasons])
+        for name in FIGURES:
+            columns[name][places[works]] = getattr(figures, name)[works]
+        columns["violation"][places[works]] = violations(study, figures)[works]
+    return columns | {"failure": np.array(failures, dtype=object)}
+
+
+def described(study: Study, label: str, sensor: Sensor) -> dict[str, Any]:
+    """The row of a sensor that is not one of the study's designs; nothing in it follows the stand-off.
+
+    Raises
+    ------
+    DesignError
+        The sensor cannot work.
+    """
+    numbers = parameters_of([sensor], [study.medium_of(sensor)])
+    figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
+    if reason:
+        raise DesignError(f"{label}: {reason}")
+    table = sensor.model_dump()
+    row: dict[str, Any] = {"design": -1}
+    for name in study.free():
+        row[name] = label if name in study.choices else reduce(lambda place, key: place[key], name.split("."), table)
+    row |= {name: column.item() for name, column in vars(figures).items()}
+    return row | {"violation": violations(study, figures).item(), "failure": ""}
+
+
+def row_of(columns: dict[str, np.ndarray], place: int) -> dict[str, Any]:
+    """One design's row as plain values."""
+    return {name: values[place].item() if values.dtype != object else values[place] for name, values in columns.items()}
+
+
+def violations(study: Study, figures: Figures) -> np.ndarray:
+    """By how much designs (N,) miss the constraints together, in parts of the bounds; 0 where all hold."""
+    total = np.zeros(len(figures.coverage))
+    for name, bounds in study.constraints.items():
+        values = getattr(figures, name)
+        for sign, bound in ((-1.0, bounds.least), (1.0, bounds.most)):
+            if bound is not None:
+                missed = np.where(np.isnan(values), math.inf, sign * (values - bound))
+                total += np.maximum(missed, 0.0) / (abs(bound) or 1.0)
+    return total

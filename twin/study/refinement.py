@@ -1,0 +1,234 @@
+"""Improves a design along the gradient of its objective, which Dr.Jit derives from the same formulas that judge it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from twin.study.description import Constraint, Study
+from twin.study.designs import Design, sensor_of
+from twin.study.figures import DEPTHS, PLACES, Field, field_of
+from twin.study.geometry import Array
+from twin.study.parameters import Parameters, followed, parameters_of
+from twin.variant import use_variant
+
+PARAMETER_OF: dict[str, tuple[str, float]] = {
+    "laser.baseline_mm": ("baseline_mm", 1.0),
+    "laser.triangulation_angle_deg": ("angle_rad", math.pi / 180),
+    "laser.roll_deg": ("roll_rad", math.pi / 180),
+    "laser.power_mw": ("power_w", 1e-3),
+    "laser.waist_radius_mm": ("waist_mm", 1.0),
+    "laser.waist_distance_mm": ("waist_distance_mm", 1.0),
+    "laser.beam_quality_m2": ("beam_quality", 1.0),
+    "laser.window.distance_mm": ("laser_window_distance_mm", 1.0),
+    "laser.window.thickness_mm": ("laser_window_thickness_mm", 1.0),
+    "camera.focal_length_mm": ("focal_mm", 1.0),
+    "camera.f_number": ("f_number", 1.0),
+    "camera.focus_distance_mm": ("focus_mm", 1.0),
+    "camera.window.distance_mm": ("window_distance_mm", 1.0),
+    "camera.window.thickness_mm": ("window_thickness_mm", 1.0),
+    "camera.window.tilt_x_deg": ("window_tilt_x_rad", math.pi / 180),
+    "camera.window.tilt_y_deg": ("window_tilt_y_rad", math.pi / 180),
+    "volume.near_mm": ("near_mm", 1.0),
+    "volume.far_mm": ("far_mm", 1.0),
+}
+"""Numbers of the description along which figures can be derived, with the parameter and its unit per the path's.
+
+Glass absorption over the thickness and grains over the f-number are taken as they are at the starting point."""
+
+_STEPS, _TOLERANCE = 40, 1e-7
+_HALVINGS = 12
+
+Mean = Callable[..., Array]
+Smooth = Callable[[ModuleType, Parameters, Field, Mean], Array]
+
+
+def _rms(name: str, depth: int | None = None) -> Smooth:
+    """Root mean square of a quantity over the points in view, all or those at one depth."""
+    return lambda xp, p, f, mean: xp.sqrt(mean(getattr(f, name) ** 2, depth))
+
+
+def _line(depth: int) -> Smooth:
+    """Length of the stripe at one depth."""
+    return lambda xp, p, f, mean: 2 * mean(f.half_line_mm, depth)
+
+
+def _largest(xp: ModuleType, values: Array) -> Array:
+    """The largest value: one of them where several are alike, of which a maximum would add up the derivatives."""
+    return xp.gather(type(values), values, int(np.argmax(values.numpy())))
+
+
+MIDDLE = DEPTHS // 2
+SMOOTH: dict[str, Smooth] = {
+    "sigma_z_rms_mm": _rms("sigma_z_mm"),
+    "sigma_z_mm": lambda xp, p, f, mean: _largest(xp, f.sigma_z_mm),
+    "sigma_y_mm": lambda xp, p, f, mean: _largest(xp, f.sigma_y_mm),
+    "sigma_z_near_mm": _rms("sigma_z_mm", 0),
+    "sigma_z_middle_mm": _rms("sigma_z_mm", MIDDLE),
+    "sigma_z_far_mm": _rms("sigma_z_mm", DEPTHS - 1),
+    "line_near_mm": _line(0),
+    "line_mm": _line(MIDDLE),
+    "line_far_mm": _line(DEPTHS - 1),
+    "required_ms": lambda xp, p, f, mean: f.required_ms,
+    "standoff_mm": lambda xp, p, f, mean: f.standoff_mm - p.window(xp).outer_mm / p.window(xp).normal[2],
+    "near_mm": lambda xp, p, f, mean: p.near_mm,
+    "far_mm": lambda xp, p, f, mean: p.far_mm,
+    "depth_mm": lambda xp, p, f, mean: p.far_mm - p.near_mm,
+    "baseline_mm": lambda xp, p, f, mean: p.baseline_mm,
+}
+"""Figures that can be derived; root mean squares are over the points in view at the start."""
+_ROOM = "room"
+
+
+@dataclass(frozen=True)
+class Derived:
+    """Values of figures, and their derivatives by the free numbers (figures, numbers) in the paths' own units."""
+
+    values: np.ndarray
+    gradient: np.ndarray
+
+
+class DerivedFigures:
+    """Figures of a design as functions of those of its free numbers that can be derived.
+
+    Attributes
+    ----------
+    paths : list of str
+        The numbers, in the order in which values are given.
+    """
+
+    def __init__(self, study: Study, design: Design, figures: list[str]):
+        use_variant()
+        import drjit as dr
+        from drjit.llvm.ad import Float64
+
+        self._dr, self._float = dr, Float64
+        sensor = sensor_of(study, design)
+        self.paths = [
+            path for path, variable in study.variables.items()
+            if path in PARAMETER_OF and variable.values is None and _is_placed(path, sensor.laser.baseline_mm)
+        ]  # fmt: skip
+        self._figures, self._study = figures, study
+        parameters = parameters_of([sensor], [study.medium_of(sensor)])
+        self._parameters = _plain(parameters)
+        depths, places = np.linspace(0, 1, DEPTHS)[:, None], np.linspace(-1, 1, PLACES)[None] * (1 - 1e-9)
+        with np.errstate(all="ignore"):
+            start = field_of(np, followed(np, parameters, study.follow), depths, places, reflectance=study.reflectance)
+        shape = (DEPTHS, PLACES)
+        self._in_view = np.broadcast_to(start.in_view, (1, *shape))[0].astype(float)
+        self._depths, self._places = (Float64(np.broadcast_to(x, shape).ravel().copy()) for x in (depths, places))
+
+    def at(self, values: np.ndarray) -> Derived:
+        """Figures and derivatives at values (K,) of the free numbers."""
+        columns = []
+        for number in range(len(self.paths)):
+            found, change = self._derived(values, number)
+            columns.append(change)
+        return Derived(np.array(found), np.array(columns).T)
+
+    def _derived(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
+        """Figures, and their derivatives by one number."""
+        dr = self._dr
+        numbers = []
+        for path, value in zip(self.paths, values, strict=True):
+            numbers.append(self._float(float(value) * PARAMETER_OF[path][1]))
+            dr.make_opaque(numbers[-1])
+        dr.enable_grad(numbers[number])
+        changed = {PARAMETER_OF[path][0]: leaf for path, leaf in zip(self.paths, numbers, strict=True)}
+        p = followed(dr, replace(self._parameters, **changed), self._study.follow)
+        f = field_of(dr, p, self._depths, self._places, reflectance=self._study.reflectance)
+
+        def mean(quantity: Array, depth: int | None = None) -> Array:
+            weights = self._in_view.copy()
+            if depth is not None:
+                weights[np.arange(DEPTHS) != depth] = 0
+            return dr.sum(quantity * self._float(weights.ravel() / weights.sum()))
+
+        hidden = self._float(1e9 * (1 - self._in_view.ravel()))
+        outputs = [
+            self._float(-_largest(dr, -(f.room_px + hidden)) if name == _ROOM else SMOOTH[name](dr, p, f, mean))
+            for name in self._figures
+        ]
+        dr.set_grad(numbers[number], 1.0)
+        dr.enqueue(dr.ADMode.Forward, numbers[number])
+        # What one figure is, another may be derived from: gradients on the way are kept.
+        dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
+        changes = [dr.grad(output) for output in outputs]
+        dr.eval(outputs, changes)
+        unit = PARAMETER_OF[self.paths[number]][1]
+        return [float(output.numpy()[0]) for output in outputs], [unit * float(c.numpy()[0]) for c in changes]
+
+
+def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> Design | None:
+    """The design moved along the gradient until the first objective is best within ranges and constraints.
+
+    Sequential quadratic programming (Kraft 1988). Constraints that cannot be derived are left to ``accepts``, which
+    tells whether a design is better than the start; where it does not like the end, the way there is halved. None if
+    nothing can be derived, or nothing better is found.
+    """
+    objective = study.objectives[0]
+    bounds = [(name, bound) for name, bound in study.constraints.items() if name in SMOOTH]
+    if objective.figure not in SMOOTH:
+        return None
+    figures = DerivedFigures(study, design, [objective.figure, *(name for name, _ in bounds), _ROOM])
+    if not figures.paths:
+        return None
+    low = np.array([study.variables[path].least for path in figures.paths])
+    wide = np.array([study.variables[path].most for path in figures.paths]) - low
+    start = (np.array([design.values[path] for path in figures.paths]) - low) / wide
+    known: dict[bytes, Derived] = {}
+
+    def at(shares: np.ndarray) -> Derived:
+        key = np.clip(shares, 0, 1).tobytes()
+        if key not in known:
+            known[key] = figures.at(low + np.clip(shares, 0, 1) * wide)
+        return known[key]
+
+    sign = 1.0 if objective.goal == "minimise" else -1.0
+    scale = sign / (abs(at(start).values[0]) or 1.0)
+    limits: list[dict[str, Any]] = []
+    # What is in view at the start stays in view, by a hundredth of a pixel.
+    bounds.append((_ROOM, Constraint(least=0.01)))
+    for place, (_, bound) in enumerate(bounds, start=1):
+        for side, limit in ((1.0, bound.least), (-1.0, bound.most)):
+            if limit is not None:
+                size = side / max(abs(limit), 1.0)
+                limits.append({
+                    "type": "ineq",
+                    "fun": lambda x, k=place, s=size, b=limit: s * (at(x).values[k] - b),
+                    "jac": lambda x, k=place, s=size: s * at(x).gradient[k] * wide,
+                })  # fmt: skip
+    found = minimize(
+        lambda x: scale * at(x).values[0], start, jac=lambda x: scale * at(x).gradient[0] * wide, method="SLSQP",
+        bounds=[(0.0, 1.0)] * len(start), constraints=limits, options={"maxiter": _STEPS, "ftol": _TOLERANCE},
+    )  # fmt: skip
+    step = np.clip(found.x, 0, 1) - start
+    for _ in range(_HALVINGS):
+        if not np.isfinite(step).all() or not step.any():
+            return None
+        values = low + (start + step) * wide
+        moved = Design(design.number, design.values | dict(zip(figures.paths, values.tolist(), strict=True)))
+        if accepts(moved):
+            return moved
+        step = 0.5 * step
+    return None
+
+
+def _is_placed(path: str, baseline_mm: float | None) -> bool:
+    """Whether a number has a meaning: a laser placed by its axis has neither baseline nor angle."""
+    return baseline_mm is not None or path not in ("laser.baseline_mm", "laser.triangulation_angle_deg")
+
+
+def _plain(parameters: Parameters) -> Parameters:
+    """Parameters of one design as plain numbers."""
+
+    def plain(value: Any) -> Any:
+        return tuple(plain(one) for one in value) if isinstance(value, tuple) else float(value.item())
+
+    return Parameters(**{field.name: plain(getattr(parameters, field.name)) for field in fields(Parameters)})
