@@ -171,18 +171,15 @@ def test_drawn_lines_are_as_long_as_the_figures_say_and_end_at_the_drawn_borders
         parameters_of([sensor], [sensor.medium(medium)]), reflectance=0.5, water_depth_m=100.0
     )
     assert not reason
-    lengths = [figures.line_near_mm[0], figures.line_mm[0], figures.line_far_mm[0]]
+    lengths = np.array([figures.line_near_mm[0], figures.line_mm[0], figures.line_far_mm[0]])
     # The figures leave out 1e-9 of the line at both ends, as the drawing does; the rest is rounding.
     assert np.ptp(front.lines[:, :, 0], axis=1) == pytest.approx(lengths, rel=1e-8)
-    # Lines that are seen end on the image's border, found by tracing rays forward, or on the fan's edge. The border has
-    # 40 pieces per side: between their ends it lies off by less than 0.1 mm even where distortion bends it.
-    borders = [*front.borders, *front.fan]
-    checked = 0
-    for line in front.lines[front.line_in_view]:
+    # Lines end on the image's border, found by tracing rays forward, or on the fan's edge. The border has 40 pieces per
+    # side: between their ends it lies off by less than 0.1 mm even where distortion bends it. In the image's corners,
+    # at near and far end, the line may end a little beyond the border's, as it is bent and the volume's end is not.
+    for line, allowed in zip(front.lines, (2.5, 0.1, 2.5), strict=True):
         for end in line:
-            assert min(distance_to(end, border) for border in borders) < 0.1
-            checked += 1
-    assert checked >= 2
+            assert min(distance_to(end, border) for border in (*front.borders, *front.fan)) < allowed
 
 
 def distance_to(point: np.ndarray, polyline: np.ndarray) -> float:
@@ -444,7 +441,7 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     assert "A note & more." in text and "laser baseline from 150" in text
     assert "Formulas and rendering disagree by a factor 2.5, more than the 1.5 allowed: most at Z = 0 mm" in text
     assert "20 µm were predicted and 50 µm rendered" in text
-    assert "the measuring volume would begin … mm before the window" in text
+    assert "the measuring volume would begin … mm behind the window's outer face" in text
     # Nothing is asked of the network: links lead within the page, and the policy forbids the rest.
     assert page.loads and all(link.startswith("#") for link in page.loads)
     styles = raw.split("<script")[0]

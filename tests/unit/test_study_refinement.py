@@ -39,11 +39,9 @@ def test_every_derivative_is_the_limit_of_differences():
         ends = [judged(study, [Design(0, VALUES | {path: start[k] + s * step})]) for s in (1, -1)]
         for row, name in zip(found.gradient, names, strict=True):
             difference = (ends[0][name].item() - ends[1][name].item()) / (2 * step)
-            # Rounding leaves 1e-8 of the value over the step's length; the glass's own absorption and the grain's
-            # change with the f-number are not derived.
-            size = abs(direct[name].item()) / abs(start[k])
-            loose = 0.35 * size if path == "camera.f_number" else 1e-6 * size
-            assert row[k] == pytest.approx(difference, rel=1e-5, abs=max(loose, 1e-12)), (path, name)
+            # Rounding leaves 1e-11 of the value over the step's length, 1e-6 of the derivative or less.
+            size = abs(direct[name].item() / start[k])
+            assert row[k] == pytest.approx(difference, rel=1e-5, abs=1e-6 * size), (path, name)
 
 
 def test_a_design_follows_the_gradient_to_the_best_of_its_range():

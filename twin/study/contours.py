@@ -22,6 +22,7 @@ _MOST_STEPS, _NODES = 100, 60
 _PER_CELL, _CELLS = 8, (4, 40)
 _LEVELS, _WIDE = 12, 15.0
 _MOST_POINTS = 2000
+_BESIDE = 1e-4
 _FAILS = 100.0
 """Grade of places where nothing works: so much that the darker grey begins right beside those where something does."""
 _GREYS = [[0, "rgba(255,255,255,0)"], [0.5, "rgba(228,231,235,0.72)"], [1, "rgba(150,158,168,1)"]]
@@ -149,7 +150,9 @@ def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Drawn |
         for name, sign, bound in bounds_of(judged.study):
             values = found.values.get(name, np.empty(0))
             if (values < bound).any() and (values > bound).any():
-                figure.add_trace(_limit(found, name, bound, bound_text(name, sign, bound), len(figure.data)))
+                # A figure that goes in steps may equal its bound over an area: the line runs where the bound is missed.
+                level = bound + sign * _BESIDE * (abs(bound) or 1.0)
+                figure.add_trace(_limit(found, name, level, bound_text(name, sign, bound), len(figure.data)))
     if found.dots:
         dots = np.flatnonzero(sample(judged.works, np.zeros(len(judged), bool), _MOST_POINTS))
         figure.add_scatter(
@@ -272,10 +275,10 @@ def _wrapped(text: str, width: int = 60) -> str:
 _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
 
 
-def _limit(found: Map, name: str, bound: float, words: str, number: int) -> go.Contour:
+def _limit(found: Map, name: str, level: float, words: str, number: int) -> go.Contour:
     """The line on which a constraint is just met."""
     return go.Contour(
         x=rounded(found.x), y=rounded(found.y), z=[rounded(row) for row in found.values[name]], name=escaped(words),
-        contours={"type": "levels", "coloring": "none", "start": bound, "end": bound, "size": 1.0}, showscale=False,
+        contours={"type": "levels", "coloring": "none", "start": level, "end": level, "size": 1.0}, showscale=False,
         line={"color": _LIMITS[number % len(_LIMITS)], "width": 3, "dash": "dash"}, showlegend=True, hoverinfo="skip",
     )  # fmt: skip

@@ -57,7 +57,10 @@ class Crew:
 
     def close(self) -> None:
         """End the workers; what waits is not begun."""
-        self._executor.shutdown(wait=True, cancel_futures=True)
+        if self._alone:
+            self._executor.shutdown(wait=True, cancel_futures=True)
+        else:
+            self._executor.shutdown(wait=False)
 
     def work(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
         """Pairs of a job and its result, in the order in which they are done.

@@ -242,15 +242,13 @@ def _drawn_front(sheet: _Sheet, view: FrontView, other: FrontView | None) -> Mar
     parts += ['<g clip-path="url(#front-view)">', *(sheet.line(border, _BLUE, 1.2) for border in borders), "</g>"]
     parts += _dots(sheet, [view.laser.origin])
     right = sheet.width - _FRONT_RIGHT
-    for word, line, seen in zip(("near", "middle", "far"), view.lines, view.line_in_view.tolist(), strict=True):
+    for word, line in zip(("near", "middle", "far"), view.lines, strict=True):
         if not np.isfinite(line).all():
             continue
-        parts.append(sheet.line(line, _RED, 3.5 if seen else 1.6, dash="" if seen else "4 4"))
+        parts.append(sheet.line(line, _RED, 3.5))
         end, length = sheet.at(line).max(axis=0), float(np.ptp(line[:, 0]))
         parts.append(_straight((end[0] + 4, end[1]), (right + 8, end[1]), "#b9c2cc", 0.8))
         parts.append(_text(f"{word} {number_text(length)} mm", right + 12, end[1] + 4, anchor="start"))
-        if not seen:
-            parts.append(_text("outside the image", right + 12, end[1] + 19, anchor="start", colour=_SOFT))
     return sheet.page(parts, "Front view, onto the sheet")
 
 

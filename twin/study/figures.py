@@ -24,12 +24,15 @@ from twin.study.geometry import (
 )
 from twin.study.parameters import Follow, Parameters, followed
 from twin.study.safety import laser_class, window_needed_mm
-from twin.study.stripe import centre_noise_px, exposure_ms, speckle_contrast, stripe_at
+from twin.study.stripe import centre_noise_px, exposure_ms, stripe_at
 from uwlts.errors import RangeError
 
 DEPTHS, PLACES = 5, 7
-"""Points of the measuring volume: so many depths, from near to far, and so many places along the stripe at each."""
+"""Points of the measuring volume: so many depths, evenly from end to end of what the camera sees of it, and so many
+places along the stripe at each."""
 _EDGE_STEPS = 5
+_NEAREST_MM, _FARTHEST_MM = 1.0, 1e6
+"""Where the sheet is taken to leave the image at most: so far from the window's outer face, and from the pupil."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,8 @@ class Field:
     """What is where in the measuring volume, arrays that go with (N, DEPTHS, PLACES).
 
     ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties by the
-    stripe's noise. ``in_view`` is 1 where camera and laser both reach; ``room_px`` is how far from the image's edges,
-    across the stripe, a point appears.
+    stripe's noise. ``lit`` tells where the fan has a line in view of the image's other sides, ``in_view`` where the
+    camera sees it.
     """
 
     y_mm: Array
@@ -53,15 +56,40 @@ class Field:
     blur_px: Array
     signal_e: Array
     occlusion_rad: Array
+    lit: Array
     in_view: Array
-    room_px: Array
     exposure_ms: Array
     required_ms: Array
     standoff_mm: Array
 
 
-def field_of(xp: ModuleType, p: Parameters, depths: Array, places: Array, *, reflectance: float) -> Field:
-    """Designs' measuring volumes, seen at shares ``depths`` (0 near, 1 far) and ``places`` (-1 to 1 along the stripe).
+def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
+    """Where the part of the measuring volume begins and ends that the camera sees, in the middle of the line.
+
+    Depths from the window's outer face. Where the sheet leaves the image follows from Newton's method in the inverse of
+    the depth, in which the pixel is nearly linear (exactly so without a window).
+    """
+    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
+    standoff, outer = standoff_mm(pose), window.outer_mm / window.normal[2]
+    other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
+    ends = []
+    for edge in (-0.5, other - 0.5):
+        inverse = 1 / standoff
+        for _ in range(_EDGE_STEPS):
+            depth = 1 / inverse
+            middle = scaled(pose.axis, (depth - standoff) / pose.axis[2])
+            view = seen(xp, lens, window, added((0.0 * standoff, 0.0 * standoff, standoff), middle))
+            by_z = pixels_per_mm(view, window, pose.axis)
+            change = -(depth**2) / pose.axis[2] * (p.along_width * by_z[1] + (1 - p.along_width) * by_z[0])
+            inverse = inverse + (edge - p.along_width * view.y - (1 - p.along_width) * view.x) / change
+            inverse = xp.minimum(xp.maximum(inverse, 1 / _FARTHEST_MM), 1 / (outer + _NEAREST_MM))
+        ends.append(1 / inverse - outer)
+    near, far = xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
+    return xp.maximum(p.near_mm, near), xp.minimum(p.far_mm, far)
+
+
+def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
+    """Designs' sheets at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
 
     A stripe's centre that is off by d px on its profile line is a point of the sheet that is off by (dY, dZ) =
     J^-1 (d, 0), J being how the pixel across and along the stripe changes with Y and Z.
@@ -69,8 +97,7 @@ def field_of(xp: ModuleType, p: Parameters, depths: Array, places: Array, *, ref
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)
     outer = window.outer_mm / window.normal[2]
-    depth = outer + p.near_mm + (p.far_mm - p.near_mm) * depths
-    z = (depth - standoff) / pose.axis[2]
+    z = (outer + depth_mm - standoff) / pose.axis[2]
     origin = (0.0 * standoff, 0.0 * standoff, standoff)
     middle = added(origin, scaled(pose.axis, z))
 
@@ -95,9 +122,9 @@ def field_of(xp: ModuleType, p: Parameters, depths: Array, places: Array, *, ref
     laser_window = p.laser_window(pose.axis)
     offset = dot(added(middle, scaled(pose.origin, -1.0)), pose.fan)
     height = dot(added(middle, scaled(pose.origin, -1.0)), pose.axis)
-    lit = [_fan_edge_mm(xp, laser_window, height, angle) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
-    low = xp.maximum(xp.minimum(ends[0], ends[1]), lit[0])
-    high = xp.minimum(xp.maximum(ends[0], ends[1]), lit[1])
+    edges = [_fan_edge_mm(xp, laser_window, height, angle) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
+    low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
+    high = xp.minimum(xp.maximum(ends[0], ends[1]), edges[1])
     half = 0.5 * (high - low)
     y = 0.5 * (high + low) + half * places
 
@@ -107,10 +134,10 @@ def field_of(xp: ModuleType, p: Parameters, depths: Array, places: Array, *, ref
     determinant = across(by_y) * along(by_z) - across(by_z) * along(by_y)
     stripe = stripe_at(xp, p, pose, window, point, view, reflectance=reflectance)
     u = across((view.x, view.y))
-    room = xp.minimum(u + 0.5, other - 0.5 - u)
-    inside = (room >= 0) & (half > 0) & (height > laser_window.outer_mm)
+    lit = (half > 0) & (height > laser_window.outer_mm) & (u == u)
+    inside = lit & (u >= -0.5) & (u <= other - 0.5)
     rate = stripe.rate_e_per_ms
-    brightest = _largest(xp, rate, inside)
+    brightest = _largest(xp, rate, lit)
     required, used = exposure_ms(xp, p, brightest)
     signal = rate * used
     noise = centre_noise_px(xp, p, stripe, used)
@@ -121,7 +148,7 @@ def field_of(xp: ModuleType, p: Parameters, depths: Array, places: Array, *, ref
         sigma_y_mm=noise * abs(along(by_z) / determinant), sigma_z_mm=noise * abs(along(by_y) / determinant),
         depth_per_px_mm=abs(along(by_y) / determinant), along_per_px_mm=1 / abs(along(by_y)),
         centre_px=noise, stripe_px=stripe.sigma_px, blur_px=stripe.blur_px, signal_e=signal,
-        occlusion_rad=_angle(xp, towards_camera, from_laser), in_view=inside, room_px=room,
+        occlusion_rad=_angle(xp, towards_camera, from_laser), lit=lit, in_view=inside,
         exposure_ms=used, required_ms=required,
         standoff_mm=standoff,
     )  # fmt: skip
@@ -155,9 +182,10 @@ def _largest(xp: ModuleType, values: Array, where: Array) -> Array:
 class Figures:
     """Figures of merit of N designs, one array (N,) each.
 
-    Lengths named with a depth are measured along the camera's axis from the window's outer face; sigmas are standard
-    uncertainties: the largest in the measuring volume, and ``sigma_z_rms_mm`` the root mean square over it. Z runs
-    along the laser's axis, Y along the stripe, X across the sheet, along the stage.
+    Depths are counted along the camera's axis from the window's outer face. Sigmas are standard uncertainties: the
+    largest in the part of the measuring volume that the camera sees, and ``sigma_z_rms_mm`` the root mean square over
+    it; near, middle and far are the ends and the middle of that part. Z runs along the laser's axis, Y along the
+    stripe, X across the sheet, along the stage.
 
     Attributes
     ----------
@@ -166,13 +194,13 @@ class Figures:
     sigma_z_near_mm, sigma_z_middle_mm, sigma_z_far_mm
         Root mean squares along the stripe.
     depth_per_px_mm, along_per_px_mm
-        In the middle of the volume: Z and Y per pixel.
+        In the middle: Z and Y per pixel.
     coverage
-        Share of the volume's points that camera and laser reach.
+        Share of the volume that camera and laser reach.
     standoff_mm, near_mm, far_mm, depth_mm
         Where the sheet crosses the camera's axis, and the volume's depths and their difference.
     line_near_mm, line_mm, line_far_mm, section_cm2
-        Length of the stripe at near end, middle and far end; area of the sheet within the volume.
+        Length of the stripe at near end, middle and far end; area of the sheet that the camera sees.
     occlusion_deg
         Largest angle between the laser's and the camera's rays: steeper walls hide one from the other.
     signal_e, exposure_ms, required_ms
@@ -232,7 +260,7 @@ def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, ref
         pose, window = p.pose(np), p.window(np)
         depth = standoff_mm(pose) - window.outer_mm / window.normal[2] + pose.axis[2] * z_mm.reshape(1, -1, 1)
         places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
-        f = field_of(np, p, (depth - p.near_mm) / (p.far_mm - p.near_mm), places, reflectance=reflectance)
+        f = field_of(np, p, depth, places, reflectance=reflectance)
     counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
     squares = np.where(counts, f.sigma_z_mm**2, 0.0)
     return np.sqrt(squares.sum(axis=2) / np.maximum(counts.sum(axis=2), 1))[0]
@@ -246,21 +274,22 @@ def figures_of(
         raise RangeError(f"reflectance is {reflectance:g}; expected a number above 0, up to 1")
     with np.errstate(all="ignore"):
         p = followed(np, p, follow)
-        depths = np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
+        near, far = depths_in_view(np, p)
+        depths = near + (far - near) * np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
         places = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
         f = field_of(np, p, depths, places, reflectance=reflectance)
         shape = np.broadcast_shapes(f.sigma_z_mm.shape, (len(np.atleast_1d(p.near_mm.ravel())), DEPTHS, PLACES))
         full = {
             one.name: np.broadcast_to(np.asarray(getattr(f, one.name), dtype=float), shape) for one in fields(Field)
         }
-        figures = _reduced(p, full, reflectance=reflectance, water_depth_m=water_depth_m)
+        figures = _reduced(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
         reasons = _reasons(p, figures, full)
     return figures, reasons
 
 
-def _reduced(p: Parameters, f: dict[str, np.ndarray], *, reflectance: float, water_depth_m: float) -> Figures:
+def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
     n = len(f["z_mm"])
-    inside = f["in_view"] > 0
+    inside = f["lit"] > 0
     middle = DEPTHS // 2
 
     def worst(name: str) -> np.ndarray:
@@ -274,21 +303,22 @@ def _reduced(p: Parameters, f: dict[str, np.ndarray], *, reflectance: float, wat
 
     per_depth = rms(f["sigma_z_mm"], inside)
     flat = f["sigma_z_mm"].reshape(n, -1), inside.reshape(n, -1)
-    line = 2 * f["half_line_mm"][:, :, 0]
+    line = np.where(inside.any(axis=2), 2 * f["half_line_mm"][:, :, 0], 0.0)
     z = f["z_mm"][:, :, 0]
     at = (slice(None), middle, PLACES // 2)
-    speckle_px = speckle_contrast(p) / p.pixel_averaging * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
+    contrast = p.speckle_coherence / math.sqrt(2)
+    speckle_px = contrast * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
     lens_window = p.window(np)
     return Figures(
         sigma_x_mm=one(p.stage_resolution_mm / math.sqrt(12)),
         sigma_y_mm=worst("sigma_y_mm"), sigma_z_mm=worst("sigma_z_mm"), sigma_z_rms_mm=rms(*flat),
         sigma_z_near_mm=per_depth[:, 0], sigma_z_middle_mm=per_depth[:, middle], sigma_z_far_mm=per_depth[:, -1],
         depth_per_px_mm=f["depth_per_px_mm"][at], along_per_px_mm=f["along_per_px_mm"][at],
-        coverage=inside.mean(axis=(1, 2)),
+        coverage=one(np.maximum(share, 0.0)) * inside.mean(axis=(1, 2)),
         standoff_mm=one(f["standoff_mm"][:, 0, 0] - one(lens_window.outer_mm / lens_window.normal[2])),
         near_mm=one(p.near_mm), far_mm=one(p.far_mm), depth_mm=one(p.far_mm - p.near_mm),
         line_near_mm=line[:, 0], line_mm=line[:, middle], line_far_mm=line[:, -1],
-        section_cm2=0.01 * np.trapezoid(np.where(inside.any(axis=2), line, 0.0), z, axis=1),
+        section_cm2=0.01 * np.trapezoid(line, z, axis=1),
         occlusion_deg=degrees(worst("occlusion_rad")),
         signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
         exposure_ms=f["exposure_ms"][:, 0, 0], required_ms=f["required_ms"][:, 0, 0],
@@ -314,9 +344,11 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
         (one(p.focus_mm - p.focal_mm) <= 0, "the lens would be focused within its focal length", None),
         (
             ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5),
-            "the sheet crosses the camera's axis {:.0f} mm before the window, not in front of it", figures.standoff_mm,
+            "the sheet crosses the camera's axis {:.0f} mm behind the window's outer face, not in front of it",
+            -figures.standoff_mm,
         ),
-        (~(figures.near_mm > 0), "the measuring volume would begin {:.0f} mm before the window", figures.near_mm),
+        (~(figures.near_mm > 0), "the measuring volume would begin {:.0f} mm behind the window's outer face",
+         -figures.near_mm),
         (cone > one(p.window_aperture_mm), "the cone of view is {:.0f} mm wide at the window's outer face, wider than "
          "its opening", cone),
         (fan > one(p.laser_window_aperture_mm), "the laser's fan is {:.0f} mm wide at its window, wider than its "

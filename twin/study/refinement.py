@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from twin.study.description import Constraint, Study
+from twin.study.description import Study
 from twin.study.designs import Design, sensor_of
-from twin.study.figures import DEPTHS, PLACES, Field, field_of
+from twin.study.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
 from twin.study.geometry import Array
 from twin.study.parameters import Parameters, followed, parameters_of
 from twin.variant import use_variant
@@ -40,7 +40,7 @@ PARAMETER_OF: dict[str, tuple[str, float]] = {
 }
 """Numbers of the description along which figures can be derived, with the parameter and its unit per the path's.
 
-Glass absorption over the thickness and grains over the f-number are taken as they are at the starting point."""
+What a window's glass absorbs is taken as it is at the starting point."""
 
 _STEPS, _TOLERANCE = 40, 1e-7
 _HALVINGS = 12
@@ -64,6 +64,11 @@ def _largest(xp: ModuleType, values: Array) -> Array:
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
 
 
+def _coverage(xp: ModuleType, p: Parameters) -> Array:
+    near, far = depths_in_view(xp, p)
+    return (far - near) / (p.far_mm - p.near_mm)
+
+
 MIDDLE = DEPTHS // 2
 SMOOTH: dict[str, Smooth] = {
     "sigma_z_rms_mm": _rms("sigma_z_mm"),
@@ -81,9 +86,9 @@ SMOOTH: dict[str, Smooth] = {
     "far_mm": lambda xp, p, f, mean: p.far_mm,
     "depth_mm": lambda xp, p, f, mean: p.far_mm - p.near_mm,
     "baseline_mm": lambda xp, p, f, mean: p.baseline_mm,
+    "coverage": lambda xp, p, f, mean: _coverage(xp, p),
 }
-"""Figures that can be derived; root mean squares are over the points in view at the start."""
-_ROOM = "room"
+"""Figures that can be derived. For coverage the laser counts as reaching whatever the camera sees."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +120,9 @@ class DerivedFigures:
             if path in PARAMETER_OF and variable.values is None and _is_placed(path, sensor.laser.baseline_mm)
         ]  # fmt: skip
         self._figures, self._study = figures, study
-        parameters = parameters_of([sensor], [study.medium_of(sensor)])
-        self._parameters = _plain(parameters)
-        depths, places = np.linspace(0, 1, DEPTHS)[:, None], np.linspace(-1, 1, PLACES)[None] * (1 - 1e-9)
-        with np.errstate(all="ignore"):
-            start = field_of(np, followed(np, parameters, study.follow), depths, places, reflectance=study.reflectance)
-        shape = (DEPTHS, PLACES)
-        self._in_view = np.broadcast_to(start.in_view, (1, *shape))[0].astype(float)
-        self._depths, self._places = (Float64(np.broadcast_to(x, shape).ravel().copy()) for x in (depths, places))
+        self._parameters = _plain(parameters_of([sensor], [study.medium_of(sensor)]))
+        shares, places = np.meshgrid(np.linspace(0, 1, DEPTHS), np.linspace(-1, 1, PLACES), indexing="ij")
+        self._shares, self._places = Float64(shares.ravel()), Float64(places.ravel() * (1 - 1e-9))
 
     def at(self, values: np.ndarray) -> Derived:
         """Figures and derivatives at values (K,) of the free numbers."""
@@ -142,19 +142,16 @@ class DerivedFigures:
         dr.enable_grad(numbers[number])
         changed = {PARAMETER_OF[path][0]: leaf for path, leaf in zip(self.paths, numbers, strict=True)}
         p = followed(dr, replace(self._parameters, **changed), self._study.follow)
-        f = field_of(dr, p, self._depths, self._places, reflectance=self._study.reflectance)
+        near, far = depths_in_view(dr, p)
+        depths = near + (far - near) * self._shares
+        f = field_of(dr, p, depths, self._places, reflectance=self._study.reflectance)
 
         def mean(quantity: Array, depth: int | None = None) -> Array:
-            weights = self._in_view.copy()
-            if depth is not None:
-                weights[np.arange(DEPTHS) != depth] = 0
+            weights = np.zeros((DEPTHS, PLACES))
+            weights[slice(None) if depth is None else depth] = 1
             return dr.sum(quantity * self._float(weights.ravel() / weights.sum()))
 
-        hidden = self._float(1e9 * (1 - self._in_view.ravel()))
-        outputs = [
-            self._float(-_largest(dr, -(f.room_px + hidden)) if name == _ROOM else SMOOTH[name](dr, p, f, mean))
-            for name in self._figures
-        ]
+        outputs = [self._float(SMOOTH[name](dr, p, f, mean)) for name in self._figures]
         dr.set_grad(numbers[number], 1.0)
         dr.enqueue(dr.ADMode.Forward, numbers[number])
         # What one figure is, another may be derived from: gradients on the way are kept.
@@ -176,7 +173,7 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
     bounds = [(name, bound) for name, bound in study.constraints.items() if name in SMOOTH]
     if objective.figure not in SMOOTH:
         return None
-    figures = DerivedFigures(study, design, [objective.figure, *(name for name, _ in bounds), _ROOM])
+    figures = DerivedFigures(study, design, [objective.figure, *(name for name, _ in bounds)])
     if not figures.paths:
         return None
     low = np.array([study.variables[path].least for path in figures.paths])
@@ -193,8 +190,6 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
     sign = 1.0 if objective.goal == "minimise" else -1.0
     scale = sign / (abs(at(start).values[0]) or 1.0)
     limits: list[dict[str, Any]] = []
-    # What is in view at the start stays in view, by a hundredth of a pixel.
-    bounds.append((_ROOM, Constraint(least=0.01)))
     for place, (_, bound) in enumerate(bounds, start=1):
         for side, limit in ((1.0, bound.least), (-1.0, bound.most)):
             if limit is not None:

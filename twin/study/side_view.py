@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.study.figures import field_of
+from twin.study.figures import depths_in_view, field_of
 from twin.study.parameters import Parameters, parameters_of
 from twin.study.rays import Face, border_towards, borders_on_sheet, directions, faces, frame, to_plane, traced
 from uwlts.errors import DesignError
@@ -93,9 +93,7 @@ class FrontView:
     borders : tuple of (N, 2)
         Where the four sides of the image lie in the sheet; NaN where they miss it.
     lines : (3, 2, 2)
-        Ends of the line at the volume's near end, middle and far end; NaN where there is none.
-    line_in_view : (3,) bool
-        Whether the camera sees any of them.
+        Ends of the line at near end, middle and far end of what the camera sees of the volume; NaN if it sees nothing.
     region : (N, 2)
         Outline of what camera and laser reach between near and far end; empty if nothing.
     """
@@ -104,7 +102,6 @@ class FrontView:
     fan: tuple[np.ndarray, ...]
     borders: tuple[np.ndarray, ...]
     lines: np.ndarray
-    line_in_view: np.ndarray
     region: np.ndarray
 
     def points(self) -> np.ndarray:
@@ -178,8 +175,8 @@ def _front_view(
     sensor: Sensor, pose: LaserPose, camera_faces: list[Face], laser_faces: list[Face], edges: np.ndarray, reach: _Reach
 ) -> FrontView:
     axes = np.stack([pose.fan, pose.axis])
-    heights = (_on_sheet(pose, reach.depths_mm) - pose.origin_mm) @ pose.axis
-    reached, ends = np.isfinite(reach.low_mm), [0, _DEPTHS // 2, _DEPTHS - 1]
+    heights, shown = ((_on_sheet(pose, d) - pose.origin_mm) @ pose.axis for d in (reach.depths_mm, reach.shown_mm))
+    reached = np.isfinite(reach.low_mm)
     low, high = (np.stack([y, heights], axis=1)[reached] for y in (reach.low_mm, reach.high_mm))
     return FrontView(
         laser=_module(sensor.laser.window, laser_faces, pose.origin_mm, pose.axis, axes, about=pose.origin_mm),
@@ -187,8 +184,8 @@ def _front_view(
         borders=tuple(
             (points - pose.origin_mm) @ axes.T for points in borders_on_sheet(sensor.camera, camera_faces, pose)
         ),
-        lines=np.stack([reach.line_mm[ends], np.repeat(heights[ends][:, None], 2, axis=1)], axis=2),
-        line_in_view=reached[ends], region=np.concatenate([low, high[::-1]]),
+        lines=np.stack([reach.line_mm, np.repeat(shown[:, None], 2, axis=1)], axis=2),
+        region=np.concatenate([low, high[::-1]]),
     )  # fmt: skip
 
 
@@ -219,28 +216,33 @@ def _on_sheet(pose: LaserPose, depths: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Reach:
-    """Of N depths (from the pupil): ends (N, 2) of the line, from the laser's axis, and from where to where (N,) camera
-    and laser reach; NaN where there is no line or they reach nothing."""
+    """Of N depths (from the pupil): from where to where (N,) camera and laser reach, from the laser's axis; NaN where
+    they reach nothing. Of the three depths to show: ends (3, 2) of the line."""
 
     depths_mm: np.ndarray
-    line_mm: np.ndarray
     low_mm: np.ndarray
     high_mm: np.ndarray
+    shown_mm: np.ndarray
+    line_mm: np.ndarray
 
 
 def _reach(sensor: Sensor, p: Parameters, pose: LaserPose, outer: float) -> _Reach:
     shares, places = np.linspace(0, 1, _DEPTHS), np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
+    depths = sensor.volume.near_mm + shares * (sensor.volume.far_mm - sensor.volume.near_mm)
+    aside = (np.array([0.0, 0.0, _crossing_mm(pose)]) - pose.origin_mm) @ pose.fan
     with np.errstate(all="ignore"):
-        f = field_of(np, p, shares.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
-    y, inside = (np.broadcast_to(values, (1, _DEPTHS, _PLACES))[0] for values in (f.y_mm, f.in_view))
-    y = y + (np.array([0.0, 0.0, _crossing_mm(pose)]) - pose.origin_mm) @ pose.fan
-    line, inside = y[:, [0, -1]], inside > 0
+        f = field_of(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
+        near, far = depths_in_view(np, p)
+        shown = near + (far - near) * np.array([0.0, 0.5, 1.0]).reshape(1, -1, 1)
+        line = field_of(np, p, shown, places[[0, -1]].reshape(1, 1, -1), reflectance=0.5).y_mm[0] + aside
+    y, inside = (np.broadcast_to(values, (1, _DEPTHS, _PLACES))[0] for values in (f.y_mm + aside, f.in_view))
     reached = inside.any(axis=1)
     return _Reach(
-        depths_mm=outer + sensor.volume.near_mm + shares * (sensor.volume.far_mm - sensor.volume.near_mm),
-        line_mm=np.where(np.diff(line) > 0, line, np.nan),
+        depths_mm=outer + depths,
         low_mm=np.where(reached, np.where(inside, y, np.inf).min(axis=1), np.nan),
         high_mm=np.where(reached, np.where(inside, y, -np.inf).max(axis=1), np.nan),
+        shown_mm=outer + shown.ravel(),
+        line_mm=np.where((np.diff(line) > 0) & (far > near)[0], line, np.nan),
     )
 
 

@@ -107,7 +107,7 @@ def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: 
     under pure speckle would tell ever more.
     """
     height = stripe.rate_e_per_ms * exposure_ms
-    contrast = speckle_contrast(p)
+    contrast = speckle_contrast(xp, p)
     floor = (
         p.read_noise_e**2 + p.offset_e**2 + p.step_e**2 / 12
         + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms + (_UNMODELLED * height) ** 2
@@ -121,14 +121,14 @@ def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: 
     return xp.sqrt(stripe.sigma_px / (2 * width * information + 1e-30))
 
 
-def speckle_contrast(p: Parameters) -> Array:
+def speckle_contrast(xp: ModuleType, p: Parameters) -> Array:
     """Contrast in one pixel, for light that a diffuse surface has depolarised: two patterns that do not interfere."""
-    return p.pixel_averaging * p.speckle_coherence / math.sqrt(2)
+    return p.pixel_averaging(xp) * p.speckle_coherence / math.sqrt(2)
 
 
 def exposure_ms(xp: ModuleType, p: Parameters, brightest_e_per_ms: Array) -> tuple[Array, Array]:
     """Exposure that brings the brightest light to the wanted level, and the exposure that the sensor then uses."""
-    level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * speckle_contrast(p))
+    level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * speckle_contrast(xp, p))
     required = level / brightest_e_per_ms
     if xp is not np:
         return required, required

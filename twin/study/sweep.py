@@ -143,5 +143,8 @@ def clear(folder: Path) -> None:
     for pattern in (f"{PARTS}/part-*.parquet", f"{RENDERED}/*.parquet"):
         for path in folder.glob(pattern):
             path.unlink()
+    for place in (folder / PARTS, folder / RENDERED):
+        if place.is_dir() and not any(place.iterdir()):
+            place.rmdir()
     for name in (PLAN, PAGE, TABLE, WINNER, SUMMARY, JOURNAL):
         (folder / name).unlink(missing_ok=True)

@@ -1,0 +1,256 @@
+"""Whole sweeps by the command: stopped and gone on with, shared, on a Dask cluster that loses a worker, and their end.
+
+Only formulas are asked here; what rendering says of designs is tested with the verification.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.study.crew import crew
+from twin.study.description import load_study
+from twin.study.results import parts, read_parts
+from twin.study.screening import screen
+from uwlts.library import load_sensor
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+SWEEP = [sys.executable, "-m", "twin.cli", "sweep"]
+STUDY = """
+title = "Small"
+follow = ["focus", "waist", "volume"]
+[variables."laser.baseline_mm"]
+least = 60.0
+most = 400.0
+[variables."laser.triangulation_angle_deg"]
+least = 15.0
+most = 60.0
+[sampling]
+kind = "sobol"
+designs = 12000
+batch = 250
+[[objectives]]
+figure = "sigma_z_rms_mm"
+[[objectives]]
+figure = "line_mm"
+goal = "maximise"
+[constraints.line_mm]
+least = 150.0
+"""
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Path:
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+    """All designs of the study, judged in one go."""
+    folder = tmp_path_factory.mktemp("expected")
+    (folder / "study.toml").write_text(STUDY, encoding="utf-8")
+    with crew(workers=2) as hands:
+        screen(load_study(folder / "study.toml"), folder / "out", hands)
+    return read_parts(folder / "out" / "screen")
+
+
+def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more],
+        env=ENVIRONMENT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+
+
+def begun(study: Path, out: Path, *more: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more],
+        env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it took too long"
+        time.sleep(0.02)
+
+
+def contents(out: Path) -> dict[str, int]:
+    """Parts and when they were written."""
+    return {path.name: path.stat().st_mtime_ns for path in parts(out / "screen")}
+
+
+def same(out: Path, expected: dict[str, np.ndarray]) -> None:
+    found = read_parts(out / "screen")
+    assert found["design"].tolist() == list(range(12000))
+    np.testing.assert_array_equal(found["sigma_z_rms_mm"], expected["sigma_z_rms_mm"])
+    assert found["failure"].tolist() == expected["failure"].tolist()
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_a_stopped_sweep_goes_on_without_repeating_or_losing(study, tmp_path, expected, sent):
+    out = tmp_path / "out"
+    first = begun(study, out)
+    until(lambda: len(parts(out / "screen")) >= 5)
+    first.send_signal(sent)
+    _, said = first.communicate(timeout=60)
+    kept = contents(out)
+    assert 5 <= len(kept) < 48
+    if sent == signal.SIGINT:
+        assert first.returncode == 130 and "Traceback" not in said
+    done = run(study, out)
+    assert done.returncode == 0, done.stderr
+    after = contents(out)
+    assert {name: after[name] for name in kept} == kept
+    same(out, expected)
+    assert not [path for path in (out / "screen").iterdir() if path.name.startswith(".") and path not in kept] or (
+        sent == signal.SIGKILL
+    )
+
+
+def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, tmp_path, expected):
+    out = tmp_path / "out"
+    done = run(study, out)
+    assert done.returncode == 0, done.stderr
+    same(out, expected)
+    summary = json.loads((out / "summary.json").read_text())
+    works = expected["failure"] == ""
+    assert (summary["designs"], summary["work"]) == (12000, int(works.sum()))
+    meets = expected["violation"] == 0
+    assert summary["meet_all_constraints"] == int(meets.sum()) > 100
+    best = next(one for one in summary["marked"] if one["label"].startswith("best"))
+    assert best["sigma_z_rms_mm"] == expected["sigma_z_rms_mm"][meets].min()
+    winner = summary["marked"][-1]
+    assert winner["sigma_z_rms_mm"] <= best["sigma_z_rms_mm"] and winner["line_mm"] >= 150.0
+    sensor = load_sensor(out / "winner.toml")
+    assert sensor.laser.baseline_mm == pytest.approx(winner["laser.baseline_mm"])
+    assert len((out / "designs.csv").read_text().splitlines()) == 12001
+    assert "<html" in (out / "report.html").read_text(encoding="utf-8")
+    # Run again there is nothing left to judge.
+    before = contents(out)
+    assert run(study, out).returncode == 0
+    assert contents(out) == before
+    simulated = subprocess.run(
+        [sys.executable, "-m", "twin.cli", "simulate", str(_scene(tmp_path)), "--sensor", str(out / "winner.toml"),
+         "--out", str(tmp_path / "plane.h5"), "--spp", "1"],
+        env=ENVIRONMENT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert simulated.returncode == 0, simulated.stderr
+    assert (tmp_path / "plane.h5").is_file()
+
+
+def _scene(folder: Path) -> Path:
+    path = folder / "board.toml"
+    path.write_text('title = "Board"\n[[objects]]\nkind = "plate"\nwidth_mm = 50.0\nheight_mm = 300.0\n')
+    return path
+
+
+def test_two_machines_share_a_study(study, tmp_path, expected):
+    out = tmp_path / "out"
+    first = begun(study, out, "--workers", "1")
+    until(lambda: len(parts(out / "screen")) >= 1)
+    second = begun(study, out, "--workers", "1")
+    codes = [process.communicate(timeout=200)[1:] and process.returncode for process in (first, second)]
+    assert codes == [0, 0]
+    same(out, expected)
+
+
+def test_a_study_is_not_mixed_with_another(study, tmp_path):
+    out = tmp_path / "out"
+    assert run(study, out, "--designs", "300").returncode == 0
+    study.write_text(STUDY.replace("least = 60.0", "least = 70.0"), encoding="utf-8")
+    refused = run(study, out)
+    assert refused.returncode == 2 and "another variables" in refused.stderr and "Traceback" not in refused.stderr
+    again = run(study, out, "--overwrite", "--designs", "300")
+    assert again.returncode == 0, again.stderr
+    assert read_parts(out / "screen")["laser.baseline_mm"].min() >= 70.0
+
+
+def test_more_designs_may_be_asked_for(study, tmp_path, expected):
+    out = tmp_path / "out"
+    for count in (400, 900):
+        done = run(study, out, "--designs", str(count))
+        assert done.returncode == 0, done.stderr
+        found = read_parts(out / "screen")
+        assert found["design"].tolist() == list(range(count))
+        np.testing.assert_array_equal(found["sigma_z_rms_mm"], expected["sigma_z_rms_mm"][:count])
+
+
+def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):
+    study.write_text(STUDY.replace('"sobol"', '"optimise"').replace("batch = 250", "batch = 64"), encoding="utf-8")
+    out = tmp_path / "out"
+    for count in (256, 512):
+        done = run(study, out, "--designs", str(count))
+        assert done.returncode == 0, done.stderr
+        assert len(read_parts(out / "screen")["design"]) == count
+    columns = read_parts(out / "screen")
+    meets = columns["violation"] == 0
+    # The optimiser looks where constraints hold: more often among its last designs than among its first, random ones.
+    assert meets[-200:].mean() > meets[:60].mean() + 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("least = 60.0\nmost = 400.0", "least = 1.0\nmost = 2.0"), "none of 12000 designs can work"),
+        (("least = 60.0\nmost = 400.0", "least = 1.0\nmost = 2.0\nunit = 1"), "unknown key"),
+    ],
+)
+def test_studies_without_an_answer_say_so(study, tmp_path, change, says):
+    study.write_text(STUDY.replace(*change), encoding="utf-8")
+    done = run(study, tmp_path / "out")
+    assert done.returncode == 2
+    assert says in done.stderr and "Traceback" not in done.stderr
+
+
+@contextmanager
+def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A Dask scheduler and workers, processes of their own on loopback: its address, and the workers."""
+    found = folder / "scheduler.json"
+    module = [sys.executable, "-m"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": ENVIRONMENT, "cwd": folder}
+    scheduler = subprocess.Popen(
+        [*module, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+         "--scheduler-file", str(found)], **quiet,
+    )  # fmt: skip
+    hands: list[subprocess.Popen[bytes]] = []
+    try:
+        until(found.is_file)
+        hands += [
+            subprocess.Popen(
+                [*module, "distributed.cli.dask_worker", "--scheduler-file", str(found), "--host", "127.0.0.1",
+                 "--nthreads", "1", "--no-nanny", "--no-dashboard"], **quiet,
+            )
+            for _ in range(workers)
+        ]  # fmt: skip
+        yield json.loads(found.read_text())["address"], hands
+    finally:
+        for process in (*hands, scheduler):
+            process.kill()
+            process.wait()
+
+
+def test_a_cluster_that_loses_a_worker_loses_nothing(study, tmp_path, expected):
+    from distributed import Client
+
+    out = tmp_path / "out"
+    with cluster(tmp_path, 2) as (address, workers):
+        with Client(address, timeout=60, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+        sweeping = begun(study, out, "--scheduler", address)
+        until(lambda: len(parts(out / "screen")) >= 5)
+        workers[0].kill()
+        _, said = sweeping.communicate(timeout=200)
+    assert sweeping.returncode == 0, said
+    same(out, expected)
