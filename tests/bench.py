@@ -168,6 +168,18 @@ def reproduction() -> list[Row]:
     return [at_most(f"the thesis's campaign, thinned to {images} images", 1e3 * seconds / images, "ms/image", 500)]
 
 
+def studies() -> list[Row]:
+    """Speed of design studies."""
+    from tests.bench_study import screening, verification
+
+    rate, engine = screening()
+    return [
+        at_least("designs judged by formulas, two workers", rate, "designs/s", 2000),
+        at_most("the engine's share of two workers' time", 100 * engine, "%", 5),
+        at_most("one design verified by rendering", verification(), "s", 30),
+    ]
+
+
 def demo() -> list[Row]:
     """Duration and peak memory of the demo, in a folder of its own."""
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
@@ -187,7 +199,7 @@ def main() -> int:
     if (count := len(os.sched_getaffinity(0))) > CORES:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
         print(f"{count} cores found, measuring on {CORES}")
-    rows = [*demo(), *reproduction(), *rendering(), *light(), *pipeline()]
+    rows = [*demo(), *reproduction(), *rendering(), *light(), *pipeline(), *studies()]
     table = Table("what", "value", "limit", "unit", "")
     for row in rows:
         table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:.4g}", row.unit, "ok" if row.ok else "MISSED")

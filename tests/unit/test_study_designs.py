@@ -132,6 +132,21 @@ def test_a_log_scale_is_even_in_the_logarithm():
     assert [design.values["laser.power_mw"] for design in designs_of(study, 0, 3)] == pytest.approx([1.0, 10.0, 100.0])
 
 
+def test_numbers_that_are_counted_are_whole(tmp_path):
+    text = 'title = "t"\n[variables."camera.width_px"]\nleast = 1000.2\nmost = 1004.8\nsteps = 9\n'
+    study = load_study(written(tmp_path, text))
+    assert [design.values["camera.width_px"] for design in designs_of(study, 0, 99)] == [
+        1000,
+        1001,
+        1002,
+        1003,
+        1004,
+        1005,
+    ]
+    random = sampled(study, kind="random", designs=50)
+    assert {type(design.values["camera.width_px"]) for design in designs_of(random, 0, 50)} == {int}
+
+
 # --- designs ----------------------------------------------------------------------------------------------------------
 
 

@@ -6,12 +6,12 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from twin.study.figures import FIGURES
 from twin.study.parameters import Follow
 from uwlts.errors import DescriptionError
-from uwlts.library import find, load_sensor, read_table, validated
+from uwlts.library import find, read_table, validated
 from uwlts.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
@@ -21,13 +21,15 @@ Value = float | int | str | bool
 class Variable(Description):
     """A free number of the sensor's description: from ``least`` to ``most``, or one of ``values``.
 
-    A grid takes ``steps`` of a range, evenly spaced, in their logarithm where ``scale`` is "log".
+    A grid takes ``steps`` of a range, evenly spaced, in their logarithm where ``scale`` is "log". ``whole`` rounds to
+    whole numbers; numbers that the description counts, such as pixels, are whole anyway.
     """
 
     least: float | None = None
     most: float | None = None
     steps: Annotated[int, Field(ge=2, le=100000)] = 11
     scale: Literal["linear", "log"] = "linear"
+    whole: bool = False
     values: tuple[Value, ...] | None = None
 
     @model_validator(mode="after")
@@ -45,18 +47,22 @@ class Variable(Description):
         return self
 
     def at(self, share: float) -> Value:
-        """The value at a share from 0 to 1 of the range, or of the list."""
+        """The value at a share from 0 to 1 of the range, not rounded, or of the list."""
         if self.values is not None:
             return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
         if self.scale == "log":
             return float(math.exp(math.log(self.least) + share * math.log(self.most / self.least)))
         return self.least + share * (self.most - self.least)
 
+    def taken(self, value: Value) -> Value:
+        """The value as a design takes it: rounded if it has to be whole."""
+        return round(value) if self.whole and self.values is None else value
+
     def grid(self) -> list[Value]:
         """All values of a grid."""
         if self.values is not None:
             return list(self.values)
-        return [self.at(k / (self.steps - 1)) for k in range(self.steps)]
+        return list(dict.fromkeys(self.taken(self.at(k / (self.steps - 1))) for k in range(self.steps)))
 
 
 class Objective(Description):
@@ -96,6 +102,7 @@ class Sampling(Description):
 class Study(Description):
     """A study as read from TOML.
 
+    ``sensor`` is the base sensor: a name or path, in whose place its table is kept, or the table itself.
     ``variables`` are free numbers or words of the sensor's description, by their path (``camera.focal_length_mm``);
     ``choices`` are named alternatives that set several paths at once, such as cameras that can be bought. ``follow``
     is what is set anew for every design as one would on the bench, see `twin.study.parameters.followed`.
@@ -104,7 +111,7 @@ class Study(Description):
     """
 
     title: str
-    sensor: str = "thesis"
+    sensor: Annotated[dict[str, Any], Field(validate_default=True)] = "thesis"
     medium: str = "water"
     reflectance: Annotated[float, Field(gt=0, le=1)] = 0.5
     water_depth_m: NotNegative = 100.0
@@ -117,6 +124,12 @@ class Study(Description):
     refine: bool = True
     verify: Annotated[int, Field(ge=0, le=1000)] = 2
     verify_tolerance: Annotated[float, Field(gt=1)] = 1.5
+
+    @field_validator("sensor", mode="before")
+    @classmethod
+    def _table_of(cls, value: Any) -> Any:
+        # Workers elsewhere may not have the file.
+        return read_table(find(value, "sensors"), "sensors") if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _figures_known(self) -> Study:
@@ -137,7 +150,7 @@ class Study(Description):
 
     def base(self) -> Sensor:
         """The base sensor."""
-        return load_sensor(self.sensor)
+        return validated(Sensor, self.sensor, "the study's sensor")
 
     def medium_of(self, sensor: Sensor) -> Medium:
         """The study's medium of a sensor."""
@@ -164,17 +177,19 @@ def load_study(name_or_path: str | Path, *, designs: int | None = None, verify: 
     if verify is not None:
         table["verify"] = verify
     study = validated(Study, table, path)
-    sensor = study.base()
-    study.medium_of(sensor)
-    paths = list(study.variables)
-    paths += [key for options in study.choices.values() for option in options.values() for key in option]
-    known = sensor.model_dump()
-    for name in paths:
-        _require_path(known, name, path)
-    return study
+    base = study.base()
+    study.medium_of(base)
+    known = base.model_dump()
+    for options in study.choices.values():
+        for name in (name for option in options.values() for name in option):
+            _value_at(known, name, path)
+    counted = [name for name in study.variables if type(_value_at(known, name, path)) is int]
+    whole = {name: study.variables[name].model_copy(update={"whole": True}) for name in counted}
+    return study.model_copy(update={"variables": study.variables | whole})
 
 
-def _require_path(known: dict[str, Any], name: str, source: Path) -> None:
+def _value_at(known: dict[str, Any], name: str, source: Path) -> Any:
+    """The value at a path of the sensor's description; DescriptionError where there is none."""
     table: Any = known
     for key in name.split("."):
         if not isinstance(table, dict) or key not in table:
@@ -185,3 +200,4 @@ def _require_path(known: dict[str, Any], name: str, source: Path) -> None:
         table = table[key]
     if isinstance(table, dict):
         raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(table)}")
+    return table

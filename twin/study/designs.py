@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from twin.study.description import Study, Value
 from twin.study.figures import FIGURES, Figures, figures_of
 from twin.study.parameters import followed, numbers_of, parameters_of, stacked
 from uwlts.errors import DesignError, UwltsError
-from uwlts.library import find, read_table, validated
+from uwlts.library import validated
 from uwlts.sensor import Sensor
 
 
@@ -38,7 +38,7 @@ def sensor_of(study: Study, design: Design) -> Sensor:
     for name, value in design.values.items():
         for path, one in study.choices[name][value].items() if name in study.choices else ((name, value),):
             changes[path] = one
-    return validated(Sensor, _changed(_base_table(study.sensor), changes), f"design {design.number}")
+    return validated(Sensor, _changed(study.sensor, changes), f"design {design.number}")
 
 
 def built(study: Study, design: Design) -> Sensor:
@@ -53,11 +53,6 @@ def built(study: Study, design: Design) -> Sensor:
     changes = {path: float(value.item()) for name in study.follow for path, value in numbers[name].items()}
     table = _changed(sensor.model_dump(exclude_none=True), changes)
     return validated(Sensor, table, f"design {design.number}")
-
-
-@cache
-def _base_table(name: str) -> dict[str, Any]:
-    return read_table(find(name, "sensors"), "sensors")
 
 
 def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

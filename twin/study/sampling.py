@@ -29,7 +29,7 @@ def designs_of(study: Study, first: int, count: int) -> list[Design]:
         chosen = ([grid[k] for grid, k in zip(grids, row, strict=True)] for row in zip(*places, strict=True))
     else:
         shares = _shares(study, numbers)
-        chosen = ([v.at(float(s)) for v, s in zip(free.values(), row, strict=True)] for row in shares)
+        chosen = ([v.taken(v.at(float(s))) for v, s in zip(free.values(), row, strict=True)] for row in shares)
     return [
         Design(number, dict(zip(free, values, strict=True))) for number, values in zip(numbers, chosen, strict=True)
     ]

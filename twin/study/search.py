@@ -41,7 +41,8 @@ class Search:
     def ask(self, count: int) -> list[Design]:
         """New designs."""
         trials = [self._optuna.ask(self._space) for _ in range(count)]
-        return [Design(trial.number, {name: trial.params[name] for name in self._space}) for trial in trials]
+        free = self._study.free()
+        return [Design(trial.number, {name: free[name].taken(trial.params[name]) for name in free}) for trial in trials]
 
     def tell(self, columns: dict[str, np.ndarray]) -> None:
         """What the designs are worth, in columns as `judged` returns them; those told before are left alone."""
