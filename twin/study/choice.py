@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from twin.study.description import Study
-from twin.study.designs import Design, built, described, judged, row_of
-from twin.study.page import Marked
+from twin.study.designs import Design, Marked, built, described, judged, row_of
 from twin.study.pareto import pareto
 from twin.study.refinement import refined
 from uwlts.errors import DesignError, UwltsError

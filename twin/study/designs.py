@@ -26,6 +26,15 @@ class Design:
     values: dict[str, Value]
 
 
+@dataclass(frozen=True)
+class Marked:
+    """A design to point out: what it is called, its sensor as built, and its row of values and figures."""
+
+    label: str
+    sensor: Sensor
+    row: dict[str, Any]
+
+
 def sensor_of(study: Study, design: Design) -> Sensor:
     """The design's sensor, before anything follows the stand-off.
 

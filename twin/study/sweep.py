@@ -20,7 +20,8 @@ from twin.study.agreement import Candidate, render
 from twin.study.choice import choose
 from twin.study.crew import Crew
 from twin.study.description import Study
-from twin.study.page import Marked, write_page
+from twin.study.designs import Marked
+from twin.study.report.page import write_page
 from twin.study.results import read_parts, write_csv
 from twin.study.screening import PARTS, PLAN, Progress, screen
 from twin.study.search import JOURNAL

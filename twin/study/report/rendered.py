@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from twin.study.description import Study
-from twin.study.names import MISSING, number_text, value_text
+from twin.study.report.names import MISSING, number_text, value_text
 
 
 def agreement(study: Study, row: Mapping[str, Any]) -> str:

@@ -14,19 +14,19 @@ from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 import uwlts
-from twin.study.charts import Drawn, Point, parallel_chart, pareto_chart, verification_chart
-from twin.study.contours import contours
-from twin.study.curves import bars, curves
 from twin.study.description import Study
-from twin.study.drawing import Drawing, draw
-from twin.study.headline import Tile, introduction, tiles
-from twin.study.names import label_of, value_text, words_of
-from twin.study.rendered import agreement, verification_rows
-from twin.study.side_view import views_of
-from twin.study.table import Judged
+from twin.study.designs import Marked
+from twin.study.report.charts import Drawn, Point, parallel_chart, pareto_chart, verification_chart
+from twin.study.report.contours import contours
+from twin.study.report.curves import bars, curves
+from twin.study.report.drawing import Drawing, draw
+from twin.study.report.headline import Tile, introduction, tiles
+from twin.study.report.names import label_of, value_text, words_of
+from twin.study.report.rendered import agreement, verification_rows
+from twin.study.report.side_view import views_of
+from twin.study.report.table import Judged
 from uwlts.errors import UwltsError
 from uwlts.files import written_aside
-from uwlts.sensor import Sensor
 
 _BEST = 20
 _DRAWN = (
@@ -35,15 +35,6 @@ _DRAWN = (
     "image's border in blue, and the line's length. Windows and rays are to scale, the housings only hint at where "
     "they are."
 )
-
-
-@dataclass(frozen=True)
-class Marked:
-    """A design to point out: what it is called, its sensor as built, and its row of values and figures."""
-
-    label: str
-    sensor: Sensor
-    row: dict[str, Any]
 
 
 def write_page(
@@ -96,7 +87,9 @@ def page_text(
     judged, collected = Judged(study, columns), _Figures()
     points = [Point(one.label, one.row, number, one is marked[-1]) for number, one in enumerate(marked)]
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(files("twin.study").joinpath("template.html.j2").read_text(encoding="utf-8"))
+    template = environment.from_string(
+        files("twin.study.report").joinpath("template.html.j2").read_text(encoding="utf-8")
+    )
     return template.render(
         title=study.title,
         introduction=introduction(judged),

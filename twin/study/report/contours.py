@@ -12,11 +12,11 @@ import plotly.graph_objects as go
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from twin.study.charts import INK, LOG_AXIS, Drawn, Point, add_marked, escaped, sample, styled
-from twin.study.curves import share_of, shown_figures, with_menu
 from twin.study.description import Variable
-from twin.study.names import label_of, listed, number_text, rounded, words_of
-from twin.study.table import Judged, bound_text, bounds_of, misses
+from twin.study.report.charts import INK, LOG_AXIS, Drawn, Point, add_marked, escaped, sample, styled
+from twin.study.report.curves import share_of, shown_figures, with_menu
+from twin.study.report.names import label_of, listed, number_text, rounded, words_of
+from twin.study.report.table import Judged, bound_text, bounds_of, misses
 
 _MOST_STEPS, _NODES = 100, 60
 _PER_CELL, _CELLS = 8, (4, 40)

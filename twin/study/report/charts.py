@@ -12,10 +12,10 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from twin.study.names import label_of, rounded, value_text, words_of
 from twin.study.pareto import pareto
+from twin.study.report.names import label_of, rounded, value_text, words_of
+from twin.study.report.table import Judged
 from twin.study.safety import CLASS_NAMES
-from twin.study.table import Judged
 
 INK, FAINT, SOFT, BLUE, RED, GREEN = "#2b3440", "#dde2e8", "#8a96a3", "#3573b1", "#c22f2f", "#2e8b57"
 MOST_POINTS, MOST_LINES = 20_000, 5_000

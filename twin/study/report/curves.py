@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from twin.study.charts import (
+from twin.study.description import Variable
+from twin.study.report.charts import (
     BLUE,
     LOG_AXIS,
     RED,
@@ -22,9 +23,8 @@ from twin.study.charts import (
     marked_trace,
     styled,
 )
-from twin.study.description import Variable
-from twin.study.names import label_of, listed, rounded, words_of
-from twin.study.table import Judged, bounds_of
+from twin.study.report.names import label_of, listed, rounded, words_of
+from twin.study.report.table import Judged, bounds_of
 
 _SHOWN = (
     "sigma_z_rms_mm", "sigma_z_mm", "depth_per_px_mm", "line_mm", "standoff_mm", "required_ms", "occlusion_deg",

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from twin.study.description import Study, Variable
-from twin.study.names import MISSING, goal_text, listed, value_text, words_of
-from twin.study.table import Judged, bound_text, bounds_of, misses
+from twin.study.report.names import MISSING, goal_text, listed, value_text, words_of
+from twin.study.report.table import Judged, bound_text, bounds_of, misses
 from uwlts.sensor import Sensor
 
 _CHOSEN = {

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from twin.study.description import Study
-from twin.study.names import value_text, without_numbers, words_of
 from twin.study.pareto import pareto
+from twin.study.report.names import value_text, without_numbers, words_of
 from uwlts.errors import EvaluationError
 
 

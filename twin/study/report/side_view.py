@@ -13,7 +13,7 @@ import numpy as np
 
 from twin.study.figures import depths_in_view, field_of
 from twin.study.parameters import Parameters, parameters_of
-from twin.study.rays import Face, border_towards, borders_on_sheet, directions, faces, frame, to_plane, traced
+from twin.study.report.rays import Face, border_towards, borders_on_sheet, directions, faces, frame, to_plane, traced
 from uwlts.errors import DesignError
 from uwlts.placement import LaserPose, laser_pose
 from uwlts.sensor import Medium, Sensor, Window

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup, escape
 
-from twin.study.names import number_text
-from twin.study.side_view import FrontView, Module, SideView
+from twin.study.report.names import number_text
+from twin.study.report.side_view import FrontView, Module, SideView
 
 _INK, _SOFT, _RED, _BLUE, _GLASS = "#2b3440", "#5c6875", "#c22f2f", "#3573b1", "#12a3a8"
 _WIDTH, _HEIGHT = 1080.0, 700.0

@@ -1,0 +1,67 @@
+"""Formulas against rendering for quite different designs: prints the table of design-studies.md.
+
+Run from the project's folder: ``python docs/study_agreement.py`` (about half a minute per design on two cores).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from twin.study.agreement import Candidate, Verification, verified
+from twin.study.description import Study
+from twin.study.parameters import followed, parameters_of
+from twin.variant import CPU
+from uwlts.library import load_sensor, merged, validated
+from uwlts.sensor import Sensor
+
+FOLLOW = ("focus", "waist", "volume")
+CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("the thesis's, focused on its stand-off", "water", {}),
+    ("the same in air", "air", {}),
+    ("baseline 200 mm, 30 deg", "water", {"laser": {"baseline_mm": 200.0, "triangulation_angle_deg": 30.0}}),
+    ("baseline 390 mm, 41 deg", "water", {"laser": {"baseline_mm": 390.0, "triangulation_angle_deg": 41.0}}),
+    ("lens of 8 mm", "water", {"camera": {"focal_length_mm": 8.0, "window": {"distance_mm": 30.0}}}),
+    ("f / 2", "water", {"camera": {"f_number": 2.0}}),
+    ("f / 8", "water", {"camera": {"f_number": 8.0}}),
+    ("stripe along the height", "water", {"camera": {"stripe_along": "height"}}),
+    ("green, 520 nm", "water", {"laser": {"wavelength_nm": 520.0}}),
+    ("window tilted by 8 deg", "water", {"camera": {"window": {"tilt_x_deg": 8.0}}}),
+    ("waist of 0.1 mm", "water", {"laser": {"waist_radius_mm": 0.1}}),
+    ("clear water", "water", {"media": {"water": {"water": "clear"}}}),
+    ("coastal water", "water", {"media": {"water": {"water": "coastal"}}}),
+    ("harbour water", "water", {"media": {"water": {"water": "harbour"}}}),
+)
+
+
+def main() -> None:
+    """Render and print."""
+    print("| design | formulas, µm | rendered, µm | rendered / formulas | exposure, formulas / rendered, ms | "
+          "largest systematic error, µm |")  # fmt: skip
+    print("| --- | --- | --- | --- | --- | --- |")
+    for number, (name, medium, changes) in enumerate(CASES):
+        sensor = validated(Sensor, merged(load_sensor("thesis").model_dump(), changes), name)
+        found = followed(np, parameters_of([sensor], [sensor.medium(medium)]), FOLLOW)
+        set_up = {
+            "camera": {"focus_distance_mm": found.focus_mm.item()},
+            "laser": {"waist_distance_mm": found.waist_distance_mm.item()},
+            "volume": {"near_mm": found.near_mm.item(), "far_mm": found.far_mm.item()},
+        }
+        built = validated(Sensor, merged(sensor.model_dump(), set_up), name)
+        study = Study.model_validate(
+            {"title": name, "medium": medium, "variables": {"laser.power_mw": {"least": 1.0, "most": 10.0}}}
+        )
+        row = verified(Verification(study, Candidate(name, number, built), 2, CPU))
+        if row["failure"]:
+            print(f"| {name} | | | | | {row['failure']} |", flush=True)
+            continue
+        foretold, measured = ([f"{1e3 * row[key][k]:.0f}" for k in (0, len(row[key]) // 2, -1)]
+                              for key in ("predicted_mm", "rendered_mm"))  # fmt: skip
+        print(
+            f"| {name} | {' / '.join(foretold)} | {' / '.join(measured)} | {row['rendered_over_predicted']:.2f} | "
+            f"{row['predicted_exposure_ms']:.2f} / {row['exposure_ms']:.2f} | "
+            f"{1e3 * np.nanmax(np.abs(row['error_mm'])):.0f} |", flush=True,
+        )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
