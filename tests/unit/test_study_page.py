@@ -148,9 +148,7 @@ def test_drawn_volume_has_the_description_s_ends_and_lies_on_the_sheet(name):
     sensor, medium = SENSORS[name]
     side, front = views_of(sensor, sensor.medium(medium))
     window = sensor.camera.window
-    outer = 0.0
-    if window.mounted:
-        outer = window.distance_mm + window.thickness_mm / math.cos(math.radians(window.tilt_x_deg))
+    outer = window.distance_mm + window.thickness_mm / math.cos(math.radians(window.tilt_x_deg))
     depths = outer + np.array([sensor.volume.near_mm, sensor.volume.far_mm])
     assert side.volume[:, 1] == pytest.approx(depths, abs=1e-9)
     # Laser, crossing, volume and its part in view lie on one line, at the angle that is written at it.

@@ -21,7 +21,7 @@ def study_of(paths: dict[str, float], **rest: object) -> Study:
     ranges = {
         path: {"least": value - 0.3 * abs(value), "most": value + 0.3 * abs(value)} for path, value in paths.items()
     }
-    return Study.model_validate({"title": "test", "variables": ranges} | rest)
+    return Study.model_validate({"title": "test", "variables": ranges, "sampling": {"kind": "sobol"}} | rest)
 
 
 def test_every_derivative_is_the_limit_of_differences():

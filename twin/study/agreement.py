@@ -126,7 +126,11 @@ def render(
         rows[place] = row
         done += 1
         progress(done, len(candidates))
-    return [row | {"label": one.label, "design": one.number} for row, one in zip(rows, candidates, strict=True)]
+    # Name and tolerance may be others than when a row was kept.
+    return [
+        row | {"label": one.label, "design": one.number, "agrees": bool(row["ratio"] <= study.verify_tolerance)}
+        for row, one in zip(rows, candidates, strict=True)
+    ]
 
 
 def _row_in(path: Path) -> dict[str, Any] | None:

@@ -15,6 +15,11 @@ from uwlts.library import find, read_table, validated
 from uwlts.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
+OTHER_COLUMNS = ("design", "violation", "failure")
+"""What results tell of a design besides its values and figures."""
+FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
+"""What follows the stand-off and could be free as well."""
+MOST_DESIGNS = 10**8
 Value = float | int | str | bool
 
 
@@ -40,6 +45,8 @@ class Variable(Description):
         if self.values is not None:
             if not self.values:
                 raise ValueError("values is empty")
+            if len({isinstance(value, str) for value in self.values}) > 1:
+                raise ValueError(f"values mix words and numbers, {self.values}: make them choices, or two studies")
         elif not self.least < self.most:
             raise ValueError(f"least {self.least:g} must be smaller than most {self.most:g}")
         elif self.scale == "log" and self.least <= 0:
@@ -94,7 +101,7 @@ class Sampling(Description):
     """
 
     kind: Literal["grid", "random", "sobol", "optimise"] = "grid"
-    designs: Annotated[int, Field(ge=1, le=100_000_000)] = 4096
+    designs: Annotated[int, Field(ge=1, le=MOST_DESIGNS)] = 4096
     seed: Annotated[int, Field(ge=0)] = 0
     batch: Annotated[int, Field(ge=1, le=100_000)] = 1000
 
@@ -142,6 +149,28 @@ class Study(Description):
             raise ValueError(f"{', '.join(sorted(twice))}: a choice needs a name of its own")
         if empty := [name for name, options in self.choices.items() if not options]:
             raise ValueError(f"choices.{empty[0]} has no options")
+        if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
+            raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
+        return self
+
+    @model_validator(mode="after")
+    def _set_once(self) -> Study:
+        chosen = {path for options in self.choices.values() for option in options.values() for path in option}
+        if twice := sorted(set(self.variables) & chosen):
+            raise ValueError(f"{twice[0]} is set by a variable and by a choice")
+        for what, path in FOLLOWING.items():
+            if what in self.follow and path in (*self.variables, *chosen):
+                raise ValueError(f"{path} is free, but follow sets it: leave '{what}' out of follow, or the path")
+        if unfit := [path for path in (*self.variables, *chosen) if path.startswith("laser.window.tilt")]:
+            raise ValueError(f"{unfit[0]}: the formulas do not know it; compare two rendered sensors instead")
+        return self
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Study:
+        count = math.prod(variable.steps if variable.values is None else len(variable.values)
+                          for variable in self.free().values())  # fmt: skip
+        if self.sampling.kind == "grid" and count > MOST_DESIGNS:
+            raise ValueError(f"a grid of {count:.3g} designs; at most {MOST_DESIGNS:g}: take fewer steps, or sobol")
         return self
 
     def free(self) -> dict[str, Variable]:
@@ -172,7 +201,7 @@ def load_study(name_or_path: str | Path, *, designs: int | None = None, verify: 
     beside = path.parent / str(table.get("sensor", ""))
     if beside.suffix == ".toml" and beside.is_file():
         table["sensor"] = str(beside)
-    if designs is not None:
+    if designs is not None and isinstance(table.get("sampling", {}), dict):
         table["sampling"] = table.get("sampling", {}) | {"designs": designs}
     if verify is not None:
         table["verify"] = verify

@@ -70,7 +70,7 @@ def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
     the depth, in which the pixel is nearly linear (exactly so without a window).
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
-    standoff, outer = standoff_mm(pose), window.outer_mm / window.normal[2]
+    standoff, outer = standoff_mm(pose), p.outer_mm(xp)
     other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
     ends = []
     for edge in (-0.5, other - 0.5):
@@ -80,8 +80,8 @@ def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
             middle = scaled(pose.axis, (depth - standoff) / pose.axis[2])
             view = seen(xp, lens, window, added((0.0 * standoff, 0.0 * standoff, standoff), middle))
             by_z = pixels_per_mm(view, window, pose.axis)
-            change = -(depth**2) / pose.axis[2] * (p.along_width * by_z[1] + (1 - p.along_width) * by_z[0])
-            inverse = inverse + (edge - p.along_width * view.y - (1 - p.along_width) * view.x) / change
+            change = -(depth**2) / pose.axis[2] * p.across(by_z)
+            inverse = inverse + (edge - p.across((view.x, view.y))) / change
             inverse = xp.minimum(xp.maximum(inverse, 1 / _FARTHEST_MM), 1 / (outer + _NEAREST_MM))
         ends.append(1 / inverse - outer)
     near, far = xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
@@ -96,19 +96,13 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)
-    outer = window.outer_mm / window.normal[2]
+    outer = p.outer_mm(xp)
     z = (outer + depth_mm - standoff) / pose.axis[2]
     origin = (0.0 * standoff, 0.0 * standoff, standoff)
     middle = added(origin, scaled(pose.axis, z))
 
     def at(y: Array) -> Vector:
         return added(middle, scaled(pose.fan, y))
-
-    def along(pixels: tuple[Array, Array]) -> Array:
-        return p.along_width * pixels[0] + (1 - p.along_width) * pixels[1]
-
-    def across(pixels: tuple[Array, Array]) -> Array:
-        return p.along_width * pixels[1] + (1 - p.along_width) * pixels[0]
 
     side = p.along_width * p.width_px + (1 - p.along_width) * p.height_px
     other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
@@ -117,7 +111,7 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
         y = 0.0 * z
         for _ in range(_EDGE_STEPS):
             view = seen(xp, lens, window, at(y))
-            y = y + (edge - along((view.x, view.y))) / along(pixels_per_mm(view, window, pose.fan))
+            y = y + (edge - p.along((view.x, view.y))) / p.along(pixels_per_mm(view, window, pose.fan))
         ends.append(y)
     laser_window = p.laser_window(pose.axis)
     offset = dot(added(middle, scaled(pose.origin, -1.0)), pose.fan)
@@ -131,10 +125,10 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     point = at(y)
     view = seen(xp, lens, window, point)
     by_y, by_z = pixels_per_mm(view, window, pose.fan), pixels_per_mm(view, window, pose.axis)
-    determinant = across(by_y) * along(by_z) - across(by_z) * along(by_y)
+    determinant = p.across(by_y) * p.along(by_z) - p.across(by_z) * p.along(by_y)
     stripe = stripe_at(xp, p, pose, window, point, view, reflectance=reflectance)
-    u = across((view.x, view.y))
-    lit = (half > 0) & (height > laser_window.outer_mm) & (u == u)
+    u = p.across((view.x, view.y))
+    lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
     inside = lit & (u >= -0.5) & (u <= other - 0.5)
     rate = stripe.rate_e_per_ms
     brightest = _largest(xp, rate, lit)
@@ -145,8 +139,8 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     from_laser = direction_outside(xp, laser_window, path_to(xp, laser_window, added(point, scaled(pose.origin, -1.0))))
     return Field(
         y_mm=y, z_mm=z, half_line_mm=half,
-        sigma_y_mm=noise * abs(along(by_z) / determinant), sigma_z_mm=noise * abs(along(by_y) / determinant),
-        depth_per_px_mm=abs(along(by_y) / determinant), along_per_px_mm=1 / abs(along(by_y)),
+        sigma_y_mm=noise * abs(p.along(by_z) / determinant), sigma_z_mm=noise * abs(p.along(by_y) / determinant),
+        depth_per_px_mm=abs(p.along(by_y) / determinant), along_per_px_mm=1 / abs(p.along(by_y)),
         centre_px=noise, stripe_px=stripe.sigma_px, blur_px=stripe.blur_px, signal_e=signal,
         occlusion_rad=_angle(xp, towards_camera, from_laser), lit=lit, in_view=inside,
         exposure_ms=used, required_ms=required,
@@ -210,7 +204,7 @@ class Figures:
     speckle_limit_mm
         Dorsch's limit along Z in the middle of the volume, for depolarised light.
     laser_class
-        1, 2, 3 (3R), 4 (3B) or 5 (4) after IEC 60825-1 for a point source, 7 mm wide at 100 mm from the window.
+        1, 2, 3 (3R), 4 (3B) or 5 (4) after IEC 60825-1 for a point source, through 7 mm at 100 mm from the line optics.
     window_mm
         Thickness that the camera's window needs for the pressure at the study's depth.
     baseline_mm
@@ -257,8 +251,8 @@ def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, ref
     The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view.
     """
     with np.errstate(all="ignore"):
-        pose, window = p.pose(np), p.window(np)
-        depth = standoff_mm(pose) - window.outer_mm / window.normal[2] + pose.axis[2] * z_mm.reshape(1, -1, 1)
+        pose = p.pose(np)
+        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
         places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
         f = field_of(np, p, depth, places, reflectance=reflectance)
     counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
@@ -308,14 +302,13 @@ def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, wate
     at = (slice(None), middle, PLACES // 2)
     contrast = p.speckle_coherence / math.sqrt(2)
     speckle_px = contrast * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
-    lens_window = p.window(np)
     return Figures(
         sigma_x_mm=one(p.stage_resolution_mm / math.sqrt(12)),
         sigma_y_mm=worst("sigma_y_mm"), sigma_z_mm=worst("sigma_z_mm"), sigma_z_rms_mm=rms(*flat),
         sigma_z_near_mm=per_depth[:, 0], sigma_z_middle_mm=per_depth[:, middle], sigma_z_far_mm=per_depth[:, -1],
         depth_per_px_mm=f["depth_per_px_mm"][at], along_per_px_mm=f["along_per_px_mm"][at],
         coverage=one(np.maximum(share, 0.0)) * inside.mean(axis=(1, 2)),
-        standoff_mm=one(f["standoff_mm"][:, 0, 0] - one(lens_window.outer_mm / lens_window.normal[2])),
+        standoff_mm=one(f["standoff_mm"][:, 0, 0] - one(p.outer_mm(np))),
         near_mm=one(p.near_mm), far_mm=one(p.far_mm), depth_mm=one(p.far_mm - p.near_mm),
         line_near_mm=line[:, 0], line_mm=line[:, middle], line_far_mm=line[:, -1],
         section_cm2=0.01 * np.trapezoid(line, z, axis=1),
@@ -339,7 +332,10 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
     corner = np.hypot(p.width_px, p.height_px) / 2 * p.pixel_mm / p.focal_mm
     glass = corner / np.sqrt(p.window_index**2 + (p.window_index**2 - 1) * corner**2)
     cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
-    fan = one(2 * np.tan(p.fan_half_rad) * p.laser_window_distance_mm)
+    spread = np.tan(p.fan_half_rad)
+    inside = spread / np.sqrt(p.laser_window_index**2 + (p.laser_window_index**2 - 1) * spread**2)
+    fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
+    fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
     checks = (
         (one(p.focus_mm - p.focal_mm) <= 0, "the lens would be focused within its focal length", None),
         (
@@ -354,6 +350,7 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
         (fan > one(p.laser_window_aperture_mm), "the laser's fan is {:.0f} mm wide at its window, wider than its "
          "opening", fan),
         (~(figures.coverage > 0), "camera and laser reach no point of the measuring volume", None),
+        (fullest > 1, "the stripe saturates: at the given exposure it has {:.1f} times the full well", fullest),
         (
             ~(np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm) < 0.5 * figures.standoff_mm),
             "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser",

@@ -114,14 +114,24 @@ class Parameters:
         by_angle = pose_at(
             xp, baseline_mm=self.baseline_mm, angle_rad=self.angle_rad, roll_rad=self.roll_rad, towards=towards
         )
-        if xp is not np or not np.isfinite(self.placed[0][0]).any():
+        if not np.isfinite(self.placed[0][0]).any():
             return by_angle
+        if xp is not np:
+            return Pose(*self.placed)
         vectors = (by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal)
         chosen = [
             tuple(np.where(np.isfinite(given), given, found) for given, found in zip(own, found_vector, strict=True))
             for own, found_vector in zip(self.placed, vectors, strict=True)
         ]
         return Pose(*chosen)
+
+    def along(self, pixels: tuple[Array, Array]) -> Array:
+        """The one of a pair for x and y that belongs to the pixel along the stripe."""
+        return self.along_width * pixels[0] + (1 - self.along_width) * pixels[1]
+
+    def across(self, pixels: tuple[Array, Array]) -> Array:
+        """The one of a pair for x and y that belongs to the pixel across the stripe."""
+        return self.along_width * pixels[1] + (1 - self.along_width) * pixels[0]
 
     def lens(self) -> Lens:
         """The camera's lens."""
@@ -136,15 +146,30 @@ class Parameters:
             self.window_mounted * self.window_thickness_mm, self.window_index, self.medium_index,
         )  # fmt: skip
 
+    def outer_mm(self, xp: ModuleType) -> Array:
+        """Depth on the camera's axis from which the volume counts: of the window's outer face, mounted or not."""
+        normal = window_normal(xp, tilt_x_rad=self.window_tilt_x_rad, tilt_y_rad=self.window_tilt_y_rad)
+        return self.window_distance_mm + self.window_thickness_mm / normal[2]
+
     def laser_window(self, axis: Vector) -> FlatWindow:
         """The laser's window, taken as square to its axis."""
         distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
         return FlatWindow(axis, distance, thickness, self.laser_window_index, self.medium_index)
 
-    def pixel_averaging(self, xp: ModuleType) -> Array:
-        """Contrast that averaging over a pixel leaves of a speckle pattern of contrast 1, with grains of lambda N."""
-        series = _averaging()
-        grain = xp.log(self.wavelength_mm * self.f_number / self.pixel_mm)
+    def pixel_contrast(self, xp: ModuleType) -> Array:
+        """Speckle contrast of a pixel, averaged over its area and two polarisations that do not interfere."""
+        return self._averaged(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
+
+    def line_contrast(self, xp: ModuleType) -> Array:
+        """What that contrast would be if neighbours across the stripe erred independently, to the same effect.
+
+        Their speckle is alike where grains are as large as pixels: the squared contrast is summed over all neighbours.
+        """
+        return self._averaged(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
+
+    def _averaged(self, xp: ModuleType, series: Chebyshev) -> Array:
+        """The exponential of a series in the logarithm of the grain lambda N (1 + m), in px."""
+        grain = xp.log(self.wavelength_mm * self.working_f_number() / self.pixel_mm)
         shift, scale = map(float, series.mapparms())
         t = shift + scale * xp.minimum(xp.maximum(grain, math.log(_GRAINS_PX[0])), math.log(_GRAINS_PX[1]))
         # Clenshaw's recurrence.
@@ -270,10 +295,30 @@ def _normalised(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, fl
 
 
 @cache
-def _averaging() -> Chebyshev:
+def _pixel_series() -> Chebyshev:
     """Logarithm of the contrast that averaging over a pixel leaves, by that of the grain in px; good to 0.5 %."""
     grains = np.geomspace(*_GRAINS_PX, 60)
     return Chebyshev.fit(np.log(grains), np.log([pixel_contrast(float(grain)) for grain in grains]), 12)
+
+
+@cache
+def _line_series() -> Chebyshev:
+    """Half the logarithm of the squared contrast summed over the neighbours across the stripe, by that of the grain.
+
+    The sum over the lags of the correlation of pixels' averages is the correlation's integral over all lags across, and
+    its mean over pairs of points of a pixel along: (4 / pi) g^2 int OTF(f g) sinc^2(f) df, since the correlation
+    |2 J1(z) / z|^2 has the spectrum (4 / pi) g^2 OTF, with OTF(v) = 2 / pi (acos v - v sqrt(1 - v^2)) up to v = 1
+    (Goodman, Speckle Phenomena in Optics, Ch. 4).
+    """
+    grains = np.geomspace(*_GRAINS_PX, 60)
+    # Gauss-Legendre over 0 to 1 in v, in pieces, for sinc^2 swings 1 / g times.
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    pieces = 200
+    v = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1)) / pieces).ravel()
+    w = np.tile(weights / (2 * pieces), pieces)
+    transfer = 2 / math.pi * (np.arccos(v) - v * np.sqrt(1 - v * v))
+    sums = np.array([4 / math.pi * g * 2 * (w * transfer * np.sinc(v / g) ** 2).sum() for g in grains])
+    return Chebyshev.fit(np.log(grains), 0.5 * np.log(sums), 12)
 
 
 def followed(xp: ModuleType, parameters: Parameters, follow: Sequence[Follow]) -> Parameters:
@@ -293,6 +338,6 @@ def followed(xp: ModuleType, parameters: Parameters, follow: Sequence[Follow]) -
         changes["waist_distance_mm"] = xp.sqrt(dot(away, away))
     if "volume" in follow:
         middle = 0.5 * (parameters.near_mm + parameters.far_mm)
-        moved = depth - window.outer_mm / window.normal[2] - middle
+        moved = depth - parameters.outer_mm(xp) - middle
         changes |= {"near_mm": parameters.near_mm + moved, "far_mm": parameters.far_mm + moved}
     return replace(parameters, **changes)

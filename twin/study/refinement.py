@@ -81,7 +81,7 @@ SMOOTH: dict[str, Smooth] = {
     "line_mm": _line(MIDDLE),
     "line_far_mm": _line(DEPTHS - 1),
     "required_ms": lambda xp, p, f, mean: f.required_ms,
-    "standoff_mm": lambda xp, p, f, mean: f.standoff_mm - p.window(xp).outer_mm / p.window(xp).normal[2],
+    "standoff_mm": lambda xp, p, f, mean: f.standoff_mm - p.outer_mm(xp),
     "near_mm": lambda xp, p, f, mean: p.near_mm,
     "far_mm": lambda xp, p, f, mean: p.far_mm,
     "depth_mm": lambda xp, p, f, mean: p.far_mm - p.near_mm,
@@ -117,7 +117,8 @@ class DerivedFigures:
         sensor = sensor_of(study, design)
         self.paths = [
             path for path, variable in study.variables.items()
-            if path in PARAMETER_OF and variable.values is None and _is_placed(path, sensor.laser.baseline_mm)
+            if path in PARAMETER_OF and variable.values is None and not variable.whole
+            and _is_placed(path, sensor.laser.baseline_mm)
         ]  # fmt: skip
         self._figures, self._study = figures, study
         self._parameters = _plain(parameters_of([sensor], [study.medium_of(sensor)]))
@@ -216,8 +217,10 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
 
 
 def _is_placed(path: str, baseline_mm: float | None) -> bool:
-    """Whether a number has a meaning: a laser placed by its axis has neither baseline nor angle."""
-    return baseline_mm is not None or path not in ("laser.baseline_mm", "laser.triangulation_angle_deg")
+    """Whether a number can be derived along: of a laser placed by its axis, neither baseline nor angle nor roll."""
+    return baseline_mm is not None or path not in (
+        "laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg"
+    )  # fmt: skip
 
 
 def _plain(parameters: Parameters) -> Parameters:

@@ -18,9 +18,9 @@ from uwlts.errors import CaptureError, OutputError
 from uwlts.files import written_aside
 
 
-def part_path(folder: Path, first: int) -> Path:
-    """The part that begins with a design."""
-    return folder / f"part-{first:09d}.parquet"
+def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
+    """The part that begins with a design, or what stands for it while it is lost with the process that made it."""
+    return folder / f"{'lost' if lost else 'part'}-{first:09d}.parquet"
 
 
 def as_part(columns: dict[str, np.ndarray]) -> bytes:
@@ -30,15 +30,26 @@ def as_part(columns: dict[str, np.ndarray]) -> bytes:
     return sink.getvalue().to_pybytes()
 
 
-def write_part(folder: Path, first: int, content: bytes) -> None:
+def write_part(folder: Path, first: int, content: bytes, *, lost: bool = False) -> None:
     """Write a part, replacing what another run has written of the same batch."""
-    with written_aside(part_path(folder, first), overwrite=True) as aside:
+    with written_aside(part_path(folder, first, lost=lost), overwrite=True) as aside:
         aside.write_bytes(content)
+    if not lost:
+        part_path(folder, first, lost=True).unlink(missing_ok=True)
 
 
 def parts(folder: Path) -> list[Path]:
-    """All parts in a folder, by their first designs."""
-    return sorted(folder.glob("part-*.parquet"))
+    """All parts in a folder, by their first designs, and lost ones that have not been made since."""
+    lost = [path for path in folder.glob("lost-*.parquet") if not path.with_name(f"part{path.name[4:]}").exists()]
+    return sorted([*folder.glob("part-*.parquet"), *lost], key=lambda path: path.name[5:])
+
+
+def rows_in(path: Path) -> int:
+    """How many designs a part holds, 0 if there is none or it is damaged."""
+    try:
+        return pq.read_metadata(path).num_rows if path.is_file() else 0
+    except (pa.ArrowInvalid, OSError):
+        return 0
 
 
 def read_parts(folder: Path) -> dict[str, np.ndarray]:
@@ -54,7 +65,7 @@ def read_parts(folder: Path) -> dict[str, np.ndarray]:
     for path in parts(folder):
         try:
             tables.append(pq.read_table(path))
-        except (pa.ArrowInvalid, OSError) as error:
+        except (pa.ArrowException, OSError) as error:
             raise CaptureError(
                 f"{path} is damaged: {error}; remove it, and the sweep judges its designs anew"
             ) from error
@@ -62,7 +73,7 @@ def read_parts(folder: Path) -> dict[str, np.ndarray]:
         return columns
     try:
         table = pa.concat_tables(tables, promote_options="permissive")
-    except pa.ArrowInvalid as error:
+    except pa.ArrowException as error:
         raise CaptureError(f"the parts in {folder} are not of one study: {error}") from error
     numbers = table.column("design").to_numpy()
     _, first = np.unique(numbers, return_index=True)

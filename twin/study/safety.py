@@ -22,11 +22,13 @@ def laser_class(p: Parameters) -> np.ndarray:
     Limits for continuous visible light from a point source (Tables 3 to 8): class 1 up to 0.39 mW above 500 nm,
     0.039 mW below 450 nm and C3 = 10^(0.02 (nm - 450)) times that between; class 2 up to 1 mW, 3R up to 5 mW, 3B up to
     500 mW. What counts is the power through 7 mm at 100 mm from the line optics (condition 3), of a line that is
-    spread by its fan in air; for a flat profile unless it is a Gaussian one, whose middle is brighter.
+    spread by its fan in air, where the fan is brightest per angle. Every laser counts alone.
     """
-    length = 2 * _AWAY_MM * np.tan(p.fan_half_rad)
-    peak = np.where(p.gaussian_fan > 0, 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))), 1.0)
-    power = p.power_w * np.minimum(1.0, peak * _PUPIL_MM / length)
+    seen = 2 * math.atan(0.5 * _PUPIL_MM / _AWAY_MM) / (2 * p.fan_half_rad)
+    gaussian = 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
+    tabulated = 2 * p.fan_half_rad * np.maximum.reduce(p.fan_powers)
+    peak = np.where(p.gaussian_fan > 0, gaussian, np.where(p.tabulated_fan > 0, tabulated, 1.0))
+    power = p.power_w * np.minimum(1.0, peak * seen)
     nm = 1e6 * p.wavelength_mm
     class_1 = 3.9e-5 * 10 ** (0.02 * (np.clip(nm, 450, 500) - 450))
     limits = (class_1, _CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W)

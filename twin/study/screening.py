@@ -15,7 +15,8 @@ import pyarrow.parquet as pq
 from twin.study.crew import Crew, Lost
 from twin.study.description import Study
 from twin.study.designs import Design, judged
-from twin.study.results import as_part, made_folder, part_path, read_parts, write_part
+from twin.study.results import as_part, made_folder, part_path, read_parts, rows_in, write_part
+from twin.study.results import parts as stored
 from twin.study.sampling import designs_of, number_of_designs
 from twin.study.search import Search
 from uwlts.errors import DescriptionError
@@ -65,7 +66,7 @@ def screen(study: Study, folder: Path, crew: Crew, *, progress: Progress = lambd
         return
     total, size = number_of_designs(study), study.sampling.batch
     batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
-    waiting = [batch for batch in batches if _rows(parts, batch.first) < batch.count]
+    waiting = [batch for batch in batches if rows_in(part_path(parts, batch.first)) < batch.count]
     # Several machines begin at different places, and look before each batch whether another has done it.
     random.shuffle(waiting)
     done = total - sum(batch.count for batch in waiting)
@@ -74,13 +75,13 @@ def screen(study: Study, folder: Path, crew: Crew, *, progress: Progress = lambd
     def left() -> Iterator[Batch]:
         nonlocal done
         for batch in waiting:
-            if _rows(parts, batch.first) < batch.count:
+            if rows_in(part_path(parts, batch.first)) < batch.count:
                 yield batch
             else:
                 done += batch.count
 
     for batch, result in crew.work(judged_part, left()):
-        write_part(parts, batch.first, _content(batch, result))
+        write_part(parts, batch.first, _content(batch, result), lost=isinstance(result, Lost))
         done += batch.count
         progress("screening", done, total)
 
@@ -92,9 +93,9 @@ def _optimise(study: Study, folder: Path, parts: Path, crew: Crew, progress: Pro
     if known:
         search.tell(known)
     total = study.sampling.designs
-    done = len(known.get("design", ()))
-    progress("optimising", done, total)
-    while done < total:
+    # Other machines may add designs of their own.
+    while (done := sum(map(rows_in, stored(parts)))) < total:
+        progress("optimising", done, total)
         asked = search.ask(min(study.sampling.batch, total - done))
         share = -(-len(asked) // crew.workers)
         batches = [
@@ -111,7 +112,7 @@ def _optimise(study: Study, folder: Path, parts: Path, crew: Crew, progress: Pro
 
 
 def _content(batch: Batch, result: bytes | Lost) -> bytes:
-    """A part's content; of a batch whose worker died, all designs fail with the reason."""
+    """A part's content; of a batch whose worker died, all designs fail with the reason, until it is tried again."""
     if not isinstance(result, Lost):
         return result
     designs = batch.all()
@@ -126,15 +127,6 @@ def _content(batch: Batch, result: bytes | Lost) -> bytes:
     return as_part(columns)
 
 
-def _rows(parts: Path, first: int) -> int:
-    """How many designs a part holds, 0 if there is none."""
-    path = part_path(parts, first)
-    try:
-        return pq.read_metadata(path).num_rows if path.is_file() else 0
-    except (pa.ArrowInvalid, OSError):
-        return 0
-
-
 def keep_to_plan(study: Study, folder: Path) -> None:
     """Write down what a folder's study is, or make sure that it is the same.
 
@@ -145,8 +137,7 @@ def keep_to_plan(study: Study, folder: Path) -> None:
     """
     made_folder(folder)
     plan = json.loads(study.model_dump_json(exclude=set(_FREE_TO_CHANGE)))
-    if study.sampling.kind != "grid":
-        del plan["sampling"]["designs"]
+    del plan["sampling"]["designs"]
     plan["sensor"] = json.loads(study.base().model_dump_json())
     path = folder / PLAN
     if path.is_file():
@@ -160,7 +151,10 @@ def keep_to_plan(study: Study, folder: Path) -> None:
                 f"{folder} holds a study with another {other}: give another folder, or --overwrite to start afresh"
             )
         return
-    if any(folder.iterdir()):
-        raise DescriptionError(f"{folder} holds other files: give a folder of its own, or --overwrite to start afresh")
+    if any(not path.name.startswith(".") for path in folder.iterdir()):
+        if path.is_file():
+            # Another machine has just begun.
+            return keep_to_plan(study, folder)
+        raise DescriptionError(f"{folder} holds other files: give a folder of its own")
     with written_aside(path, overwrite=True) as aside:
         aside.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")

@@ -40,14 +40,13 @@ class Stripe:
     """The stripe on a diffuse plate square to the laser's axis.
 
     ``sigma_px`` is the image's standard deviation across, ``blur_px`` the lens's part of it; ``rate_e_per_ms`` is the
-    brightest pixel's; ``lit`` the share of the fan's power per angle there (0 outside the fan), on average 1.
+    brightest pixel's, ``background_e_per_ms`` what other light adds to it.
     """
 
     sigma_px: Array
     blur_px: Array
     rate_e_per_ms: Array
     background_e_per_ms: Array
-    lit: Array
 
 
 def stripe_at(
@@ -65,7 +64,9 @@ def stripe_at(
     away = xp.sqrt(dot(from_laser, from_laser))
     rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
     sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((away - p.waist_distance_mm) / rayleigh) ** 2)
-    thick = _across(p, pixels_per_mm(view, window, pose.normal)) * sheet
+    # On a profile line, where the pixel along the stripe is given.
+    by_x, by_y = (pixels_per_mm(view, window, direction) for direction in (pose.normal, pose.fan))
+    thick = abs(p.across(by_x) - p.across(by_y) * p.along(by_x) / p.along(by_y)) * sheet
 
     number = p.working_f_number()
     radius = 0.5 * p.focal_mm / number
@@ -86,7 +87,8 @@ def stripe_at(
     angle = xp.atan(fan.slope) * side / xp.sqrt(side * side + 1e-18)
     lit = _lit(xp, p, angle)
     per_mm = p.power_w * lit / (2 * p.fan_half_rad) / ((1 + fan.slope * fan.slope) * fan.growth_mm)
-    way = length_outside_mm(xp, laser_window, fan) + length_outside_mm(xp, window, view.path)
+    back = length_outside_mm(xp, window, view.path)
+    way = length_outside_mm(xp, laser_window, fan) + back
     on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * p.laser_window_passes * xp.exp(-p.extinction_per_mm * way)
     a, b = view.slopes
     cosine_squared = 1 / (1 + a * a + b * b)
@@ -94,8 +96,10 @@ def stripe_at(
     per_radiance = lens * p.window_passes / (p.medium_index * p.medium_index)
     electrons = 1e-3 * p.pixel_mm * p.pixel_mm * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
-    ambient = p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons
-    return Stripe(sigma, blur, rate, ambient + 0.0 * rate, lit)
+    ambient = (
+        p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons * xp.exp(-p.extinction_per_mm * back)
+    )
+    return Stripe(sigma, blur, rate, ambient)
 
 
 def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: Array) -> Array:
@@ -107,7 +111,7 @@ def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: 
     under pure speckle would tell ever more.
     """
     height = stripe.rate_e_per_ms * exposure_ms
-    contrast = speckle_contrast(xp, p)
+    contrast = p.line_contrast(xp)
     floor = (
         p.read_noise_e**2 + p.offset_e**2 + p.step_e**2 / 12
         + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms + (_UNMODELLED * height) ** 2
@@ -121,30 +125,20 @@ def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: 
     return xp.sqrt(stripe.sigma_px / (2 * width * information + 1e-30))
 
 
-def speckle_contrast(xp: ModuleType, p: Parameters) -> Array:
-    """Contrast in one pixel, for light that a diffuse surface has depolarised: two patterns that do not interfere."""
-    return p.pixel_averaging(xp) * p.speckle_coherence / math.sqrt(2)
-
-
 def exposure_ms(xp: ModuleType, p: Parameters, brightest_e_per_ms: Array) -> tuple[Array, Array]:
     """Exposure that brings the brightest light to the wanted level, and the exposure that the sensor then uses."""
-    level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * speckle_contrast(xp, p))
+    level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * p.pixel_contrast(xp))
     required = level / brightest_e_per_ms
-    if xp is not np:
-        return required, required
-    return required, np.where(np.isnan(p.exposure_ms), np.minimum(required, p.longest_ms), p.exposure_ms)
+    automatic = xp.minimum(required, p.longest_ms)
+    if xp is np:
+        return required, np.where(np.isnan(p.exposure_ms), automatic, p.exposure_ms)
+    return required, automatic if math.isnan(p.exposure_ms) else p.exposure_ms
 
 
 def _image_rows(view: Seen) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Pairs of x's and y's derivative, by the first and the second slope."""
     xa, xb, ya, yb = view.jacobian
     return (xa, ya), (xb, yb)
-
-
-def _across(p: Parameters, pixels: tuple[Array, Array]) -> Array:
-    """Size of a shift across the stripe, of shifts in x and y."""
-    across = p.along_width * pixels[1] + (1 - p.along_width) * pixels[0]
-    return abs(across)
 
 
 def _lit(xp: ModuleType, p: Parameters, angle: Array) -> Array:

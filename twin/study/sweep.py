@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -140,12 +141,19 @@ def _short(value: Any) -> str:
 
 
 def clear(folder: Path) -> None:
-    """Remove what an earlier sweep has left in a folder, and nothing else."""
-    for pattern in (f"{PARTS}/part-*.parquet", f"{RENDERED}/*.parquet"):
+    """Remove what an earlier sweep has left in a folder, and nothing else; a folder of other files stays as it is."""
+    if not (folder / PLAN).is_file():
+        return
+    for pattern in (f"{PARTS}/part-*.parquet", f"{PARTS}/lost-*.parquet", f"{RENDERED}/*.parquet"):
         for path in folder.glob(pattern):
             path.unlink()
+    for place in (folder, folder / PARTS, folder / RENDERED):
+        for path in place.glob(".*"):
+            # What was being written when an earlier sweep was killed.
+            if path.is_file() and re.fullmatch(r"\.[0-9a-f]{16}\.(parquet|json|csv|toml|html)", path.name):
+                path.unlink()
     for place in (folder / PARTS, folder / RENDERED):
         if place.is_dir() and not any(place.iterdir()):
             place.rmdir()
-    for name in (PLAN, PAGE, TABLE, WINNER, SUMMARY, JOURNAL):
+    for name in (PLAN, PAGE, TABLE, WINNER, SUMMARY, JOURNAL, f"{JOURNAL}.lock"):
         (folder / name).unlink(missing_ok=True)

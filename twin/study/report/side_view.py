@@ -120,8 +120,7 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
         As `twin.study.parameters.numbers_of`.
     """
     pose, p = laser_pose(sensor), parameters_of([sensor], [medium])
-    window = p.window(np)
-    outer = float((window.outer_mm / window.normal[2]).item())
+    outer = float(p.outer_mm(np).item())
     _require_crossing(pose, outer)
     rotation = frame(pose.axis, pose.normal)
     camera_faces = faces(sensor, sensor.camera.window, medium, np.zeros(3), np.eye(3))
