@@ -136,11 +136,11 @@ class DerivedFigures:
     def _derived(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
         """Figures, and their derivatives by one number."""
         dr = self._dr
-        numbers = []
-        for path, value in zip(self.paths, values, strict=True):
-            numbers.append(self._float(float(value) * PARAMETER_OF[path][1]))
-            dr.make_opaque(numbers[-1])
-        dr.enable_grad(numbers[number])
+        # All numbers carry derivatives, of which one is not 0, and neither is compiled in: one kernel serves all.
+        numbers = [self._float(float(v) * PARAMETER_OF[path][1]) for path, v in zip(self.paths, values, strict=True)]
+        seeds = [self._float(float(k == number)) for k in range(len(numbers))]
+        dr.make_opaque(numbers, seeds)
+        dr.enable_grad(numbers)
         changed = {PARAMETER_OF[path][0]: leaf for path, leaf in zip(self.paths, numbers, strict=True)}
         p = followed(dr, replace(self._parameters, **changed), self._study.follow)
         near, far = depths_in_view(dr, p)
@@ -153,8 +153,8 @@ class DerivedFigures:
             return dr.sum(quantity * self._float(weights.ravel() / weights.sum()))
 
         outputs = [self._float(SMOOTH[name](dr, p, f, mean)) for name in self._figures]
-        dr.set_grad(numbers[number], 1.0)
-        dr.enqueue(dr.ADMode.Forward, numbers[number])
+        dr.set_grad(numbers, seeds)
+        dr.enqueue(dr.ADMode.Forward, numbers)
         # What one figure is, another may be derived from: gradients on the way are kept.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
         changes = [dr.grad(output) for output in outputs]
