@@ -160,16 +160,27 @@ class Parameters:
         """Speckle contrast of a pixel, averaged over its area and two polarisations that do not interfere."""
         return self._averaged(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
 
-    def line_contrast(self, xp: ModuleType) -> Array:
-        """What that contrast would be if neighbours across the stripe erred independently, to the same effect.
+    def centre_contrast(self, xp: ModuleType, sigma_px: Array) -> Array:
+        """What that contrast would be if neighbours across a stripe erred independently, to the same effect.
 
-        Their speckle is alike where grains are as large as pixels: the squared contrast is summed over all neighbours.
+        Speckle is alike in neighbours where grains are as large as pixels. A stripe of standard deviation s is shifted
+        by what changes across it at the frequency f = 1 / (2 pi s). Of the squared contrast, summed over all
+        neighbours, the lens's and the pixel's transfer functions OTF(f g) and sinc^2(f) leave that part.
         """
-        return self._averaged(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
+        frequency = 1 / (2 * math.pi * sigma_px)
+        v = xp.minimum(frequency * self.grain_px(), 0.999)
+        lens = 2 / math.pi * (xp.acos(v) - v * xp.sqrt(1 - v * v))
+        pixel = xp.sin(math.pi * frequency) / (math.pi * frequency)
+        whole = self._averaged(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
+        return whole * xp.sqrt(lens) * pixel
+
+    def grain_px(self) -> Array:
+        """Size of speckle grains, lambda N (1 + m), in px."""
+        return self.wavelength_mm * self.working_f_number() / self.pixel_mm
 
     def _averaged(self, xp: ModuleType, series: Chebyshev) -> Array:
-        """The exponential of a series in the logarithm of the grain lambda N (1 + m), in px."""
-        grain = xp.log(self.wavelength_mm * self.working_f_number() / self.pixel_mm)
+        """The exponential of a series in the logarithm of the grain."""
+        grain = xp.log(self.grain_px())
         shift, scale = map(float, series.mapparms())
         t = shift + scale * xp.minimum(xp.maximum(grain, math.log(_GRAINS_PX[0])), math.log(_GRAINS_PX[1]))
         # Clenshaw's recurrence.

@@ -103,26 +103,30 @@ def stripe_at(
 
 
 def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: Array) -> Array:
-    """Standard uncertainty of the stripe's centre in px: what the noise of its pixels allows at best.
+    """Standard uncertainty of the stripe's centre in px, found by a fit that weighs pixels by their noise.
 
-    The information of a pixel about the centre is (dm/dx)^2 / V (Fisher), with the mean signal m = A exp(-x^2 / 2 s^2)
-    and the variance V = m + (C m)^2 + read, dark, background and rounding noise: photons and speckle of contrast C.
-    On top of these, V holds how far real profiles are from Gaussian ones, without which the dark flanks of a stripe
-    under pure speckle would tell ever more.
+    With the mean signal m = A exp(-x^2 / 2 s^2), its derivative m' and weights m' / W the fit's variance is
+    sum(m'^2 V / W^2) / sum(m'^2 / W)^2. V is the pixels' variance, m + (C m)^2 + read, dark, background and rounding
+    noise: photons and speckle, whose contrast C allows for what neighbours have in common. W is what the fit takes for
+    V: it knows of no neighbours, and adds how far real profiles may be from Gaussian ones, without which the dark
+    flanks of a stripe under pure speckle would count ever more.
     """
     height = stripe.rate_e_per_ms * exposure_ms
-    contrast = p.line_contrast(xp)
+    true, taken = p.centre_contrast(xp, stripe.sigma_px) ** 2 + p.prnu**2, p.pixel_contrast(xp) ** 2 + p.prnu**2
     floor = (
         p.read_noise_e**2 + p.offset_e**2 + p.step_e**2 / 12
-        + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms + (_UNMODELLED * height) ** 2
+        + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms
     )  # fmt: skip
-    information = 0.0 * height
+    information, noise = 0.0 * height, 0.0 * height
     width = _FLANK / _NODES
     for node in range(_NODES):
         t = (node + 0.5) * width
         signal = height * math.exp(-0.5 * t * t)
-        information = information + t * t * signal * signal / (floor + signal + (contrast**2 + p.prnu**2) * signal**2)
-    return xp.sqrt(stripe.sigma_px / (2 * width * information + 1e-30))
+        weight = 1 / (floor + (_UNMODELLED * height) ** 2 + signal + taken * signal**2)
+        slope = t * t * signal * signal
+        information = information + slope * weight
+        noise = noise + slope * weight * weight * (floor + signal + true * signal**2)
+    return xp.sqrt(stripe.sigma_px * noise / (2 * width * information * information + 1e-30))
 
 
 def exposure_ms(xp: ModuleType, p: Parameters, brightest_e_per_ms: Array) -> tuple[Array, Array]:
