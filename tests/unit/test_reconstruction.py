@@ -171,10 +171,11 @@ def test_the_ray_of_a_projected_point_passes_through_it_at_any_angle(window, med
     assert ok.sum() > 40
     missed = np.linalg.norm(np.cross(points[shown][ok] - rays.origins[ok], rays.directions[ok]), axis=1)
     # Near grazing a rounding of 1e-16 of the sine becomes 1e-8 of the angle; the promise holds where the ray in the
-    # medium stays 1 deg off the face, a magnification of 1 / sin^2 of it, 3e3, of roundings of 1e4 mm, 2e-12 mm.
+    # medium stays 1 deg off the face, a magnification of 1 / sin^2 of it, 3e3, of roundings of 1e4 mm, 2e-12 mm. Where
+    # the medium is denser than air, the ray before the window grazes it more: up to ten times that.
     steady = rays.directions[ok] @ face.normal > math.sin(math.radians(1.0))
     assert steady.sum() > 20
-    assert missed[steady].max() < 1e-8
+    assert missed[steady].max() < 1e-7
 
 
 @settings(deadline=None, max_examples=40)
