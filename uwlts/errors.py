@@ -47,3 +47,7 @@ class EvaluationError(UwltsError):
 
 class SetupError(UwltsError):
     """The machine lacks something: libLLVM, a library, a permission."""
+
+
+class HardwareError(UwltsError):
+    """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""
