@@ -24,6 +24,7 @@ demo: setup
 	@$(PYTHON) -m twin.demo
 
 test: setup
+	@$(PYTHON) -m twin.hardware.aravis_install
 	@$(PYTHON) -m pytest -q
 
 bench: setup
@@ -39,7 +40,7 @@ $(INSTALLED): pyproject.toml
 	@touch $@
 
 clean:
-	@rm -rf $(VENV) .llvm build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .llvm .aravis build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.

@@ -16,6 +16,7 @@ from twin.variant import CPU, use_variant
 from uwlts.console import progress_bar, run
 from uwlts.errors import DescriptionError
 from uwlts.library import load_sensor, names
+from uwlts.sensor import Sensor
 from uwlts.waters import water_names
 
 app = App(
@@ -92,10 +93,7 @@ def simulate(
         description = load_scene(scene, changes=changes)
         recordings.append((description, out.with_name(out.name.replace("{placement}", description.placement))))
     nominal = load_sensor(sensor)
-    built = load_sensor(as_built) if as_built else None
-    shared = {"width_px", "height_px", "stripe_along"}
-    if built and built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
-        raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{sensor}'")
+    built = _built(as_built, nominal, sensor)
     options = Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))
     use_variant(variant)
     from twin.simulate import simulate as record
@@ -115,6 +113,100 @@ def _water(text: str | None) -> str | float | None:
         return None if text is None else float(text)
     except ValueError:
         return text
+
+
+@app.command
+def serve(
+    scene: str,
+    *,
+    sensor: str = "thesis",
+    as_built: str | None = None,
+    placement: str | None = None,
+    medium: str | None = None,
+    water: str | None = None,
+    spp: int = 16,
+    seed: int = 0,
+    without: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    ideal: Annotated[bool, Parameter(negative="")] = False,
+    stage_start: float | None = None,
+    lamp: bool | None = None,
+    speed_up: float = 1.0,
+    fault: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
+    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
+) -> None:
+    """Serve a scene as hardware: a GigE Vision camera and a Grbl controller with stage and laser, until Ctrl-C.
+
+    A frame shows what the camera sees where the stage stands, with the laser as it is. Camera and controller can be
+    reached from this machine only.
+
+    Example: twin serve plane --placement near --fault drop@20
+
+    Parameters
+    ----------
+    scene
+        Name of a scene (see: twin scenes) or path of its TOML file.
+    sensor
+        Name or path of the sensor description that the sensor's software will be given.
+    as_built
+        Name or path of the sensor that is really rendered, if it differs from the description.
+    placement
+        Named place of the objects, such as near, standoff or far.
+    medium
+        Name of one of the sensor's media, in place of the scene's.
+    water
+        What floats in the water, in place of the medium's own: a name or a turbidity, as in twin simulate.
+    spp
+        Samples per lit pixel.
+    seed
+        Seed of all noise.
+    without
+        Effects to leave out, as in twin simulate; a moving stage does not blur the image in any case.
+    ideal
+        Leave out all effects: a pinhole's sharp image without noise.
+    stage_start
+        Stage position in mm at which the scene's motion starts; the middle of the travel is used unless given.
+    lamp
+        Whether the lamp is on while the laser is off; if the scene's motion has lamp images unless given.
+    speed_up
+        How much faster than real the stage moves.
+    fault
+        Faults as NAME[:ARGUMENT][@FRAME], each with the frame of that number, else with the first: drop, repeat or cut
+        (so many frames), delay (s), camera-disconnect, stage-disconnect, mute, stall, stop-short or lose-steps (steps),
+        alarm (number), hold, restart, garbage, break-laser.
+    variant
+        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
+    """
+    wanted = {"placement": placement, "medium": medium, "water": _water(water)}
+    description = load_scene(scene, changes={key: value for key, value in wanted.items() if value is not None})
+    options = Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))
+    if not speed_up > 0:
+        raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
+    nominal = load_sensor(sensor)
+    built = _built(as_built, nominal, sensor)
+    use_variant(variant)
+    from twin.hardware.faults import parse_fault
+    from twin.hardware.serve import serve as serve_twin
+    from twin.hardware.serve import wait_for_end
+
+    faults = [parse_fault(text) for text in fault]
+    with serve_twin(
+        description, built or nominal, options=options, stage_start_mm=stage_start, lamp=lamp, faults=faults,
+        speed_up=speed_up, report=lambda line: print(line, flush=True),
+    ) as served:  # fmt: skip
+        print("\n".join([*served.lines(), "serving; Ctrl-C ends it"]), flush=True)
+        wait_for_end(served)
+    print(f"ended after {served.rates()}")
+
+
+def _built(as_built: str | None, nominal: Sensor, name: str) -> Sensor | None:
+    """The sensor that is rendered in place of the nominal one called ``name``, whose images it must fit."""
+    if as_built is None:
+        return None
+    built = load_sensor(as_built)
+    shared = {"width_px", "height_px", "stripe_along"}
+    if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
+        raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{name}'")
+    return built
 
 
 @app.command

@@ -112,6 +112,10 @@ class Renderer:
             return self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
         return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp)
 
+    def daylight(self, scene_from_object: np.ndarray, *, spp: int) -> np.ndarray:
+        """What falls on the image sensor with laser and lamp off, (H, W) in W/mm2, as `irradiance`."""
+        return self._lamp_frame(SensorPose(scene_from_object), spp=spp, ambient=True)
+
     def laser_frame(
         self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> LaserFrame:

@@ -43,6 +43,132 @@ def info(path: str) -> None:
     print(describe(path))
 
 
+@app.command(name="import")
+def import_images(folder: Path, *, out: Path, description: Path | None = None, overwrite: Flag = False) -> None:
+    """Turn a folder of images of any camera into a capture.
+
+    Example: uwlts import photographs --out target.h5
+
+    Parameters
+    ----------
+    folder
+        Folder of PNG, TIFF, BMP or JPEG images.
+    out
+        Capture to write.
+    description
+        TOML file that tells sensor, medium, positions, and which image is what; import.toml in the folder unless given.
+    overwrite
+        Replace an existing file.
+    """
+    from uwlts.importing import import_folder
+
+    with progress_bar(f"importing {folder.name}") as progress:
+        imported = import_folder(folder, out, description=description, overwrite=overwrite, progress=progress)
+    for warning in imported.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(f"wrote {out} with {imported.laser} laser and {imported.lamp} lamp images")
+
+
+@app.command
+def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", overwrite: Flag = False) -> None:
+    """Write a capture as a folder of images that `uwlts import` reads back, or a cloud in another format.
+
+    Example: uwlts export scan.ply --out scan.laz
+
+    Parameters
+    ----------
+    file
+        Capture (.h5) or cloud (.ply).
+    out
+        New folder for a capture; for a cloud a file whose ending names the format: .ply, .xyz (text), .laz or .e57.
+    images
+        Format of a capture's images; both keep all bits.
+    overwrite
+        Replace an existing cloud.
+    """
+    from uwlts.capture import Capture
+    from uwlts.cloud import read_cloud
+    from uwlts.exporting import export_capture, export_cloud
+
+    if file.suffix.lower() == ".ply":
+        cloud = read_cloud(file)
+        export_cloud(cloud, out, overwrite=overwrite)
+        print(f"wrote {out} with {len(cloud)} points")
+        return
+    with Capture(file) as capture, progress_bar(f"exporting {file.name}") as progress:
+        export_capture(capture, out, image_format=images, progress=progress)
+        print(f"wrote {len(capture)} images and import.toml to {out}")
+
+
+@app.command
+def scan(
+    plan: Path,
+    *,
+    out: Path,
+    camera: str | None = None,
+    stage: str | None = None,
+    home: Flag = False,
+    unlock: Flag = False,
+    resume: Flag = False,
+    overwrite: Flag = False,
+) -> None:
+    """Record a scan with a camera and a stage into a capture.
+
+    Moves, lets the stage settle, switches the laser, takes an image and stores it with the position read back. The plan
+    is checked against travel and volume before anything moves; the laser goes off however the scan ends.
+
+    Example: uwlts scan plan.toml --camera gige:192.168.1.10 --stage /dev/ttyACM0 --home --out scan.h5
+
+    Parameters
+    ----------
+    plan
+        TOML file that tells sensor, medium, positions, lights and exposures (docs/scan.md).
+    out
+        Capture to write.
+    camera
+        Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti, replay:PATH.
+    stage
+        Serial port of the stage, in place of the plan's.
+    home
+        Find the limit switch first.
+    unlock
+        Take the stage's position as it is, without homing.
+    resume
+        Go on with an interrupted scan.
+    overwrite
+        Replace an existing capture.
+    """
+    from uwlts.hardware.camera import open_camera
+    from uwlts.hardware.grbl import GrblStage
+    from uwlts.hardware.scan_plan import load_plan
+    from uwlts.hardware.scanning import Seen, plan_text, record_scan
+
+    described = load_plan(plan)
+    address, port = camera or described.camera, stage or described.stage.port
+    if address is None or port is None:
+        what = "camera" if address is None else "stage"
+        raise DescriptionError(f"neither the plan nor the command line tells the {what}: give --{what}")
+    if not resume:
+        refuse_unsuitable(out, overwrite=overwrite)
+    print(plan_text(described))
+    with GrblStage(port) as moved, open_camera(address) as opened, progress_bar(described.title) as progress:
+        if home:
+            moved.home()
+        elif unlock:
+            moved.unlock()
+
+        def report(done: int, total: int, seen: Seen) -> None:
+            progress(done, total)
+
+        seen = record_scan(
+            described, out, camera=opened, stage=moved, overwrite=overwrite, resume=resume, progress=report
+        )
+    for warning in seen.warnings():
+        print(f"warning: {warning}", file=sys.stderr)
+    exposures = ", ".join(f"{light} {value:.3g} ms" for light, value in seen.exposure_ms.items())
+    print(f"wrote {out}, {seen.found} of {seen.lines} profile lines with a stripe; exposure {exposures or 'as before'}")
+
+
 @app.command
 def calibrate(
     *,
@@ -424,6 +550,33 @@ def thesis(
     rows = write_comparison(folder, results, tables, overwrite=overwrite)
     print(markdown(rows, results), end="")
     print(f"wrote {folder / 'report.html'}, summary.json, tables.csv and summary.md")
+
+
+@app.command
+def doctor(*, folder: Path = Path(), camera: str | None = None, stage: str | None = None) -> None:
+    """Examine libraries, libLLVM, cameras, serial ports, permissions and speed of this machine, and say what to do.
+
+    Ends with exit code 1 if something required, or something named here, is missing or does not work.
+
+    Example: uwlts doctor --camera gige: --stage /dev/ttyACM0
+
+    Parameters
+    ----------
+    folder
+        Where captures are to be written; 64 MB are, and removed.
+    camera
+        Address of a camera to take ten frames with: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
+    stage
+        Serial port of a stage to ask for its version, settings and state. It is not moved and the laser stays off, but
+        an Arduino Uno restarts: home before the next scan.
+    """
+    from uwlts.doctor import examine, print_findings
+
+    with progress_bar("examining") as progress:
+        findings = examine(folder, camera=camera, stage=stage, progress=progress)
+    print_findings(findings)
+    if any(each.status == "missing" for each in findings):
+        sys.exit(1)
 
 
 def _read_toml(path: Path) -> dict[str, object]:

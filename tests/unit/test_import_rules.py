@@ -15,11 +15,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 # What the twin may know of the sensor's software: what the sensor is (description, nominal media and placement, the
 # library that finds descriptions), how a capture and its ground truth are stored, how files are written, the errors,
-# how both commands speak on the terminal, and how they work in several processes. Nothing of how the software computes:
+# how both commands speak on the terminal, how they work in several processes, and where the library of GigE Vision is
+# found. Nothing of how the software computes:
 # camera, refraction, sheet, stripe, targets, calibration, reconstruction, metrology.
 SHARED_WITH_TWIN = {
     "errors", "sensor", "media", "waters", "placement", "library", "capture", "truth", "files", "unfinished",
-    "file_label", "console", "workers",
+    "file_label", "console", "workers", "aravis_library",
 }  # fmt: skip
 
 RENDERER = {"mitsuba", "drjit"}

@@ -1,0 +1,267 @@
+"""Scans by the command with the twin as the hardware, through the real drivers: the same cloud as a simulated one."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.hardware.serve import ServedTwin, serve
+from twin.options import Options
+from twin.scene import Scene, load_scene
+from twin.simulate import simulate
+from uwlts.capture import Capture, part_path
+from uwlts.library import load_sensor
+from uwlts.sensor import Sensor
+from uwlts.stripe import extract_stripe
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+COUNT = 6
+SENSOR = """
+base = "thesis"
+name = "small"
+[camera]
+width_px = 96
+height_px = 512
+pixel_size_um = 10.6
+[stage]
+travel_mm = 120.0
+resolution_mm = 0.01
+settling_s = 0.0
+[lamp]
+ambient_w_per_m2 = 0.05
+"""
+BOARD = f"""
+title = "Board"
+medium = "air"
+[motion]
+start_mm = -5.0
+step_mm = 2.0
+count = {COUNT}
+[artefact]
+kind = "plane"
+[[objects]]
+kind = "plate"
+width_mm = 200.0
+height_mm = 160.0
+rotation_deg = [0.0, 30.0, 0.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("scan")
+    (place / "sensor.toml").write_text(SENSOR, encoding="utf-8")
+    (place / "board.toml").write_text(BOARD, encoding="utf-8")
+    return place
+
+
+@pytest.fixture(scope="module")
+def sensor(folder: Path) -> Sensor:
+    return load_sensor(folder / "sensor.toml")
+
+
+@pytest.fixture(scope="module")
+def board(folder: Path) -> Scene:
+    return load_scene(folder / "board.toml")
+
+
+@pytest.fixture
+def served(board: Scene, sensor: Sensor) -> Iterator[ServedTwin]:
+    with serve(board, sensor, options=Options(spp=4), speed_up=50.0) as running:
+        yield running
+
+
+def written(folder: Path, served: ServedTwin, *, name: str = "plan", top: str = "", **stage: object) -> Path:
+    """A plan for the served twin, with the given changes."""
+    values = {"start_mm": served.track.start_mm, "step_mm": 2.0, "count": COUNT, "feed_mm_per_min": 900.0} | stage
+    lines = "\n".join(f"{key} = {value}" for key, value in values.items())
+    path = folder / f"{name}.toml"
+    path.write_text(
+        f'title = "Board"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{served.camera.address}"\n{top}\n'
+        f'[stage]\nport = "{served.controller.port}"\n{lines}\n[artefact]\nkind = "plane"\n',
+        encoding="utf-8",
+    )
+    return path
+
+
+def command(plan: Path, out: Path, *more: str) -> list[str]:
+    return [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home", *more]
+
+
+def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(plan, out, *more), env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+
+
+def dark(served: ServedTwin) -> bool:
+    """Whether the laser goes off within a second."""
+    deadline = time.monotonic() + 1.0
+    while served.controller.state().laser_on:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def centres(image: np.ndarray) -> np.ndarray:
+    return extract_stripe(image, stripe_along="width").centre_px
+
+
+def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, sensor, tmp_path):
+    exposure = served.exposure_ms["laser"]
+    done = run(written(folder, served, top=f"laser_ms = {exposure}"), tmp_path / "scan.h5")
+    assert done.returncode == 0, done.stderr
+    assert dark(served)
+    simulate(board, sensor, tmp_path / "simulated.h5", options=Options(spp=4))
+    with Capture(tmp_path / "scan.h5") as scan, Capture(tmp_path / "simulated.h5") as simulated:
+        assert len(scan) == len(simulated) == COUNT
+        assert scan.laser_on.all()
+        # The stage's steps are 0.01 mm; positions are read back from it.
+        np.testing.assert_allclose(scan.stage_mm - served.track.offset_mm, simulated.stage_mm, atol=0.011)
+        # The camera exposes whole microseconds, and says so.
+        np.testing.assert_allclose(scan.exposure_ms, exposure, atol=1e-3)
+        assert (np.diff(scan.time_s) > 0).all()
+        assert scan.header.artefact == {"kind": "plane"} and scan.header.provenance["source"] == "scan"
+        for (_, ours), (_, theirs) in zip(scan.frames(), simulated.frames(), strict=True):
+            apart = np.abs(centres(ours) - centres(theirs))
+            assert np.isfinite(apart).mean() > 0.9 and np.nanmedian(apart) < 0.05
+    clouds = []
+    for name in ("scan", "simulated"):
+        for line in (
+            f"nominal {folder / 'sensor.toml'} --medium air --out {tmp_path / name}.json",
+            f"reconstruct {tmp_path / name}.h5 --calibration {tmp_path / name}.json --out {tmp_path / name}.ply",
+            f"evaluate {tmp_path / name}.ply --out {tmp_path / name}.evaluation.json",
+        ):
+            judged = subprocess.run(
+                [sys.executable, "-m", "uwlts.cli", *line.split()], env=ENVIRONMENT, capture_output=True, text=True
+            )
+            assert judged.returncode == 0, judged.stderr
+        clouds.append((tmp_path / f"{name}.evaluation.json").read_text())
+    # The served images' noise is of another draw than the simulated ones', so that the spreads differ by chance.
+    spreads = [float(re.search(r'"STD": ([0-9.e-]+)', text)[1]) for text in clouds]
+    assert spreads[0] == pytest.approx(spreads[1], rel=0.25)
+
+
+def test_automatic_exposure_comes_near_that_of_the_twin(served, folder, tmp_path):
+    done = run(written(folder, served, count=2), tmp_path / "scan.h5")
+    assert done.returncode == 0, done.stderr
+    with Capture(tmp_path / "scan.h5") as scan:
+        # Both bring all but 2 % of the lines to 80 % of the full scale, here with noise and within 10 %.
+        assert scan.exposure_ms[0] == pytest.approx(served.exposure_ms["laser"], rel=0.3)
+        assert scan.exposure_ms[0] == scan.exposure_ms[1]
+
+
+def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_path):
+    top = 'background = true\nlights = ["lamp", "laser"]\nlaser_ms = 0.3\nlamp_ms = 0.3'
+    done = run(written(folder, served, top=top, count=2), tmp_path / "scan.h5")
+    assert done.returncode == 0, done.stderr
+    with Capture(tmp_path / "scan.h5") as scan:
+        assert scan.laser_on.tolist() == [False, True, False, True]
+        assert scan.dtype == np.uint16 and scan.header.saturation_dn == 511
+        _, lamp = next(iter(scan.frames()))
+        laser = scan.frame(1).image
+        assert lamp.max() < 256
+        # Away from the stripe the difference is noise about 256, which stands for none.
+        assert np.median(laser) == pytest.approx(256, abs=1) and laser.max() > 300
+
+
+def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder, tmp_path):
+    out = tmp_path / "scan.h5"
+    plan = written(folder, served, top="laser_ms = 0.3", settle_s=0.4)
+    scanning = subprocess.Popen(
+        command(plan, out), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60
+    while True:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+        if part_path(out).exists():
+            with Capture(part_path(out)) as part:
+                if len(part) >= 2:
+                    break
+    scanning.send_signal(signal.SIGINT)
+    _, said = scanning.communicate(timeout=20)
+    assert scanning.returncode == 130 and "Traceback" not in said
+    assert dark(served)
+    assert not out.exists()
+    with Capture(part_path(out)) as part:
+        kept, times = len(part), part.time_s[:]
+    assert 2 <= kept < COUNT
+    assert "--resume" in run(plan, out).stderr
+    done = run(plan, out, "--resume")
+    assert done.returncode == 0, done.stderr
+    with Capture(out) as scan:
+        assert len(scan) == COUNT
+        np.testing.assert_array_equal(scan.time_s[:kept], times)
+        assert (np.diff(scan.time_s) > 0).all()
+        np.testing.assert_allclose(np.diff(scan.stage_mm), 2.0, atol=0.021)
+
+
+@pytest.mark.parametrize(
+    ("stage", "top", "says"),
+    [
+        ({"count": 400}, "", "the stage from 0 to"),
+        ({"feed_mm_per_min": 1e6}, "", "the stage does at most"),
+        ({"step": 1.0}, "", "unknown key"),
+        ({}, 'lights = ["moon"]', "lights"),
+        ({}, 'laser_ms = "long"', "laser_ms"),
+        ({"direction": "[0, 0, 0]"}, "", "no length"),
+    ],
+)
+def test_plans_that_cannot_be_done_are_refused_before_anything_moves(served, folder, tmp_path, stage, top, says):
+    before = served.controller.state().position_mm
+    plan = written(folder, served, name="wrong", top=top, **stage)
+    arguments = [word for word in command(plan, tmp_path / "scan.h5") if word != "--home"] + ["--unlock"]
+    done = subprocess.run(arguments, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert says in done.stderr and "Traceback" not in done.stderr
+    assert served.controller.state().position_mm == before and not (tmp_path / "scan.h5").exists()
+
+
+def test_another_camera_than_described_is_refused(served, folder, tmp_path):
+    (folder / "other.toml").write_text(SENSOR.replace("96", "128"), encoding="utf-8")
+    plan = written(folder, served, name="other-plan")
+    plan.write_text(plan.read_text().replace("sensor.toml", "other.toml"), encoding="utf-8")
+    done = run(plan, tmp_path / "scan.h5")
+    assert done.returncode == 2 and "96 x 512 px" in done.stderr and "128 x 512" in done.stderr
+
+
+@pytest.mark.parametrize("fault", ["stall", "lose", "mute", "alarm", "camera"])
+def test_faults_end_dark_with_a_message_and_can_be_gone_on_from(served, folder, tmp_path, fault):
+    out = tmp_path / "scan.h5"
+    plan = written(folder, served, top="laser_ms = 0.3", settle_s=0.2)
+    scanning = subprocess.Popen(
+        command(plan, out), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60
+    while not (part_path(out).exists() and _images(part_path(out)) >= 2):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    controller, camera = served.controller, served.camera
+    {"stall": controller.stall, "lose": lambda: controller.stop_short(200), "mute": controller.mute,
+     "alarm": lambda: controller.alarm(1), "camera": camera.disconnect}[fault]()  # fmt: skip
+    _, said = scanning.communicate(timeout=60)
+    assert scanning.returncode == 2, said
+    assert "error:" in said and "Traceback" not in said
+    controller.mute(False)
+    assert dark(served)
+    kept = _images(part_path(out))
+    assert 2 <= kept < COUNT
+    if fault == "camera":
+        camera.connect()
+    done = run(plan, out, "--resume")
+    assert done.returncode == 0, done.stderr
+    with Capture(out) as scan:
+        assert len(scan) == COUNT
+
+
+def _images(part: Path) -> int:
+    with Capture(part) as capture:
+        return len(capture)

@@ -1,0 +1,72 @@
+"""Obtains the library of Aravis, by which cameras are read and the twin plays one.
+
+`python -m twin.hardware.aravis_install` says which library is used, and obtains one first where there is none: with
+apt-get as root, else unpacked from Debian's package or a wheel into a folder of one's own. Exit status 0, or 2 when
+there is none.
+"""
+
+import os
+import sys
+from functools import partial
+from pathlib import Path
+
+from twin.packages import Report, install_packages, unpack_packages, unpack_wheel, writable_folder
+from uwlts.aravis_library import VARIABLE, load_aravis, own_folders
+from uwlts.errors import SetupError
+
+DEBIAN_PACKAGE = "libaravis-0.8-0"
+# Built by a third party for x86-64; GLib, libxml2 and libusb have to be there.
+WHEEL = "aravis-python==0.8.31.post1"
+_WHAT = "Aravis"
+
+
+def install_aravis(*, target: Path | None = None, report: Report = lambda line: None) -> str:
+    """Name of the library that is used; where there is none it is obtained.
+
+    Parameters
+    ----------
+    target
+        Folder to unpack into; without it `.aravis` in the source tree, or the user's cache folder.
+    report
+        Called with a line of text for each step.
+
+    Raises
+    ------
+    SetupError
+        None of the ways led to a library; the message gives the reason of each.
+    """
+    try:
+        return load_aravis()._name
+    except SetupError as error:
+        # The user's own choice is never replaced, and replacing it would not be noticed.
+        if os.environ.get(VARIABLE):
+            raise
+        nothing_found = error
+    target = target or writable_folder(own_folders())
+    ways = (
+        partial(install_packages, [DEBIAN_PACKAGE]),
+        partial(unpack_packages, [DEBIAN_PACKAGE], target),
+        partial(unpack_wheel, WHEEL, target),
+    )
+    refusals = []
+    for way in ways:
+        try:
+            way(what=_WHAT, report=report)
+            return load_aravis()._name
+        except SetupError as error:
+            refusals.append(f"\n  {error}")
+    raise SetupError(f"{nothing_found}\nTried without success to obtain it:{''.join(refusals)}") from nothing_found
+
+
+def main() -> int:
+    """Command line of this module; returns the exit status."""
+    try:
+        print(f"Aravis: {install_aravis(report=partial(print, flush=True))}")
+    except SetupError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

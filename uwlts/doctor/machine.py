@@ -1,0 +1,113 @@
+"""Whether folder, network buffers, processors, memory and clock carry a scan at 60 frames/s."""
+
+import os
+import shutil
+import tempfile
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+from uwlts.doctor.finding import Finding
+
+FRAME_BYTES, FRAMES_PER_S = 1280 * 1024, 60
+_TRIAL_BYTES = 64_000_000
+# 7500 profiles: the bench's travel of 750 mm in steps of 0.1 mm, uncompressed.
+_SCAN_BYTES = 7500 * FRAME_BYTES
+_RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
+_RECOMMENDED_BUFFER = 33_554_432
+_LEAST_PROCESSORS, _LEAST_MEMORY = 2, 4e9
+
+
+def examine(folder: Path) -> list[Finding]:
+    """All of them."""
+    return [examine_folder(folder), examine_buffer(), examine_computer(), examine_clock()]
+
+
+def examine_folder(folder: Path) -> Finding:
+    """Whether captures can be written to a folder, fast enough: 64 MB are, and vanish again whatever happens."""
+    subject, path = "folder", folder.resolve()
+    elsewhere = "work in a folder that you may write to, on a local disk"
+    try:
+        free = shutil.disk_usage(folder).free
+        if free < 2 * _TRIAL_BYTES:
+            return Finding(subject, "warning", f"the disk of {path} is full: {free / 1e6:.0f} MB free", "make room")
+        rate = _writing_rate(folder)
+    except OSError as error:
+        return Finding(subject, "warning", f"{path} cannot be written to: {error.strerror}", elsewhere)
+    minutes = free / (FRAME_BYTES * FRAMES_PER_S) / 60
+    found = (
+        f"{path} takes {rate / FRAME_BYTES:.0f} frames/s of 1280 x 1024 px ({rate / 1e6:.0f} MB/s), has room for "
+        f"{free / 1e9:.0f} GB, {minutes:.0f} min at {FRAMES_PER_S} frames/s"
+    )
+    if rate < FRAME_BYTES * FRAMES_PER_S:
+        advice = f"for {FRAMES_PER_S} frames/s use a faster disk, end what else writes to it, or read out a region"
+        return Finding(subject, "warning", found, advice)
+    if free < _SCAN_BYTES:
+        return Finding(subject, "warning", found, f"make room: a long scan takes {_SCAN_BYTES / 1e9:.0f} GB")
+    return Finding(subject, "ok", found)
+
+
+def _writing_rate(folder: Path) -> float:
+    """Bytes per s until they lie on the disk. Noise, so that no file system compresses it."""
+    frame = os.urandom(FRAME_BYTES)
+    frames = -(-_TRIAL_BYTES // FRAME_BYTES)
+    # It has no name where the system can do that: the kernel removes it even after a kill.
+    with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
+        began = time.perf_counter()
+        for _ in range(frames):
+            written = 0
+            while written < FRAME_BYTES:
+                written += file.write(frame[written:])
+        os.fsync(file.fileno())
+        return frames * FRAME_BYTES / (time.perf_counter() - began)
+
+
+def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
+    """Whether a frame of a GigE camera may wait in the network's buffer while the program is busy."""
+    subject = "network buffer"
+    try:
+        allowed = int(limit.read_text())
+    except (OSError, ValueError) as error:
+        return Finding(
+            subject, "warning", f"{limit} cannot be read: {error}", "only for GigE cameras: look at its docs"
+        )
+    found = f"net.core.rmem_max is {allowed} bytes, {allowed / FRAME_BYTES:.1f} frames of 1280 x 1024 px"
+    if allowed >= FRAME_BYTES:
+        return Finding(subject, "ok", found)
+    advice = (
+        "only for GigE cameras, which lose packets otherwise:\n"
+        f"sudo sysctl -w net.core.rmem_max={_RECOMMENDED_BUFFER}\n"
+        f"echo net.core.rmem_max={_RECOMMENDED_BUFFER} | sudo tee /etc/sysctl.d/60-gige-camera.conf"
+    )
+    return Finding(subject, "warning", found, advice)
+
+
+def examine_computer() -> Finding:
+    """Processors this program may use, and the memory."""
+    processors = len(os.sched_getaffinity(0))
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    load = os.getloadavg()[0]
+    found = f"{processors} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
+    if processors < _LEAST_PROCESSORS or memory < _LEAST_MEMORY:
+        advice = f"take a computer of {_LEAST_PROCESSORS} processors and {_LEAST_MEMORY / 1e9:.0f} GB or more"
+        return Finding("computer", "warning", found, advice)
+    return Finding("computer", "ok", found)
+
+
+def examine_clock(files: Path | None = None) -> Finding:
+    """Whether the clock is behind the newest file of a folder, that of this software unless given.
+
+    Small computers without a battery start in the past, and captures would carry its dates.
+    """
+    folder = Path(__file__).parents[1] if files is None else files
+    newest = max(path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
+    now = time.time()
+    found = f"{_date(now)} UTC"
+    if now < newest - 1:
+        found += f", before the date of files in {folder}, {_date(newest)} UTC"
+        return Finding("clock", "warning", found, "set the clock: sudo timedatectl set-ntp true")
+    return Finding("clock", "ok", found)
+
+
+def _date(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")

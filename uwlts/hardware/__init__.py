@@ -1,0 +1,1 @@
+"""Cameras, stages and lasers: what moves, lights and looks at the tank."""

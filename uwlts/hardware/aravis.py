@@ -1,0 +1,309 @@
+"""Cameras with GigE Vision or USB3 Vision, by Aravis."""
+
+import ctypes
+import os
+import socket
+import stat
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from ipaddress import ip_address
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.aravis_library import load_aravis
+from uwlts.errors import HardwareError
+from uwlts.hardware.aravis_functions import BUFFER_COMPLETE, AravisFunctions
+from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+
+# Frames that may wait to be fetched; at 60 frames/s half a second.
+_BUFFERS = 32
+# A wait in the library holds up Ctrl-C.
+_WAIT_S = 0.1
+# Packed formats are left out: hardly any camera offers them alone.
+_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
+_MONO8 = "Mono8"
+_SOCKET_BYTES = 2**23
+# GigE Vision's discovery command: key, acknowledge, command 2, no content, request 1.
+_DISCOVERY = b"\x42\x01\x00\x02\x00\x00\x00\x01"
+_LOOPBACK, _CONTROL_PORT = "127.0.0.1", 3956
+
+
+@dataclass(frozen=True)
+class FoundCamera:
+    """A camera that answered: identifier, network address or bus position, protocol."""
+
+    identifier: str
+    serial: str
+    address: str
+    protocol: str
+
+    def __str__(self) -> str:
+        return f"aravis:{self.identifier} ({self.protocol}, {self.address})"
+
+
+def list_aravis_cameras() -> list[FoundCamera]:
+    """Ask for all cameras on the networks and USB ports of this machine; takes about a second.
+
+    Raises
+    ------
+    SetupError
+        Aravis is not installed.
+    """
+    functions = AravisFunctions(load_aravis())
+    functions.arv_update_device_list()
+    parts = ("id", "serial_nbr", "address", "protocol")
+    found = _served_on_loopback()
+    for index in range(functions.arv_get_n_devices()):
+        texts = [functions.text(getattr(functions, f"arv_get_device_{part}")(index)) for part in parts]
+        found.append(FoundCamera(*texts))
+    return found
+
+
+def _served_on_loopback() -> list[FoundCamera]:
+    """The camera that a program on this machine plays, which a search by broadcast does not reach."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        asking.settimeout(_WAIT_S)
+        try:
+            asking.connect((_LOOPBACK, _CONTROL_PORT))
+            asking.send(_DISCOVERY)
+            answer = asking.recv(1024)
+        except OSError:
+            # Nobody listens there, or not to this.
+            return []
+    if len(answer) != 8 + 248 or answer[:4] != b"\0\0\0\x03":
+        return []
+    maker, model, serial = (
+        answer[8 + start : 8 + start + room].partition(b"\0")[0].decode(errors="replace")
+        for start, room in ((0x48, 32), (0x68, 32), (0xD8, 16))
+    )
+    return [FoundCamera(f"{maker}-{model}-{serial}", serial, _LOOPBACK, "GigEVision")]
+
+
+class AravisCamera(Camera):
+    """A camera by its identifier, serial number or IP address; the only one there is if the name is empty."""
+
+    def __init__(self, name: str, *, address: str | None = None):
+        super().__init__(address or f"aravis:{name}")
+        self._name = name
+        self._functions: AravisFunctions
+        self._camera: int | None = None
+        self._stream: int | None = None
+        self._gone = False
+
+    def _open(self) -> CameraInfo:
+        self._functions = AravisFunctions(load_aravis())
+        self._gone = False
+        self._camera = self._call("new", self._identifier(), of=None)
+        try:
+            self._require_control()
+            width, height = self._numbers("get_sensor_size", 2)
+            maker, model, serial = (
+                self._functions.text(self._call(f"get_{part}")) or "?"
+                for part in ("vendor_name", "model_name", "device_serial_number")
+            )
+            bits = _BITS.get(self._pixel_format(), 8)
+        except BaseException:
+            self._close()
+            raise
+        return CameraInfo(f"{maker} {model}", serial, width, height, bits)
+
+    def _identifier(self) -> bytes:
+        """How Aravis calls the camera: an IP address as it is, for everything else there is a search."""
+        if _is_ip_address(self._name):
+            return self._name.encode()
+        found = list_aravis_cameras()
+        fitting = [each for each in found if self._name in ("", each.identifier, each.serial, each.address)]
+        if len(fitting) != 1:
+            listed = "".join(f"\n  {each}" for each in found) or "\n  none"
+            how_many = "no camera is" if not fitting else f"{len(fitting)} cameras are"
+            raise HardwareError(
+                f"{how_many} called '{self._name}'. Found:{listed}\n"
+                "Check power, cable and network settings; a GigE camera must be in the network of the computer"
+            )
+        # An address is asked directly, which also reaches the loopback interface.
+        return (fitting[0].address if fitting[0].protocol == "GigEVision" else fitting[0].identifier).encode()
+
+    def _require_control(self) -> None:
+        """A GigE camera obeys one program at a time; Aravis opens it for reading where that is another one."""
+        functions = self._functions
+        if functions.arv_camera_is_gv_device(self._camera):
+            device = functions.arv_camera_get_device(self._camera)
+            if not functions.arv_gv_device_is_controller(device):
+                raise HardwareError(f"the camera {self.address} is used by another program: end that one first")
+
+    def _close(self) -> None:
+        things = [thing for thing in (self._stream, self._camera) if thing is not None]
+        self._stream = self._camera = None
+        if self._gone:
+            # Aravis asks it again and again to let go, for 10 s, in which a laser may have to be switched off.
+            threading.Thread(target=self._let_go, args=(things,), name="aravis-let-go").start()
+        else:
+            self._let_go(things)
+
+    def _let_go(self, things: list[int]) -> None:
+        for thing in things:
+            self._functions.g_object_unref(thing)
+
+    def _configure(self, wishes: Wishes) -> CameraSettings:
+        info = self.info
+        self._call("set_acquisition_mode", 0)
+        self._call("clear_triggers")
+        self._set_pixel_format(wishes.bits)
+        region = wishes.region or Region(0, 0, info.width_px, info.height_px)
+        self._call("set_region", region.x_px, region.y_px, region.width_px, region.height_px)
+        for feature, value in (("exposure_time", wishes.exposure_ms), ("gain", wishes.gain_db)):
+            if value is not None:
+                self._set_number(feature, 1e3 * value if feature == "exposure_time" else value)
+        if wishes.frame_rate_hz is not None:
+            self._set_number("frame_rate", wishes.frame_rate_hz)
+        if wishes.trigger != "free":
+            self._call("set_trigger", b"Software" if wishes.trigger == "software" else b"Line0")
+        exposure_us, gain, rate = (self._get_number(feature) for feature in ("exposure_time", "gain", "frame_rate"))
+        return CameraSettings(
+            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us, gain_db=gain,
+            region=Region(*self._numbers("get_region", 4)), bits=_BITS[self._pixel_format()], trigger=wishes.trigger,
+            frame_rate_hz=rate if wishes.trigger == "free" else None,
+        )  # fmt: skip
+
+    def _set_number(self, feature: str, value: float) -> None:
+        if not self._has(feature):
+            raise HardwareError(f"the camera {self.address} has no setting for {feature.replace('_', ' ')}")
+        automatic = feature.replace("_time", "")
+        if feature != "frame_rate" and self._call(f"is_{automatic}_auto_available"):
+            self._call(f"set_{feature}_auto", 0)
+        low, high = (ctypes.c_double() for _ in range(2))
+        self._call(f"get_{feature}_bounds", ctypes.byref(low), ctypes.byref(high))
+        # Some cameras refuse what is out of range, others stop answering.
+        self._call(f"set_{feature}", min(max(value, low.value), high.value))
+
+    def _get_number(self, feature: str) -> float | None:
+        return self._call(f"get_{feature}") if self._has(feature) else None
+
+    def _has(self, feature: str) -> bool:
+        # A gain that is called otherwise is not in dB.
+        if feature == "gain":
+            return bool(self._call("is_feature_available", b"Gain"))
+        return bool(self._call(f"is_{feature}_available"))
+
+    def _set_pixel_format(self, bits: int | None) -> None:
+        """Grey values of so many bits; without a wish the format stays if it is a grey one, else 8 bits are taken."""
+        if bits is None and self._pixel_format() in _BITS:
+            return
+        wanted = _MONO8 if bits is None else f"Mono{bits}"
+        count = ctypes.c_uint()
+        names = self._call("dup_available_pixel_formats_as_strings", ctypes.byref(count))
+        offered = [names[index].decode() for index in range(count.value)]
+        self._functions.g_free(names)
+        if wanted not in offered or wanted not in _BITS:
+            raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
+        self._call("set_pixel_format_from_string", wanted.encode())
+
+    def _pixel_format(self) -> str:
+        return self._functions.text(self._call("get_pixel_format_as_string"))
+
+    def _start(self) -> None:
+        functions = self._functions
+        self._stream = self._call("create_stream", None, None)
+        payload = self._call("get_payload")
+        if functions.arv_camera_is_gv_device(self._camera):
+            _widen(functions.arv_gv_stream_get_port(self._stream))
+        for _ in range(_BUFFERS):
+            functions.arv_stream_push_buffer(self._stream, functions.arv_buffer_new(payload, None))
+        self._call("start_acquisition")
+
+    def _stop(self) -> None:
+        if self._gone:
+            raise HardwareError(f"the camera {self.address} does not answer any more and cannot be stopped")
+        self._call("stop_acquisition")
+        stream, self._stream = self._stream, None
+        self._let_go([stream])
+
+    def _trigger(self) -> None:
+        self._call("software_trigger")
+
+    def _next(self, timeout_s: float) -> Delivered | None:
+        functions, stream = self._functions, self._stream
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left_s = max(deadline - time.monotonic(), 0.0)
+            buffer = functions.arv_stream_timeout_pop_buffer(stream, int(1e6 * min(left_s, _WAIT_S)))
+            if buffer is not None:
+                break
+            if left_s <= _WAIT_S:
+                return None
+        try:
+            return self._delivered(buffer)
+        finally:
+            functions.arv_stream_push_buffer(stream, buffer)
+
+    def _delivered(self, buffer: int) -> Delivered:
+        functions = self._functions
+        stamp_ns = functions.arv_buffer_get_timestamp(buffer)
+        number, time_s = functions.arv_buffer_get_frame_id(buffer), 1e-9 * stamp_ns if stamp_ns else None
+        if functions.arv_buffer_get_status(buffer) != BUFFER_COMPLETE:
+            return Delivered(None, number, time_s)
+        size = ctypes.c_size_t()
+        start = functions.arv_buffer_get_data(buffer, ctypes.byref(size))
+        width, height = functions.arv_buffer_get_image_width(buffer), functions.arv_buffer_get_image_height(buffer)
+        kind = np.dtype(np.uint8 if self.settings.bits == 8 else "<u2")
+        if size.value < width * height * kind.itemsize:
+            return Delivered(None, number, time_s)
+        pixels = (ctypes.c_ubyte * (width * height * kind.itemsize)).from_address(start)
+        image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
+        return Delivered(image, number, time_s)
+
+    def _answers(self) -> None:
+        self._numbers("get_region", 4)
+
+    def _numbers(self, name: str, count: int) -> list[int]:
+        numbers = [ctypes.c_int() for _ in range(count)]
+        self._call(name, *map(ctypes.byref, numbers))
+        return [number.value for number in numbers]
+
+    def _call(self, name: str, *arguments: object, of: str | None = "camera") -> object:
+        """Call ``arv_camera_NAME``; the library's complaint becomes a HardwareError."""
+        receiver = () if of is None else (self._camera,)
+        result, complaint = self._functions.checked(f"arv_camera_{name}", *receiver, *arguments)
+        if complaint is not None:
+            self._gone = self._gone or "timeout" in complaint
+            raise HardwareError(
+                f"the camera {self.address} failed at '{name.replace('_', ' ')}': {complaint}. If it does not answer, "
+                "check power and cable, and whether another program uses it"
+            )
+        return result
+
+
+def _widen(port: int) -> None:
+    """Make room in the system for the packets of whole frames; how much it allows, net.core.rmem_max tells.
+
+    Aravis does so only once the first frame has come, too late for it and for all others if its first packet was lost.
+    It tells the port of its socket, but not the socket.
+    """
+    for number in _open_sockets():
+        with socket.socket(fileno=os.dup(number)) as same:
+            if same.family == socket.AF_INET and same.getsockname()[1] == port:
+                same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)
+
+
+def _open_sockets() -> list[int]:
+    """Numbers of this process's sockets; none where the system does not tell."""
+    folder = Path("/proc/self/fd")
+    numbers = [int(entry.name) for entry in folder.iterdir()] if folder.is_dir() else []
+    found = []
+    for number in numbers:
+        # The folder's own number is gone by now.
+        with suppress(OSError):
+            if stat.S_ISSOCK(os.fstat(number).st_mode):
+                found.append(number)
+    return found
+
+
+def _is_ip_address(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True

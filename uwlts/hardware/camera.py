@@ -1,0 +1,362 @@
+"""The camera as the rest of the software sees it, whatever it is connected by, and the addresses cameras are opened by.
+
+A driver implements the methods with an underscore; this class keeps the order of the calls, checks every frame and says
+what went wrong. One thread uses a camera.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+
+from uwlts.errors import HardwareError
+from uwlts.hardware.frame_check import FrameCheck, FrameCounts, FrameStatus
+
+Trigger = Literal["free", "software", "line"]
+
+ADDRESSES = """\
+  gige:NAME or aravis:NAME       GigE Vision or USB3 Vision by Aravis: identifier, serial number or IP address;
+                                 without NAME the only camera there is
+  genicam:PRODUCER.cti[:SERIAL]  any camera with a GenTL producer, such as XIMEA's
+  replay:PATH                    a folder of images, or a capture"""
+
+
+_MEANING = {
+    FrameStatus.SHORT: "short: parts of it were lost on the way; check cable, network load and packet size",
+    FrameStatus.DUPLICATED: "duplicated: it is the previous frame once more",
+    FrameStatus.DROPPED: "not the next one: frames before it were dropped; lower the frame rate or the load",
+    FrameStatus.LATE: "late: more than a frame's period after the one before",
+}
+
+
+@dataclass(frozen=True)
+class Region:
+    """Part of the image sensor that is read out, in px, from its upper left pixel."""
+
+    x_px: int
+    y_px: int
+    width_px: int
+    height_px: int
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """Which camera it is: name, serial number, pixels of the whole image sensor, and bits of a grey value."""
+
+    name: str
+    serial: str
+    width_px: int
+    height_px: int
+    bits: int
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """What the camera really does; None where it has no such setting, or does not tell."""
+
+    exposure_ms: float | None
+    gain_db: float | None
+    region: Region
+    bits: int
+    trigger: Trigger
+    frame_rate_hz: float | None
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a camera is asked to do; None leaves a setting as it is, but the region becomes the whole image."""
+
+    exposure_ms: float | None
+    gain_db: float | None
+    region: Region | None
+    bits: int | None
+    trigger: Trigger
+    frame_rate_hz: float | None
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """What a driver hands over: image (H, W), or None if incomplete, and what the camera says of it."""
+
+    image: np.ndarray | None
+    frame_id: int
+    time_s: float | None = None
+    exposure_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class GrabbedFrame:
+    """An image (H, W) of uint8 or uint16, complete, with its number and the camera's time stamp in s.
+
+    The camera's clock has an origin of its own. ``exposure_ms`` is None where the camera does not tell. ``status`` is
+    OK, or DROPPED or LATE where such frames are wanted.
+    """
+
+    image: np.ndarray
+    time_s: float
+    frame_id: int
+    exposure_ms: float | None
+    status: FrameStatus
+
+
+class Camera(ABC):
+    """A camera: ``open``, ``configure``, ``start``, then ``grab``, with ``trigger`` before it where that is wanted.
+
+    A context manager, which opens the camera if it is not open and closes it whatever happens. All methods raise
+    HardwareError where the camera does not answer, answers wrongly, or cannot do what is asked.
+    """
+
+    def __init__(self, address: str):
+        self.address = address
+        self._info: CameraInfo | None = None
+        self._settings: CameraSettings | None = None
+        self._started = False
+        self._check = FrameCheck()
+        self._skip = False
+
+    @property
+    def info(self) -> CameraInfo:
+        """Which camera it is; known once it is open."""
+        if self._info is None:
+            raise HardwareError(f"the camera {self.address} is not open: call open() first")
+        return self._info
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What the camera really does; known once it is configured."""
+        if self._settings is None:
+            raise HardwareError(f"the camera {self.address} is not configured: call configure() first")
+        return self._settings
+
+    @property
+    def counts(self) -> FrameCounts:
+        """How many frames since ``start`` were good, and how many of each fault."""
+        return self._check.counts
+
+    def open(self) -> None:
+        """Connect to the camera, alone; opening an open camera does nothing."""
+        if self._info is None:
+            self._info = self._open()
+
+    def close(self) -> None:
+        """Stop, let go of the camera; closing one that is closed, or gone, is no error."""
+        if self._info is None:
+            return
+        try:
+            with suppress(HardwareError):
+                self.stop()
+        finally:
+            self._info = self._settings = None
+            self._close()
+
+    def configure(
+        self,
+        *,
+        exposure_ms: float | None = None,
+        gain_db: float | None = None,
+        region: Region | None = None,
+        bits: int | None = None,
+        trigger: Trigger = "free",
+        frame_rate_hz: float | None = None,
+    ) -> CameraSettings:
+        """Set up the camera, and return what it really set, which may be rounded or limited.
+
+        Parameters
+        ----------
+        exposure_ms, gain_db, bits
+            Exposure in ms, gain in dB, bits of a grey value; None leaves what is set.
+        region
+            Part of the image sensor to read out; None for all of it.
+        trigger
+            "free": one frame after the other. "software": one for each call of ``trigger``. "line": one for each
+            pulse at the camera's trigger input.
+        frame_rate_hz
+            Frames per second of a free-running camera; None leaves what is set.
+        """
+        info = self.info
+        if self._started:
+            raise HardwareError(f"the camera {self.address} is running: call stop() before configure()")
+        for name, value in (("exposure_ms", exposure_ms), ("frame_rate_hz", frame_rate_hz)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise HardwareError(f"{name} is {value}: it must be positive")
+        if gain_db is not None and not np.isfinite(gain_db):
+            raise HardwareError(f"gain_db is {gain_db}: it must be finite")
+        if region is not None:
+            _refuse_outside(region, info)
+        wishes = Wishes(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz)
+        self._settings = self._configure(wishes)
+        return self._settings
+
+    def start(self, *, faults: Literal["raise", "skip"] = "raise") -> None:
+        """Begin to take frames.
+
+        With ``faults`` "raise" every fault of a frame is a HardwareError. With "skip" they are only counted: short and
+        duplicated frames are passed over, frames after a gap and late ones are returned with their status.
+        """
+        settings = self.settings
+        if self._started:
+            raise HardwareError(f"the camera {self.address} is running already")
+        free = settings.trigger == "free" and settings.frame_rate_hz is not None
+        self._check = FrameCheck(period_s=1 / settings.frame_rate_hz if free else None)
+        self._skip = faults == "skip"
+        self._start()
+        self._started = True
+
+    def stop(self) -> None:
+        """Take no more frames; stopping a camera that does not run does nothing."""
+        if self._started:
+            self._started = False
+            self._stop()
+
+    def trigger(self) -> None:
+        """Have one frame taken; the next ``grab`` returns it. Frames that still wait are thrown away."""
+        self._require_running()
+        if self.settings.trigger != "software":
+            raise HardwareError(
+                f"the camera {self.address} is configured for trigger '{self.settings.trigger}', not 'software'"
+            )
+        while self._next(0.0) is not None:
+            self._check.unasked()
+        self._trigger()
+
+    def grab(self, timeout_s: float) -> GrabbedFrame:
+        """Wait for the next frame, at most so many seconds.
+
+        Raises
+        ------
+        HardwareError
+            No frame came in time, the camera is gone, or the frame has a fault (see ``start``). After a trigger that
+            was not answered in time the acquisition is restarted, so that its frame cannot be taken for the answer
+            to a later one.
+        """
+        self._require_running()
+        deadline = time.monotonic() + timeout_s
+        while True:
+            delivered = self._next(max(deadline - time.monotonic(), 0.0))
+            if delivered is None:
+                raise self._no_frame(timeout_s)
+            status = self._check.judge(
+                frame_id=delivered.frame_id, time_s=delivered.time_s, complete=delivered.image is not None
+            )
+            usable = delivered.image is not None and status is not FrameStatus.DUPLICATED
+            if status is FrameStatus.OK or (self._skip and usable):
+                return self._grabbed(delivered, status)
+            if not self._skip:
+                raise HardwareError(f"frame {delivered.frame_id} of the camera {self.address} is {_MEANING[status]}")
+
+    def _grabbed(self, delivered: Delivered, status: FrameStatus) -> GrabbedFrame:
+        region = self.settings.region
+        if delivered.image.shape != (region.height_px, region.width_px):
+            raise HardwareError(
+                f"frame {delivered.frame_id} of the camera {self.address} has {delivered.image.shape[1]} x "
+                f"{delivered.image.shape[0]} px, expected {region.width_px} x {region.height_px} px"
+            )
+        time_s = time.monotonic() if delivered.time_s is None else delivered.time_s
+        exposure_ms = self.settings.exposure_ms if delivered.exposure_ms is None else delivered.exposure_ms
+        return GrabbedFrame(delivered.image, time_s, delivered.frame_id, exposure_ms, status)
+
+    def _no_frame(self, timeout_s: float) -> HardwareError:
+        """The error of a frame that did not come; another HardwareError where the camera is gone altogether."""
+        # Should the camera be gone, nothing is left to be stopped.
+        self._started = False
+        if self.settings.trigger == "software":
+            self._check.missed()
+            self._stop()
+            self._start()
+            self._started = True
+            return HardwareError(
+                f"the camera {self.address} did not answer a trigger within {timeout_s:g} s; its exposure is "
+                f"{self.settings.exposure_ms} ms. It still answers commands: the frame or the trigger was lost"
+            )
+        self._answers()
+        self._started = True
+        advice = "pulses at its trigger input are missing" if self.settings.trigger == "line" else "its frames are lost"
+        return HardwareError(
+            f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: {advice}"
+        )
+
+    def _require_running(self) -> None:
+        if not self._started:
+            raise HardwareError(f"the camera {self.address} does not run: call start() first")
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def _open(self) -> CameraInfo:
+        """Connect; whatever was acquired is let go if this fails."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Let go of everything that ``_open`` acquired, even if the camera is gone."""
+
+    @abstractmethod
+    def _configure(self, wishes: Wishes) -> CameraSettings:
+        """Set what is wished, and read back what came of it."""
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Begin to take frames, with none from before."""
+
+    @abstractmethod
+    def _stop(self) -> None:
+        """End it; HardwareError where the camera is gone."""
+
+    @abstractmethod
+    def _trigger(self) -> None:
+        """Have one frame taken."""
+
+    @abstractmethod
+    def _next(self, timeout_s: float) -> Delivered | None:
+        """The next frame, None after so many seconds without one; Ctrl-C must get through within 0.2 s."""
+
+    @abstractmethod
+    def _answers(self) -> None:
+        """HardwareError where the camera is gone."""
+
+
+def open_camera(address: str) -> Camera:
+    """Open the camera at an address such as "gige:127.0.0.1"; a context manager that closes it.
+
+    Raises
+    ------
+    HardwareError
+        The address is not understood, or there is no such camera; the message lists what there is.
+    SetupError
+        A library is missing; the message says how to install it.
+    """
+    kind, colon, rest = address.partition(":")
+    if kind in ("gige", "aravis") and colon:
+        from uwlts.hardware.aravis import AravisCamera
+
+        camera: Camera = AravisCamera(rest, address=address)
+    elif kind == "genicam" and rest:
+        from uwlts.hardware.genicam import GenicamCamera
+
+        producer, _, serial = rest.partition(".cti:")
+        camera = GenicamCamera(f"{producer}.cti" if serial else rest, serial=serial or None, address=address)
+    elif kind == "replay" and rest:
+        from uwlts.hardware.replay import ReplayCamera
+
+        camera = ReplayCamera(rest, address=address)
+    else:
+        raise HardwareError(f"'{address}' is no address of a camera; known are\n{ADDRESSES}")
+    camera.open()
+    return camera
+
+
+def _refuse_outside(region: Region, info: CameraInfo) -> None:
+    right, below = region.x_px + region.width_px, region.y_px + region.height_px
+    inside = min(region.x_px, region.y_px) >= 0 and min(region.width_px, region.height_px) > 0
+    if not inside or right > info.width_px or below > info.height_px:
+        raise HardwareError(f"{region} is not within the image sensor of {info.width_px} x {info.height_px} px")

@@ -1,0 +1,242 @@
+"""Cameras with a GenTL producer, the driver library (.cti) that comes with most machine-vision cameras, by harvesters.
+
+XIMEA's producer for the thesis's camera is among them, and so are those of Basler, Allied Vision, FLIR, IDS and others.
+"""
+
+import time
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from uwlts.errors import HardwareError, SetupError
+from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+
+# A wait in the producer holds up Ctrl-C.
+_WAIT_S = 0.1
+_BUFFERS = 32
+# Packed formats are left out, which harvesters does not unpack.
+_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
+# GenApi's access modes count: not implemented, not available, write only, read only, both.
+_WRITE_ONLY = 2
+# Names after the standard, then those in use before it.
+_EXPOSURE_US, _FRAME_RATE = ("ExposureTime", "ExposureTimeAbs"), ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_HOW_TO_INSTALL = "the libraries harvesters and genicam are not installed: pip install harvesters genicam"
+
+
+class GenicamCamera(Camera):
+    """The camera of a serial number at a GenTL producer; the only one there is without a serial number."""
+
+    def __init__(self, producer: str | Path, *, serial: str | None = None, address: str | None = None):
+        super().__init__(address or f"genicam:{producer}" + (f":{serial}" if serial else ""))
+        self._producer = Path(producer)
+        self._serial = serial
+        self._harvester = None
+        self._acquirer = None
+        self._faults: tuple[type[BaseException], ...] = ()
+        self._timeout: type[BaseException]
+
+    def _open(self) -> CameraInfo:
+        core, genapi, gentl = _libraries()
+        self._faults = (genapi.GenericException, gentl.GenericException)
+        self._timeout = gentl.TimeoutException
+        if not self._producer.is_file():
+            raise HardwareError(
+                f"there is no GenTL producer at {self._producer}; give the path of the camera maker's .cti file"
+            )
+        self._harvester = core.Harvester()
+        try:
+            info = self._connect()
+        except BaseException:
+            self._close()
+            raise
+        return info
+
+    def _connect(self) -> CameraInfo:
+        self._harvester.add_file(str(self._producer))
+        try:
+            self._harvester.update()
+            found = list(self._harvester.device_info_list)
+            fitting = [each for each in found if self._serial in (None, each.serial_number)]
+            if len(fitting) != 1:
+                listed = "".join(f"\n  genicam:{self._producer}:{each.serial_number} ({each.model})" for each in found)
+                raise HardwareError(
+                    f"{len(fitting)} of the cameras at {self._producer} fit {self.address}, expected one. "
+                    f"Found:{listed or ' none; check power, cable, and that the file is a producer for this machine'}"
+                )
+            self._acquirer = self._harvester.create(found.index(fitting[0]))
+            self._acquirer.num_buffers = _BUFFERS
+            width, height = (self._whole(side) for side in ("Width", "Height"))
+            bits = _BITS.get(self._node("PixelFormat").value, 8)
+        except self._faults as error:
+            raise self._failed("opening it", error) from error
+        return CameraInfo(f"{fitting[0].vendor} {fitting[0].model}", fitting[0].serial_number, width, height, bits)
+
+    def _close(self) -> None:
+        acquirer, self._acquirer = self._acquirer, None
+        harvester, self._harvester = self._harvester, None
+        if acquirer is not None:
+            acquirer.destroy()
+        if harvester is not None:
+            harvester.reset()
+
+    def _configure(self, wishes: Wishes) -> CameraSettings:
+        try:
+            self._set_if_there("AcquisitionMode", "Continuous")
+            self._set_if_there("TriggerMode", "Off")
+            self._set_pixel_format(wishes.bits)
+            self._set_region(wishes.region)
+            self._set_number(_EXPOSURE_US, wishes.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
+            self._set_number(("Gain",), wishes.gain_db, "gain", automatic="GainAuto")
+            if wishes.frame_rate_hz is not None:
+                self._set_if_there("AcquisitionFrameRateEnable", True)
+            self._set_number(_FRAME_RATE, wishes.frame_rate_hz, "frame rate")
+            if wishes.trigger != "free":
+                self._set_trigger("Software" if wishes.trigger == "software" else "Line0")
+            return self._settings_read(wishes)
+        except self._faults as error:
+            raise self._failed("configuring it", error) from error
+
+    def _settings_read(self, wishes: Wishes) -> CameraSettings:
+        exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, ("Gain",), _FRAME_RATE))
+        x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
+        region = Region(x, y, int(self._node("Width").value), int(self._node("Height").value))
+        return CameraSettings(
+            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us, gain_db=gain, region=region,
+            bits=_BITS[self._node("PixelFormat").value], trigger=wishes.trigger,
+            frame_rate_hz=rate if wishes.trigger == "free" else None,
+        )  # fmt: skip
+
+    def _set_pixel_format(self, bits: int | None) -> None:
+        """Grey values of so many bits; without a wish the format stays if it is a grey one, else 8 bits are taken."""
+        node = self._node("PixelFormat")
+        if bits is None and node.value in _BITS:
+            return
+        wanted = f"Mono{bits or 8}"
+        if wanted not in node.symbolics or wanted not in _BITS:
+            raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(node.symbolics)}")
+        node.value = wanted
+
+    def _set_region(self, region: Region | None) -> None:
+        wanted = region or Region(0, 0, self.info.width_px, self.info.height_px)
+        # Moved to the corner first: a width is refused that would not fit beside the offset.
+        for name in ("OffsetX", "OffsetY"):
+            self._set_if_there(name, 0)
+        for name, size in (("Width", wanted.width_px), ("Height", wanted.height_px)):
+            node = self._node(name)
+            node.value = max(node.min, size // node.inc * node.inc)
+        for name, offset in (("OffsetX", wanted.x_px), ("OffsetY", wanted.y_px)):
+            if offset and not self._has(name):
+                raise HardwareError(f"the camera {self.address} cannot move its region: it has no {name}")
+            if offset:
+                node = self._node(name)
+                node.value = offset // node.inc * node.inc
+
+    def _set_number(
+        self, names: tuple[str, ...], value: float | None, what: str, *, factor: float = 1, automatic: str | None = None
+    ) -> None:
+        if value is None:
+            return
+        name = next((name for name in names if self._has(name)), None)
+        if name is None:
+            raise HardwareError(f"the camera {self.address} has no setting for {what} ({' or '.join(names)})")
+        if automatic is not None:
+            self._set_if_there(automatic, "Off")
+        node = self._node(name)
+        node.value = min(max(factor * value, node.min), node.max)
+
+    def _number(self, names: tuple[str, ...]) -> float | None:
+        return next((float(self._node(name).value) for name in names if self._has(name)), None)
+
+    def _set_trigger(self, source: str) -> None:
+        self._set_if_there("TriggerSelector", "FrameStart")
+        self._set_if_there("TriggerMode", "On")
+        self._set_if_there("TriggerSource", source)
+        if not self._has("TriggerMode") or (source == "Software" and not self._has("TriggerSoftware")):
+            raise HardwareError(f"the camera {self.address} cannot be triggered by {source}: use trigger 'free'")
+
+    def _set_if_there(self, name: str, value: object) -> None:
+        # Cameras that know but one value refuse to be told it.
+        if self._has(name) and self._node(name).value != value:
+            self._node(name).value = value
+
+    def _has(self, name: str) -> bool:
+        nodes = self._acquirer.remote_device.node_map
+        return nodes.has_node(name) and nodes.get_node(name).get_access_mode() >= _WRITE_ONLY
+
+    def _node(self, name: str):
+        return self._acquirer.remote_device.node_map.get_node(name)
+
+    def _whole(self, side: str) -> int:
+        """Pixels of the whole image sensor along its width or height."""
+        for name in (f"Sensor{side}", f"{side}Max"):
+            if self._has(name):
+                return int(self._node(name).value)
+        return int(self._node(side).max)
+
+    def _start(self) -> None:
+        try:
+            self._acquirer.start()
+        except self._faults as error:
+            raise self._failed("starting it", error) from error
+
+    def _stop(self) -> None:
+        self._acquirer.stop()
+
+    def _trigger(self) -> None:
+        try:
+            self._node("TriggerSoftware").execute()
+        except self._faults as error:
+            raise self._failed("triggering it", error) from error
+
+    def _next(self, timeout_s: float) -> Delivered | None:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            left_s = max(deadline - time.monotonic(), 0.0)
+            try:
+                buffer = self._acquirer.fetch(timeout=min(left_s, _WAIT_S))
+                break
+            except self._timeout:
+                if left_s <= _WAIT_S:
+                    return None
+            except self._faults as error:
+                raise self._failed("waiting for a frame", error) from error
+        try:
+            return self._delivered(buffer)
+        finally:
+            buffer.queue()
+
+    def _delivered(self, buffer) -> Delivered:
+        raw = buffer.module
+        try:
+            time_s = 1e-9 * raw.timestamp_ns
+        except self._faults:
+            time_s = None
+        image = None
+        if raw.is_complete() and buffer.payload.components:
+            part = buffer.payload.components[0]
+            kind = np.uint8 if self.settings.bits == 8 else np.uint16
+            image = part.data.reshape(part.height, part.width).astype(kind)
+        return Delivered(image, raw.frame_id, time_s)
+
+    def _answers(self) -> None:
+        try:
+            self._whole("Width")
+        except self._faults as error:
+            raise self._failed("asking it", error) from error
+
+    def _failed(self, doing: str, error: BaseException) -> HardwareError:
+        return HardwareError(
+            f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "
+            "whether another program uses it"
+        )
+
+
+def _libraries() -> tuple[ModuleType, ModuleType, ModuleType]:
+    """harvesters.core, genicam.genapi and genicam.gentl, which most users do not need."""
+    try:
+        from genicam import genapi, gentl
+        from harvesters import core
+    except ImportError as error:
+        raise SetupError(f"{_HOW_TO_INSTALL} ({error})") from error
+    return core, genapi, gentl

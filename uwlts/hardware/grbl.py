@@ -1,0 +1,338 @@
+"""The stage and the laser: a Grbl 1.1 controller that moves one axis and switches the laser by its spindle pin.
+
+Positions are in mm from the lower end of travel in machine coordinates, so that 0 <= position <= travel once the stage
+is homed; the limit switch is at 0 if $23 is 1, else at the other end. Moves are given in machine coordinates (G53), so
+that work offsets left in the controller change nothing. Without homing ($22=0) positions count from where the
+controller was started.
+
+Grbl counts the pulses that it sends to the motor; it measures nothing. A position that differs from the target means
+that a command or pulses were lost before the motor. Steps that the motor itself loses show only when the limit switch
+is found pressed away from its place, which every move checks, or in the pictures: return to the first position and
+compare.
+
+When the laser goes off:
+
+- the ``with`` ends, normally or by an exception, Ctrl-C included: Ctrl-X, whose answer is awaited. Grbl's receiving
+  interrupt obeys it, so it works while the controller moves, waits or is locked;
+- a fault is found: Ctrl-X before the error is raised;
+- the program is killed (SIGTERM, SIGKILL), crashes or ends without closing: `laser_guard`, a process of its own, sends
+  the Ctrl-X;
+- the cable is pulled out: the Uno, fed by it, loses its power and the pull-down at the laser's transistor does the
+  rest. Grbl has no watchdog and no setting replaces one; an Uno with a supply of its own keeps the laser lit;
+- the computer freezes or loses power while USB stays powered: only hardware helps, docs/hardware-stage.md shows it. The
+  Uno's reset through DTR does not: it comes when the port is *opened*, not when it is closed;
+- the controller restarts for any reason, the next opening of the port included: Grbl starts with the pin off.
+"""
+
+import math
+import time
+from types import TracebackType
+
+from uwlts.errors import HardwareError, RangeError
+from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine
+from uwlts.hardware.grbl_protocol import GrblSettings, Message, Setting, Status, parse_settings
+
+# A stage that has not moved by a step in this time, and in that of some steps, stands still.
+_STALL_S, _STALL_STEPS = 1.0, 5
+_MARGIN, _MARGIN_S = 1.5, 2.0
+# The offset comes with every 10th report at rest and every 30th in motion.
+_REPORTS_TO_OFFSET = 31
+_PIN_MARGIN_MM = 0.5
+
+
+class GrblStage:
+    """A stage, open from construction on; a context manager that leaves the laser off. Not safe between threads.
+
+    Parameters
+    ----------
+    port : str
+        Serial port, such as /dev/ttyACM0.
+    baud : int
+        Grbl 1.1 speaks 115200.
+    boot_s : float
+        How long a controller that restarts when the port is opened may take.
+
+    Attributes
+    ----------
+    settings : GrblSettings
+        What ``$$`` says.
+    version : str
+        Grbl's version.
+    limits_mm : tuple
+        Lowest and highest position.
+
+    Raises
+    ------
+    HardwareError
+        The port cannot be opened, nothing answers, or not a Grbl 1.1 that can do this.
+    """
+
+    def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
+        self._line = GrblLine(port, baud=baud, boot_s=boot_s)
+        self._power, self._held = 0.0, False
+        try:
+            self.port, self.version = port, self._line.version
+            answers = self._line.command("$$")
+            self.settings: GrblSettings = parse_settings({a.number: a.value for a in answers if isinstance(a, Setting)})
+            self._read_options()
+            # Locked at the start: homing is enabled and has not been done. A board whose reset is disabled keeps it.
+            self._position_known = self._line.status().state != "Alarm"
+        except BaseException as error:
+            self._line.close(error)
+            raise
+
+    def _read_options(self) -> None:
+        texts = [answer.text for answer in self._line.command("$I") if isinstance(answer, Message)]
+        options = next((text.removeprefix("OPT:").split(",")[0] for text in texts if text.startswith("OPT:")), "")
+        if "V" not in options:
+            raise HardwareError(
+                f"this Grbl's options are {options!r}, without V: the laser needs a firmware with variable spindle"
+            )
+        travel = self.settings.travel_mm
+        zero_at_switch = "Z" in options
+        self._origin_mm = 0.0 if not self.settings.homing or (zero_at_switch and self._switch_is_low()) else -travel
+        self.limits_mm = (0.0, travel) if self.settings.homing else (-travel, travel)
+
+    def _switch_is_low(self) -> bool:
+        return self.settings.homes_to_negative
+
+    @property
+    def position_known(self) -> bool:
+        """Whether the stage may move: it is homed or unlocked, and no fault came since."""
+        return self._position_known and self._line.fault is None
+
+    @property
+    def laser_power(self) -> float:
+        """Power that the laser was last told, 0 when off."""
+        return 0.0 if self._line.fault else self._power
+
+    def home(self) -> float:
+        """Find the limit switch and return the position read back in mm; ends a fault. The laser goes off.
+
+        Raises
+        ------
+        HardwareError
+            Homing is disabled, fails, or takes too long; or another fault.
+        """
+        settings = self.settings
+        if not settings.homing:
+            raise HardwareError("homing is disabled ($22=0): wire the limit switch and send $22=1, or use unlock")
+        self._recover()
+        if self._power:
+            self.laser(False)
+        seek, feed, pull_off = (
+            settings.homing_seek_mm_per_min / 60, settings.homing_feed_mm_per_min / 60, settings.homing_pull_off_mm,
+        )  # fmt: skip
+        # Grbl seeks over 1.5 times the travel and then, twice the pull-off at the seek rate, 5 times it at the feed.
+        longest_s = (1.5 * settings.travel_mm + 2 * pull_off) / seek + 5 * pull_off / feed
+        longest_s += 4 * (settings.homing_debounce_ms / 1000 + seek / settings.acceleration_mm_per_s2)
+        self._position_known = False
+        # No status queries: Grbl does not answer them while it homes.
+        self._line.command("$H", timeout_s=_MARGIN * longest_s + _MARGIN_S)
+        self._position_known = True
+        return self.position_mm()
+
+    def unlock(self) -> float:
+        """End an alarm, a hold or a fault, taking the controller's position for true, and return that in mm.
+
+        Right where nothing moved (noise on the line at rest, a soft limit) or where there is no limit switch.
+        """
+        self._recover()
+        self._line.command("$X")
+        self._position_known = True
+        return self.position_mm()
+
+    def _recover(self) -> None:
+        if self._line.fault is None and not self._held:
+            return
+        self._position_known = self._position_known and self._line.fault is None
+        self._power, self._held = 0.0, False
+        self._line.restart()
+        # A reset that met a movement leaves an alarm behind.
+        self._position_known = self._position_known and self._line.status().state != "Alarm"
+
+    def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
+        """Move, wait until the stage rests, and return the position read back in mm.
+
+        Raises
+        ------
+        RangeError
+            The target lies outside the travel, or the feed outside what the stage can do. Nothing has moved.
+        HardwareError
+            The position is not known, or a fault: alarm, stall, hold, lost steps, restart, silence, noise, lost line.
+        """
+        self._refuse_outside(position_mm, feed_mm_per_min)
+        if self._held:
+            raise HardwareError("the stage is held since it was stopped: unlock or home it")
+        if not self._position_known and self._line.fault is None:
+            raise HardwareError("the stage does not know where it is: home it first")
+        start_mm = self.position_mm()
+        feed_mm_s = feed_mm_per_min / 60
+        # Distance at full speed plus a ramp up and one down: never less than the real time, however short the way.
+        expected_s = abs(position_mm - start_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
+        self._line.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
+        watch = _MotionWatch(self, start_mm, feed_mm_s)
+        # A dwell is acknowledged when all movements before it are done.
+        self._line.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
+        reached_mm = self._rest()
+        missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
+        if abs(missing) > 1:
+            raise self._failed(
+                f"missed steps: {reached_mm:.3f} mm read back where {position_mm:.3f} mm was asked for, {missing:+d} "
+                "steps; a command or pulses were lost: check the wiring for interference, then home"
+            )
+        return reached_mm
+
+    def _refuse_outside(self, position_mm: float, feed_mm_per_min: float) -> None:
+        low, high = self.limits_mm
+        if not low <= position_mm <= high:
+            raise RangeError(f"{position_mm:g} mm is outside the stage's travel of {low:g} to {high:g} mm")
+        fastest = self.settings.max_feed_mm_per_min
+        if not 0 < feed_mm_per_min <= fastest:
+            raise RangeError(f"the feed {feed_mm_per_min:g} mm/min is not above 0 and up to {fastest:g} mm/min ($110)")
+
+    def _rest(self) -> float:
+        """Wait until the controller says Idle and return the position."""
+        deadline = time.monotonic() + _MARGIN_S
+        while (report := self._line.status()).state != "Idle":
+            self._refuse_stop(report)
+            if time.monotonic() > deadline:
+                raise self._failed(f"the controller is in the state {report.state} although its movements are done")
+            time.sleep(POLL_S / 5)
+        return self._position_of(report)
+
+    def position_mm(self) -> float:
+        """Position in mm as the controller counts it."""
+        return self._position_of(self._line.status())
+
+    def _position_of(self, report: Status) -> float:
+        for _ in range(_REPORTS_TO_OFFSET):
+            machine_mm = report.machine_mm
+            if machine_mm is None and self._line.offset_mm is not None:
+                machine_mm = report.work_mm + self._line.offset_mm
+            if machine_mm is not None:
+                # The report is rounded to 1 um; what the controller counts is steps.
+                return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
+            report = self._line.status()
+        raise self._failed("work positions without their offset (WCO) are reported: send $10=1")
+
+    def _refuse_stop(self, report: Status) -> None:
+        """Raise for a state in which a movement will not end, and for a switch pressed where it should not be."""
+        advice = {
+            "Hold": "feed hold: its button was pressed, or noise on the line or on A1 was taken for it; home or unlock",
+            "Door": "the safety door is open: close it, then home or unlock",
+            "Alarm": "locked by an alarm: home",
+            "Sleep": "asleep: home", "Check": "in check mode, in which nothing moves: send $C", "Jog": "jogging",
+        }  # fmt: skip
+        if report.state in advice:
+            raise self._failed(f"the controller has stopped: {advice[report.state]}")
+        self._refuse_pressed_switch(report)
+
+    def _refuse_pressed_switch(self, report: Status) -> None:
+        if not self.settings.homing or "X" not in report.pins:
+            return
+        position_mm = self._position_of(report)
+        switch_mm = 0.0 if self._switch_is_low() else self.settings.travel_mm
+        if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
+            raise self._failed(
+                f"missed steps: the limit switch at {switch_mm:g} mm is pressed where {position_mm:.3f} mm is counted: "
+                "the motor lost steps (feed or acceleration too high, or something is in the way); home"
+            )
+
+    def laser(self, on: bool, *, power: float = 1.0) -> None:
+        """Switch the laser at once and see that the controller says so.
+
+        Whether light comes out only the camera can tell. Below full power the pin is pulsed at some kHz.
+
+        Parameters
+        ----------
+        power : float
+            0 < power <= 1, the share of the time in which the pin is on.
+
+        Raises
+        ------
+        RangeError
+            The power is outside its range.
+        HardwareError
+            The controller is locked or does not follow, the guard process is gone, or another fault.
+        """
+        if not 0 < power <= 1:
+            raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
+        if not on:
+            # A fault has told it to go off already.
+            if self._line.fault is not None:
+                return
+            self._line.command("M5")
+            self._power = 0.0
+            self._see_spindle(0.0)
+            return
+        if not self._line.guarded:
+            raise self._failed("the process that switches the laser off after a crash is gone; open the stage again")
+        speed = max(1, round(power * self.settings.spindle_max))
+        # In laser mode ($32=1) the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
+        self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
+        self._power = power
+        self._line.command(f"M3S{speed}")
+        self._see_spindle(float(speed))
+
+    def _see_spindle(self, expected: float) -> None:
+        report = self._line.status()
+        if report.spindle is not None and abs(report.spindle - expected) > 1:
+            raise self._failed(
+                f"the laser's pin does not follow: S{report.spindle:g} is reported where S{expected:g} was sent "
+                f"(state {report.state}): a hold, an override of the spindle, or $31 above it"
+            )
+
+    def stop(self, *, reset: bool = False) -> float:
+        """Brake to a rest by a feed hold and return the position in mm.
+
+        Without ``reset`` the controller stays held until `unlock` or `home`, and the laser stays as it is unless $32=1,
+        with which Grbl switches it off. With ``reset`` the laser goes off and the stage can move again. The position
+        is kept, because nothing moves at the reset.
+        """
+        self._line.realtime(FEED_HOLD)
+        braking_s = self.settings.max_feed_mm_per_min / 60 / self.settings.acceleration_mm_per_s2
+        deadline = time.monotonic() + _MARGIN * braking_s + _MARGIN_S
+        # Hold:1 brakes, Hold:0 has come to rest.
+        while (report := self._line.status()).state in ("Run", "Hold", "Jog") and report.substate != 0:
+            if time.monotonic() > deadline:
+                raise self._failed(f"the stage does not stop on a feed hold, its state is {report.state}")
+            time.sleep(POLL_S / 5)
+        self._held = True
+        if reset:
+            self._recover()
+        return self.position_mm()
+
+    def close(self, error: BaseException | None = None) -> None:
+        """Switch the laser off and close the port; HardwareError where the controller does not confirm."""
+        self._line.close(error)
+
+    def _failed(self, what: str) -> HardwareError:
+        return self._line.failed(what)
+
+    def __enter__(self) -> "GrblStage":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(error)
+
+
+class _MotionWatch:
+    """Looks at the status reports of a movement for a stall and for states in which it will not end."""
+
+    def __init__(self, stage: GrblStage, start_mm: float, feed_mm_s: float):
+        self._stage, self._last_mm, self._since = stage, start_mm, time.monotonic()
+        self._patience_s = _STALL_S + _STALL_STEPS * stage.settings.step_mm / feed_mm_s
+
+    def __call__(self, report: Status) -> None:
+        self._stage._refuse_stop(report)
+        position_mm, now = self._stage._position_of(report), time.monotonic()
+        if report.state != "Run" or not math.isclose(position_mm, self._last_mm, abs_tol=1e-9):
+            self._last_mm, self._since = position_mm, now
+        elif now - self._since > self._patience_s:
+            raise self._stage._failed(
+                f"stall: the stage has stood at {position_mm:.3f} mm for {now - self._since:.1f} s although the "
+                "controller says it runs: restart the controller, then home"
+            )

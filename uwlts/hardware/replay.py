@@ -1,0 +1,159 @@
+"""A folder of images or a capture, shown like a camera: at a frame rate of its own, or one image for each trigger."""
+
+import re
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from uwlts.capture import Capture
+from uwlts.errors import HardwareError, ImageError
+from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+
+_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+# Frames that may wait to be fetched, as in the buffers of a camera's driver; later ones are lost.
+_BUFFERS = 32
+
+
+class ReplayCamera(Camera):
+    """Images in the order of their names, numbers in them counting as numbers, or of a capture.
+
+    A free-running replay without a frame rate shows an image whenever one is asked for. With one it does not wait for a
+    program that is too slow: what no longer fits into its buffers is dropped, as by a real camera. Exposures are those
+    of the capture; of a folder's images nobody knows it, so the one that is configured counts.
+
+    Parameters
+    ----------
+    path
+        Folder or capture.
+    repeat
+        Begin again after the last image; without it grabbing more is a HardwareError.
+    """
+
+    def __init__(self, path: str | Path, *, repeat: bool = False, address: str | None = None):
+        super().__init__(address or f"replay:{path}")
+        self._path = Path(path)
+        self._repeat = repeat
+        self._files: list[Path] = []
+        self._capture: Capture | None = None
+        self._shown = 0
+        self._due = 0
+        self._began_s = 0.0
+        self._triggers = 0
+
+    def _open(self) -> CameraInfo:
+        self._shown = 0
+        if self._path.is_dir():
+            self._files = sorted(
+                (path for path in self._path.iterdir() if path.suffix.lower() in _SUFFIXES), key=_natural
+            )
+            if not self._files:
+                raise HardwareError(f"the folder {self._path} holds no image ({', '.join(_SUFFIXES)})")
+            first = _read(self._files[0])
+            (height, width), bits = first.shape, 8 * first.itemsize
+        elif self._path.is_file():
+            self._capture = Capture(self._path)
+            if len(self._capture) == 0:
+                self._close()
+                raise HardwareError(f"the capture {self._path} holds no frame")
+            sensor = self._capture.header.sensor
+            height, width, bits = sensor.camera.height_px, sensor.camera.width_px, sensor.detector.bits
+        else:
+            raise HardwareError(f"there is no folder of images and no capture at {self._path}")
+        return CameraInfo(f"replay of {self._path.name}", self._path.name, width, height, bits)
+
+    def _close(self) -> None:
+        capture, self._capture, self._files = self._capture, None, []
+        if capture is not None:
+            capture.close()
+
+    def _configure(self, wishes: Wishes) -> CameraSettings:
+        info = self.info
+        if wishes.trigger == "line":
+            raise HardwareError(f"{self.address} has no trigger input: use trigger 'free' or 'software'")
+        if wishes.bits not in (None, info.bits):
+            raise HardwareError(f"{self.address} has images of {info.bits} bits, not {wishes.bits}")
+        if wishes.gain_db is not None:
+            raise HardwareError(f"{self.address} has no gain: its images are what they are")
+        exposure_ms = wishes.exposure_ms if self._capture is None else float(self._capture.exposure_ms[0])
+        rate = wishes.frame_rate_hz if wishes.trigger == "free" else None
+        region = wishes.region or Region(0, 0, info.width_px, info.height_px)
+        return CameraSettings(exposure_ms, None, region, info.bits, wishes.trigger, rate)
+
+    def _start(self) -> None:
+        self._began_s, self._due, self._triggers = time.monotonic(), 0, 0
+
+    def _stop(self) -> None:
+        self._triggers = 0
+
+    def _trigger(self) -> None:
+        self._triggers = 1
+
+    def _next(self, timeout_s: float) -> Delivered | None:
+        stamp_s = time.monotonic()
+        if self.settings.trigger == "software":
+            if not self._triggers:
+                time.sleep(timeout_s)
+                return None
+            self._triggers = 0
+        elif self.settings.frame_rate_hz is not None:
+            stamp_s = self._wait_for_frame(timeout_s, 1 / self.settings.frame_rate_hz)
+            if stamp_s is None:
+                return None
+        index, self._shown = self._shown, self._shown + 1
+        return self._deliver(index, stamp_s)
+
+    def _wait_for_frame(self, timeout_s: float, period_s: float) -> float | None:
+        """Time of the next frame once it has come; None if it does not come in time."""
+        now_s = time.monotonic()
+        lost = int((now_s - self._began_s) / period_s) - self._due - _BUFFERS
+        if lost > 0:
+            self._due, self._shown = self._due + lost, self._shown + lost
+        stamp_s = self._began_s + self._due * period_s
+        if stamp_s - now_s > timeout_s:
+            time.sleep(timeout_s)
+            return None
+        time.sleep(max(stamp_s - now_s, 0.0))
+        self._due += 1
+        return stamp_s
+
+    def _deliver(self, index: int, stamp_s: float) -> Delivered:
+        count = len(self._files) if self._capture is None else len(self._capture)
+        if index >= count and not self._repeat:
+            raise HardwareError(f"all {count} images of {self._path} have been shown")
+        image, exposure_ms = self._image(index % count)
+        info, region = self.info, self.settings.region
+        if image.shape != (info.height_px, info.width_px) or image.dtype.itemsize != (1 if info.bits == 8 else 2):
+            raise ImageError(
+                f"image {index % count} of {self._path} has {image.shape[1]} x {image.shape[0]} px of {image.dtype}, "
+                f"the first one {info.width_px} x {info.height_px} px of {info.bits} bits: give one camera's images"
+            )
+        part = image[region.y_px : region.y_px + region.height_px, region.x_px : region.x_px + region.width_px]
+        return Delivered(np.ascontiguousarray(part), index + 1, stamp_s, exposure_ms)
+
+    def _image(self, index: int) -> tuple[np.ndarray, float | None]:
+        if self._capture is None:
+            return _read(self._files[index]), None
+        return self._capture.image(index), float(self._capture.exposure_ms[index])
+
+    def _answers(self) -> None:
+        """Files are always there, or tell when they are read."""
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sorts image-9 before image-10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _read(path: Path) -> np.ndarray:
+    """A grey image (H, W) of uint8 or uint16; ImageError for anything else."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ImageError(f"{path} cannot be read: it is truncated, or no image")
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise ImageError(
+            f"{path} is {image.dtype} of shape {image.shape}, expected a grey image of 8 or 16 bit: "
+            "`uwlts import` takes colour images, and makes a capture of them that can be shown"
+        )
+    return image
