@@ -180,6 +180,17 @@ def studies() -> list[Row]:
     ]
 
 
+def hardware() -> list[Row]:
+    """Frames per second from a camera to the disk."""
+    from tests.bench_recording import RATE_HZ, TAKEN, recording
+
+    rate, lost = recording()
+    return [
+        at_least(f"camera to disk, {TAKEN} frames at {RATE_HZ:g}/s", rate, "frames/s", 0.99 * RATE_HZ),
+        at_most("the same: lost", lost, "frames", 0),
+    ]
+
+
 def demo() -> list[Row]:
     """Duration and peak memory of the demo, in a folder of its own."""
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
@@ -199,7 +210,7 @@ def main() -> int:
     if (count := len(os.sched_getaffinity(0))) > CORES:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
         print(f"{count} cores found, measuring on {CORES}")
-    rows = [*demo(), *reproduction(), *rendering(), *light(), *pipeline(), *studies()]
+    rows = [*demo(), *reproduction(), *rendering(), *light(), *pipeline(), *studies(), *hardware()]
     table = Table("what", "value", "limit", "unit", "")
     for row in rows:
         table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:.4g}", row.unit, "ok" if row.ok else "MISSED")

@@ -42,7 +42,7 @@ def run(app: App) -> int:
         print(f"error: {error}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
-        print("interrupted; what is complete is kept: run it again, twin simulate with --resume", file=sys.stderr)
+        print("interrupted; what is complete is kept: run it again, recordings with --resume", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         # The reader has seen enough; what is left unwritten must not be tried again when Python ends.
