@@ -1,6 +1,7 @@
 """The ``uwlts`` command: the sensor's software, from captures to judged point clouds."""
 
 import sys
+import threading
 import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
@@ -167,6 +168,40 @@ def scan(
         print(f"warning: {warning}", file=sys.stderr)
     exposures = ", ".join(f"{light} {value:.3g} ms" for light, value in seen.exposure_ms.items())
     print(f"wrote {out}, {seen.found} of {seen.lines} profile lines with a stripe; exposure {exposures or 'as before'}")
+
+
+@app.command
+def watch(capture: Path, *, calibration: Path | None = None, host: str = "127.0.0.1", port: int = 8080) -> None:
+    """Show a recording while it grows, in a browser: the latest image with its stripe, and the cloud so far.
+
+    Example: uwlts watch scan.h5 --calibration calibration.json
+
+    Parameters
+    ----------
+    capture
+        Capture that is being recorded, or is to be.
+    calibration
+        Calibration of the sensor, or one by polynomials, for the cloud.
+    host
+        Address at which the page is served; the usual one can be reached from this machine only.
+    port
+        Port of the page; the next free one is taken where it is in use.
+    """
+    from uwlts.calibration.polynomial_model import read_any_calibration
+    from uwlts.live_view import LiveView
+    from uwlts.live_view import watch as show
+
+    known = read_any_calibration(calibration) if calibration else None
+    view = LiveView(capture.name, host=host, port=port)
+    try:
+        print(f"open {view.address}; Ctrl-C ends it", flush=True)
+        images = show(capture, view, known)
+        print(f"{capture} is finished with {images} images; the page stays until Ctrl-C", flush=True)
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("closed")
+    finally:
+        view.close()
 
 
 @app.command
