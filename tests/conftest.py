@@ -1,5 +1,7 @@
 """Chooses Mitsuba's variant before any test module imports the renderer, and loads the sensor most tests start from."""
 
+import signal
+
 import pytest
 
 from twin.variant import use_variant
@@ -7,6 +9,9 @@ from uwlts.library import load_sensor
 from uwlts.sensor import Sensor
 
 use_variant()
+
+# A shell starts what runs in its background with SIGINT ignored, and children inherit that: here Ctrl-C is tested.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

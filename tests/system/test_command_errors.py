@@ -651,12 +651,8 @@ def test_interrupted_simulation_is_kept_and_resumed(command, folder: Path, tmp_p
     quick = ["--without", "multiple-scattering", "secondary-light", "haze"]
     options = ["--sensor", str(folder / "sensor.toml"), "--spp", "2", "--seed", "5", *quick, "--out"]
     path = tmp_path / "a.h5"
-    # A shell that runs the tests in the background makes all its children ignore Ctrl-C; the program must not.
-    program = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import twin.cli; twin.cli.main()"
-    )
     process = subprocess.Popen(
-        [sys.executable, "-c", program, "simulate", str(scene), *options, str(path)],
+        [sys.executable, "-m", "twin.cli", "simulate", str(scene), *options, str(path)],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
     )  # fmt: skip
     part, frames = part_path(path), 0

@@ -332,11 +332,9 @@ def test_a_take_that_fails_is_named(reproduce, described: Path, tmp_path: Path):
 @pytest.mark.parametrize("all_of_them", [True, False], ids=["terminal", "command"])
 def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: Path, all_of_them: bool):
     """Ctrl-C on the terminal reaches all processes, a signal from elsewhere the command alone."""
-    # A shell that runs the tests in the background makes all its children ignore Ctrl-C; the program must not.
-    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import twin.cli as c; c.main()"
     options = ["--out", tmp_path / "runs", "--campaigns", 1, "--spp", 1, "--workers", 2]
     command = subprocess.Popen(
-        [sys.executable, "-c", program, "reproduce", described / "many.toml", *map(str, options)], env=ENVIRONMENT,
+        [sys.executable, "-m", "twin.cli", "reproduce", described / "many.toml", *map(str, options)], env=ENVIRONMENT,
         start_new_session=True, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     parts = [tmp_path / "runs" / "campaign-0" / f"{name}.h5.part" for name in ("first", "second")]
