@@ -110,6 +110,8 @@ def scan(
     stage: str | None = None,
     home: Flag = False,
     unlock: Flag = False,
+    watch: Flag = False,
+    calibration: Path | None = None,
     resume: Flag = False,
     overwrite: Flag = False,
 ) -> None:
@@ -134,13 +136,21 @@ def scan(
         Find the limit switch first.
     unlock
         Take the stage's position as it is, without homing.
+    watch
+        Show the recording in a browser meanwhile, as uwlts watch does.
+    calibration
+        Watched: calibration of the sensor, or one by polynomials, for the cloud.
     resume
         Go on with an interrupted scan.
     overwrite
         Replace an existing capture.
     """
+    from contextlib import ExitStack
+
+    from uwlts.calibration.polynomial_model import read_any_calibration
     from uwlts.hardware.camera import open_camera
     from uwlts.hardware.grbl import GrblStage
+    from uwlts.hardware.page_beside import PageBeside
     from uwlts.hardware.scan_plan import load_plan
     from uwlts.hardware.scanning import Seen, plan_text, record_scan
 
@@ -151,8 +161,19 @@ def scan(
         raise DescriptionError(f"neither the plan nor the command line tells the {what}: give --{what}")
     if not resume:
         refuse_unsuitable(out, overwrite=overwrite)
-    print(plan_text(described))
-    with GrblStage(port) as moved, open_camera(address) as opened, progress_bar(described.title) as progress:
+    if calibration:
+        if not watch:
+            raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
+        read_any_calibration(calibration)
+    print(plan_text(described), flush=True)
+    with ExitStack() as stack:
+        page = None
+        if watch:
+            page = stack.enter_context(
+                PageBeside(out, calibration=calibration, say=lambda line: print(line, flush=True))
+            )
+        progress = stack.enter_context(progress_bar(described.title))
+        moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
         if home:
             moved.home()
         elif unlock:
@@ -160,12 +181,14 @@ def scan(
 
         def report(done: int, total: int, seen: Seen) -> None:
             progress(done, total)
+            if page:
+                page.start()
 
         seen = record_scan(
-            described, out, camera=opened, stage=moved, overwrite=overwrite, resume=resume, progress=report
+            described, out, camera=opened, stage=moved, overwrite=overwrite, resume=resume, progress=report, warn=_warn
         )
     for warning in seen.warnings():
-        print(f"warning: {warning}", file=sys.stderr)
+        _warn(warning)
     exposures = ", ".join(f"{light} {value:.3g} ms" for light, value in seen.exposure_ms.items())
     print(f"wrote {out}, {seen.found} of {seen.lines} profile lines with a stripe; exposure {exposures or 'as before'}")
 
@@ -207,47 +230,75 @@ def watch(capture: Path, *, calibration: Path | None = None, host: str = "127.0.
 @app.command
 def calibrate(
     *,
-    air: Files,
+    air: Files = (),
+    water: Files = (),
     step: Files = (),
+    joint: Flag = False,
+    live: Path | None = None,
     out: Path,
     refractions: Literal[1, 2] = 2,
     poses: Literal["stage-normal", "stage", "free"] = "stage-normal",
     distortion: Coefficients = ("k1", "k2"),
     index: float | None = None,
     method: Method | None = None,
+    camera: str | None = None,
+    stage: str | None = None,
+    port: int = 8080,
+    resume: Flag = False,
     overwrite: Flag = False,
 ) -> None:
-    """Calibrate camera and sheet from target images in air, and the window's distance from step images in water.
+    """Calibrate camera, window and sheet from images of a target in air or in water, and of a step standard in water.
+
+    From a target in air and steps it goes by turns: camera and sheet first, then the window's distance. With a target
+    in water, or with --joint, all is estimated together (docs/joint-calibration.md).
 
     Example: uwlts calibrate --air target.h5 --step step-near.h5 step-far.h5 --out calibration.json
+
+    Example: uwlts calibrate --water target-water.h5 --out calibration.json
 
     Parameters
     ----------
     air
         Captures of the target in air: at every stage position one image under the lamp and one with the laser. All
         taken in the medium of use, and without steps, they give a calibration of a single viewpoint for that medium.
+    water
+        The same in the medium of use, seen through the window, whose distance is found with all else.
     step
-        Captures of the step standard in the medium of use; without them the calibration is for air only.
+        Captures of the step standard in the medium of use; without any in it the calibration is for air only.
+    joint
+        Estimate all together; what is known before and how well is the sensor's description's.
+    live
+        Plan (TOML, docs/calibrate-live.md) of a guided calibration with camera and stage, in place of captures: leads
+        through the images, refuses bad ones with the reason, and records the good ones beside the calibration.
     out
         Calibration file to write.
     refractions
         2: glass plate of known thickness, air images taken without the window. 1: one interface, air images taken
-        through the window.
+        through the window. Jointly, the captures tell what they were taken through.
     poses
         stage-normal: one plate pose, moved by the stage along the plate's normal (the thesis). stage: the same with a
-        free direction. free: every image has a pose of its own.
+        free direction, as always jointly. free: every image has a pose of its own.
     distortion
         Distortion coefficients to estimate; the others stay 0.
     index
         Refractive index of the medium, in place of the one that follows from the captures.
     method
         How the stripe's centre is found.
+    camera
+        Guided: address of the camera, in place of the plan's.
+    stage
+        Guided: serial port of the stage, in place of the plan's.
+    port
+        Guided: port of the page for the browser; the next free one is taken where it is in use.
+    resume
+        Guided: go on with what is recorded.
     overwrite
-        Replace an existing file.
+        Replace an existing file; guided, and without resume, its captures too.
     """
     from contextlib import ExitStack
 
     from uwlts.calibration.intrinsics import CameraOptions
+    from uwlts.calibration.joint.procedure import calibrate_jointly
     from uwlts.calibration.model import write_calibration
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.calibration.procedure import calibrate as solve
@@ -259,6 +310,15 @@ def calibrate(
     if index is not None:
         require_index(index)
     refuse_unsuitable(out, overwrite=overwrite)
+    if live is not None:
+        if air or water or step:
+            raise DescriptionError("--live records its own captures: give either it, or --air, --water and --step")
+        air, water, step, poses = _led_through(
+            live, out, camera=camera, stage=stage, port=port, resume=resume, overwrite=overwrite and not resume,
+            refractions=refractions, distortion=distortion,
+        )  # fmt: skip
+    elif not (air or water):
+        raise DescriptionError("nothing to calibrate from: give --air or --water with captures of a target, or --live")
     options = CalibrationOptions(
         refractions=refractions, poses=poses, camera=CameraOptions(distortion=distortion), medium_index=index,
         stripe=StripeOptions(method=method) if method else StripeOptions(),
@@ -266,8 +326,15 @@ def calibrate(
     with ExitStack() as stack, progress_bar("calibrating") as progress:
         air_captures = [stack.enter_context(Capture(path)) for path in air]
         step_captures = [stack.enter_context(Capture(path)) for path in step]
-        result = solve(
-            air_captures, step_captures, options=options, progress=lambda stage, done, total: progress(done, total)
+        water_captures = [stack.enter_context(Capture(path)) for path in water]
+
+        def report(stage: str, done: int, total: int) -> None:
+            progress(done, total)
+
+        result = (
+            calibrate_jointly([*air_captures, *water_captures], step_captures, options=options, progress=report)
+            if water or joint
+            else solve(air_captures, step_captures, options=options, progress=report)
         )
     write_calibration(out, result.calibration, overwrite=overwrite)
     print("\n".join(calibration_lines(result.calibration)))
@@ -612,6 +679,47 @@ def doctor(*, folder: Path = Path(), camera: str | None = None, stage: str | Non
     print_findings(findings)
     if any(each.status == "missing" for each in findings):
         sys.exit(1)
+
+
+def _led_through(
+    live: Path,
+    out: Path,
+    *,
+    camera: str | None,
+    stage: str | None,
+    port: int,
+    resume: bool,
+    overwrite: bool,
+    refractions: Literal[1, 2],
+    distortion: tuple[str, ...],
+) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[Path, ...], Literal["stage-normal", "stage", "free"]]:
+    """Record a guided calibration: captures of the target in air or in water, of steps, and how the poses are tied."""
+    from uwlts.calibration.intrinsics import CameraOptions
+    from uwlts.hardware.guided.operator import Operator
+    from uwlts.hardware.guided.page import GuidedPage
+    from uwlts.hardware.guided.plan import load_guided_plan
+    from uwlts.hardware.guided.recording import record_guided
+
+    plan = load_guided_plan(live).connected(camera=camera, port=stage)
+    page = GuidedPage(plan.title, port=port)
+    try:
+        print(f"open {page.address}; Ctrl-C ends it, what was accepted is kept", flush=True)
+        operator = Operator(lambda line: print(line, flush=True), button=page.pressed)
+        recording = record_guided(
+            plan, out, page=page, operator=operator, resume=resume, overwrite=overwrite, refractions=refractions,
+            camera=CameraOptions(distortion=distortion),
+        )  # fmt: skip
+    finally:
+        page.close()
+    for line in recording.missing:
+        _warn(f"still missing: {line}; --resume takes more images")
+    step = () if recording.step is None else (recording.step,)
+    target = (recording.target,)
+    return (target, (), step, plan.poses) if plan.target_in_air() else ((), target, step, plan.poses)
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
 def _read_toml(path: Path) -> dict[str, object]:

@@ -138,7 +138,21 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         value = calibration.residuals.get(step, {}).get(name)
         if value is not None:
             lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
-    return lines
+    return lines + _joint_lines(calibration.residuals.get("joint", {}))
+
+
+def _joint_lines(joint: dict[str, Any]) -> list[str]:
+    """Parameters of a joint estimate with their standard uncertainties, before and after."""
+    if not joint:
+        return []
+    lines = ["joint estimate, with standard uncertainties after and before:"]
+    for name, value, std, before in zip(*(joint[key] for key in ("parameters", "values", "std", "std_before")),
+                                        strict=True):  # fmt: skip
+        lines.append(
+            f"  {name.replace('_', ' ')}: {value:.6g} ± {std:.2g}" + (f" ({before:.2g})" if before is not None else "")
+        )
+    scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint["scatter_px"].items())
+    return [*lines, f"scatter: {scatter}; {joint['strays']} of {joint['residuals']} residuals left out"]
 
 
 def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:

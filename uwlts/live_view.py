@@ -12,15 +12,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import viser
 
 from uwlts.capture import Capture, part_path
 from uwlts.errors import CaptureError
+from uwlts.live_page import LivePage, small_picture
 from uwlts.scan import AnyCalibration, FoundStripes, reconstruct_stripes
 from uwlts.stripe import extract_stripe
 
 _LOOK_S = 0.25
-_LONGEST_SIDE_PX = 900
+_PACE = 20
 _STRIPE_COLOUR = (255, 60, 40)
 _FAINT, _MANY = 0.1, 0.05
 """A laser image is faint below this part of the full scale, saturated with more than this part of its lines there."""
@@ -30,7 +30,8 @@ _FAINT, _MANY = 0.1, 0.05
 class Seen:
     """One image of a recording: its number, position in mm, light, picture (H, W, 3), stripe, and points (N, 3) in mm.
 
-    ``found`` tells the profile lines with a stripe, of ``lines``; ``remarks`` what should be seen to.
+    ``found`` tells the profile lines with a stripe, of ``lines``; ``remarks`` what should be seen to. ``planned`` is
+    how many images there will be, where that is known, and ``left_s`` the time they take.
     """
 
     number: int
@@ -41,6 +42,8 @@ class Seen:
     lines: int
     points_mm: np.ndarray
     remarks: tuple[str, ...]
+    planned: int | None = None
+    left_s: float | None = None
 
 
 def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> Seen:
@@ -53,9 +56,10 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
     """
     frame = capture.frame(number)
     along = capture.header.sensor.camera.stripe_along
-    none = np.zeros((0, 3))
+    none, outlook = np.zeros((0, 3)), _outlook(capture, number)
     if not frame.laser_on:
-        return Seen(number, frame.stage_mm, False, _picture(frame.image, capture, None), 0, 0, none, ())
+        picture = _picture(frame.image, capture, None)
+        return Seen(number, frame.stage_mm, False, picture, 0, 0, none, (), **outlook)
     stripe = extract_stripe(frame.image, stripe_along=along, saturation=capture.header.saturation_dn)
     line = stripe.lines
     points = none
@@ -72,20 +76,29 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
     if len(line) < 0.05 * len(stripe.status):
         remarks.append("hardly any stripe: is the object in the volume?")
     picture = _picture(frame.image, capture, (line, stripe.centre_px[line]))
-    return Seen(number, frame.stage_mm, True, picture, len(line), len(stripe.status), points, tuple(remarks))
+    return Seen(number, frame.stage_mm, True, picture, len(line), len(stripe.status), points, tuple(remarks), **outlook)
+
+
+def _outlook(capture: Capture, number: int) -> dict[str, float | int]:
+    """How many images a recording will have, and the time in s that is left, by the pace of the latest ones."""
+    planned = capture.header.provenance.get("images")
+    if not isinstance(planned, int) or planned <= number:
+        return {}
+    first = max(number - _PACE, 0)
+    if first == number:
+        return {"planned": planned}
+    pace_s = (capture.time_s[number] - capture.time_s[first]) / (number - first)
+    return {"planned": planned, "left_s": float(pace_s * (planned - number - 1))}
 
 
 def _picture(image: np.ndarray, capture: Capture, stripe: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
     """The image (H, W, 3), uint8, dark parts raised, the stripe's centres marked; small enough to be sent often."""
-    share = np.sqrt(image.astype(np.float32) / capture.header.saturation_dn)
-    grey = np.minimum(255 * share, 255).astype(np.uint8)
-    scale = min(1.0, _LONGEST_SIDE_PX / max(grey.shape))
-    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
-    picture = cv2.cvtColor(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2RGB)
+    picture, scale = small_picture(image, full_dn=capture.header.saturation_dn)
     if stripe is not None:
         line, centre = ((scale * values).astype(int) for values in stripe)
         rows, columns = (centre, line) if capture.header.sensor.camera.stripe_along == "width" else (line, centre)
-        picture[np.clip(rows, 0, size[1] - 1), np.clip(columns, 0, size[0] - 1)] = _STRIPE_COLOUR
+        last_row, last_column = picture.shape[0] - 1, picture.shape[1] - 1
+        picture[np.clip(rows, 0, last_row), np.clip(columns, 0, last_column)] = _STRIPE_COLOUR
     return picture
 
 
@@ -117,17 +130,14 @@ def images_of(path: Path, calibration: AnyCalibration | None) -> Iterator[Seen |
         yield None
 
 
-class LiveView:
+class LiveView(LivePage):
     """The page. It can be seen from this machine only, unless another ``host`` is given."""
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 8080):
-        self._server = viser.ViserServer(host=host, port=port, verbose=False)
-        self._server.gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False)
-        self._server.gui.add_markdown(f"# {title}")
-        self._words = self._server.gui.add_markdown("waiting for the first image")
-        self._image = self._server.gui.add_image(np.zeros((2, 2, 3), np.uint8), label="latest image", format="jpeg")
+        super().__init__(title, host=host, port=port)
+        self._words = self.server.gui.add_markdown("waiting for the first image")
+        self._image = self.server.gui.add_image(np.zeros((2, 2, 3), np.uint8), label="latest image", format="jpeg")
         self._found = self._lines = self._points = 0
-        self.address = f"http://{host}:{self._server.get_port()}"
 
     def show(self, seen: Seen) -> None:
         """Show an image, and its profile in the cloud."""
@@ -136,7 +146,7 @@ class LiveView:
         self._points += len(seen.points_mm)
         if len(seen.points_mm):
             depth = seen.points_mm[:, 2]
-            self._server.scene.add_point_cloud(
+            self.server.scene.add_point_cloud(
                 f"/profiles/{seen.number}", seen.points_mm.astype(np.float32), _coloured(depth), point_size=0.4,
                 precision="float32",
             )  # fmt: skip
@@ -145,19 +155,23 @@ class LiveView:
         remarks = "".join(f"\n\n**{remark}**" for remark in seen.remarks)
         light = "laser" if seen.laser_on else "lamp"
         self._words.content = (
-            f"image {seen.number + 1}, {light}, stage at {seen.stage_mm:.3f} mm\n\n"
+            f"image {seen.number + 1}{_of(seen)}, {light}, stage at {seen.stage_mm:.3f} mm\n\n"
             f"stripe on {self._found:,} of {self._lines:,} profile lines; {self._points:,} points{remarks}"
         )
 
     def _look_at(self, middle: np.ndarray) -> None:
         """Put the viewers' camera before the first profile, seen as the sensor sees it."""
-        self._server.initial_camera.position = tuple(middle + np.array([-60.0, 0.0, -250.0]))
-        self._server.initial_camera.look_at = tuple(middle)
-        self._server.initial_camera.up = (1.0, 0.0, 0.0)
+        self.server.initial_camera.position = tuple(middle + np.array([-60.0, 0.0, -250.0]))
+        self.server.initial_camera.look_at = tuple(middle)
+        self.server.initial_camera.up = (1.0, 0.0, 0.0)
 
-    def close(self) -> None:
-        """End the page."""
-        self._server.stop()
+
+def _of(seen: Seen) -> str:
+    """How many images there will be, and when that is."""
+    if seen.planned is None:
+        return ""
+    left = f", {int(seen.left_s) // 60} min {int(seen.left_s) % 60} s left" if seen.left_s else ""
+    return f" of {seen.planned}{left}"
 
 
 def _coloured(depth_mm: np.ndarray) -> np.ndarray:

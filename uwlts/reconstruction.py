@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.model import Calibration, SheetModel
+from uwlts.calibration.model import Calibration
 from uwlts.camera import directions
 from uwlts.errors import RangeError
 from uwlts.refraction import RaysInMedium, RayStatus, trace_window
+from uwlts.sheet_surface import SheetSurface, sheet_surface
 
 # Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
 # angle would meet a sheet 1 mm away after a million kilometres.
@@ -114,7 +115,7 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
     blocks = [
         _crossings(
             trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index),
-            calibration.sheet,
+            sheet_surface(calibration.sheet, medium_index=medium_index),
         )
         for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK))
     ]
@@ -167,19 +168,19 @@ def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> n
     return np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
 
 
-def _crossings(rays: RaysInMedium, sheet: SheetModel) -> SheetPoints:
-    """Crossings of rays in the medium with the sheet's plane (thesis Eq. 3.9).
+def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> SheetPoints:
+    """Crossings of rays in the medium with the sheet (thesis Eq. 3.9 for a plane).
 
     A crossing that is not ahead of the ray is BEHIND if the light passed the sheet between the pupil and the medium,
     that is, if the two lie on different sides of it; otherwise the ray runs away from the sheet.
     """
-    normal = np.array(sheet.normal)
+    normal = sheet.normal
     gap = sheet.offset_mm - rays.origins @ normal
     approach = rays.directions @ normal
     parallel = np.abs(approach) <= _PARALLEL
     if parallel.any():
         approach[parallel] = np.nan
-    length = gap / approach
+    length = gap / approach if sheet.bulge == 0.0 else sheet.crossings(rays.origins.T, rays.directions.T)[0]
     points = (rays.origins.T + length * rays.directions.T).T
     status = rays.status
     if not np.all(length > 0):

@@ -100,7 +100,10 @@ def require_index(index: float) -> None:
 
 def medium_index(capture: Capture, calibration: AnyCalibration) -> float:
     """Refractive index of the capture's medium at the sensor's wavelength, relative to air."""
-    return capture.header.medium.refractive_index(calibration.wavelength_nm)
+    medium = capture.header.medium
+    if isinstance(calibration, PolynomialCalibration):
+        return medium.refractive_index(calibration.wavelength_nm)
+    return calibration.index_of(medium)
 
 
 @dataclass(frozen=True, eq=False)

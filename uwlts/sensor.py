@@ -18,6 +18,9 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Vector = tuple[float, float, float]
 
+_INDEX_FORMULA = 1.5e-5
+"""Error that Quan and Fry (1995) give for their formula of the index of water."""
+
 
 class Description(BaseModel):
     """Base of all descriptions: frozen, unknown keys and non-finite numbers refused."""
@@ -229,6 +232,15 @@ class Medium(Description):
             wavelength_nm=wavelength_nm, temperature_c=self.temperature_c, salinity_g_kg=self.salinity_g_kg
         )
 
+    def index_uncertainty(self, wavelength_nm: float, uncertainty: "Uncertainty") -> float:
+        """Standard uncertainty of the index, from the temperature's where it follows from that."""
+        if self.index is not None or self.kind == "air":
+            return uncertainty.index
+        # The formula ends at 30 degC.
+        here = self.model_copy(update={"temperature_c": min(self.temperature_c, 29.0)})
+        per_kelvin = here.warmer_by(1.0).refractive_index(wavelength_nm) - here.refractive_index(wavelength_nm)
+        return math.hypot(per_kelvin * uncertainty.temperature_k, _INDEX_FORMULA)
+
     def warmer_by(self, kelvin: float) -> "Medium":
         """The same medium at another temperature."""
         return self.model_copy(update={"temperature_c": self.temperature_c + kelvin})
@@ -387,6 +399,31 @@ class Volume(Description):
         return self
 
 
+class Uncertainty(Description):
+    """Standard uncertainties of what drawings, data sheets and certificates say, for the joint calibration.
+
+    Of the windows: distance and tilt of the camera's, thickness and index of its glass, tilt of the laser's against the
+    sheet. ``bow_deg`` is the tilt of the beam into the line optics, ``temperature_k`` that of a medium whose index
+    follows from its temperature, ``index`` that of one whose index is given. Of the stage: each position, the scale of
+    all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
+    its plane when it bends like a dish, and the height of the steps.
+    """
+
+    window_distance_mm: Positive = 5.0
+    window_tilt_deg: Positive = 0.5
+    glass_thickness_mm: Positive = 0.05
+    glass_index: Positive = 1e-3
+    laser_window_tilt_deg: Positive = 0.5
+    bow_deg: Positive = 0.5
+    temperature_k: Positive = 1.0
+    index: Positive = 1e-4
+    stage_position_mm: Positive = 0.005
+    stage_scale: Positive = 1e-4
+    stage_alignment_deg: Positive = 0.5
+    target_bow_mm: Positive = 0.03
+    step_height_mm: Positive = 0.01
+
+
 class Sensor(Description):
     """A complete sensor with the media it is used in. ``more_lasers`` shine further sheets at the same time."""
 
@@ -401,6 +438,7 @@ class Sensor(Description):
     stage: Stage
     volume: Volume
     media: dict[str, Medium]
+    uncertainty: Uncertainty = Uncertainty()
 
     def medium(self, name: str) -> Medium:
         """One of the sensor's media; DescriptionError where it has none of this name."""

@@ -231,37 +231,3 @@ def test_another_camera_than_described_is_refused(served, folder, tmp_path):
     plan.write_text(plan.read_text().replace("sensor.toml", "other.toml"), encoding="utf-8")
     done = run(plan, tmp_path / "scan.h5")
     assert done.returncode == 2 and "96 x 512 px" in done.stderr and "128 x 512" in done.stderr
-
-
-@pytest.mark.parametrize("fault", ["stall", "lose", "mute", "alarm", "camera"])
-def test_faults_end_dark_with_a_message_and_can_be_gone_on_from(served, folder, tmp_path, fault):
-    out = tmp_path / "scan.h5"
-    plan = written(folder, served, top="laser_ms = 0.3", settle_s=0.2)
-    scanning = subprocess.Popen(
-        command(plan, out), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 60
-    while not (part_path(out).exists() and _images(part_path(out)) >= 2):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    controller, camera = served.controller, served.camera
-    {"stall": controller.stall, "lose": lambda: controller.stop_short(200), "mute": controller.mute,
-     "alarm": lambda: controller.alarm(1), "camera": camera.disconnect}[fault]()  # fmt: skip
-    _, said = scanning.communicate(timeout=60)
-    assert scanning.returncode == 2, said
-    assert "error:" in said and "Traceback" not in said
-    controller.mute(False)
-    assert dark(served)
-    kept = _images(part_path(out))
-    assert 2 <= kept < COUNT
-    if fault == "camera":
-        camera.connect()
-    done = run(plan, out, "--resume")
-    assert done.returncode == 0, done.stderr
-    with Capture(out) as scan:
-        assert len(scan) == COUNT
-
-
-def _images(part: Path) -> int:
-    with Capture(part) as capture:
-        return len(capture)

@@ -38,7 +38,7 @@ _NAME_BYTES = 32
 _SERIAL_BYTES = 16
 # Frames are counted in 16 bits, without 0.
 _LAST_NUMBER = 2**16 - 1
-# Of a frame that is cut every tenth packet is lost, but never the first, by which hosts know of it.
+# Of a frame that is cut every tenth packet is lost, at least one, but never the first, by which hosts know of it.
 _CUT_EVERY = 10
 # GLib's number of the type double.
 _DOUBLE_TYPE = 15 << 2
@@ -246,7 +246,8 @@ class GigeCamera:
                 shot.image, time_ns=shot.time_ns, number=self._number, region=region, packet_bytes=packet_bytes & 0xFFFF
             )
             if faults.cut:
-                packets = [packet for index, packet in enumerate(packets) if index % _CUT_EVERY != _CUT_EVERY - 1]
+                lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
+                packets = [packet for index, packet in enumerate(packets) if index not in lost]
             send_paced(self._stream, packets, (socket.inet_ntoa(struct.pack(">I", host)), port & 0xFFFF))
             self._sent += 1
 

@@ -9,14 +9,13 @@ from uwlts.errors import CalibrationError
 
 _ROUNDS = 60
 _SMALLEST_STEP = 1e-11
-_SMALLEST_GAIN = 1e-13
 # Columns are scaled to length one: a smaller eigenvalue of the shared parameters' normal matrix is rounding.
 _SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Residuals (n, 2) of one group and their derivatives by shared (2 n, k) and own (2 n, b) parameters."""
+    """Residuals (n, c) of one group and their derivatives by shared (c n, k) and own (c n, b) parameters."""
 
     residuals: np.ndarray
     by_shared: np.ndarray
@@ -34,7 +33,7 @@ class BorderedFit:
     ----------
     shared : (k,)
     own : list of (b,)
-    residuals : list of (n, 2)
+    residuals : list of (n, c)
     covariance : (k, k)
         Of the shared parameters, scaled by the residuals' variance.
     own_covariances : list of (b, b)
@@ -71,7 +70,12 @@ class _Normal:
 
 
 def fit_bordered(
-    model: Model, shared: np.ndarray, own: Sequence[np.ndarray], *, soft_limit: float | None = None
+    model: Model,
+    shared: np.ndarray,
+    own: Sequence[np.ndarray],
+    *,
+    soft_limit: float | None = None,
+    smallest_gain: float = 1e-13,
 ) -> BorderedFit:
     """Least squares over all groups; each step eliminates the groups' own parameters (Schur complement).
 
@@ -86,6 +90,8 @@ def fit_bordered(
     soft_limit : float, optional
         Residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s; quadratic
         without it.
+    smallest_gain : float
+        The iteration ends when a step lowers the cost by less than this share of it.
 
     Raises
     ------
@@ -95,7 +101,7 @@ def fit_bordered(
     shared, own = np.array(shared, dtype=np.float64), [np.array(o, dtype=np.float64) for o in own]
     normal = _assembled(model, shared, own, soft_limit)
     if normal is None:
-        raise CalibrationError("the calibration's start puts target points behind the camera: check points and poses")
+        raise CalibrationError("the calibration's start puts what was seen behind the camera: check points and poses")
     damping = 1e-4
     for rounds in range(1, _ROUNDS + 1):
         shared_step, own_steps = _step(normal, damping)
@@ -110,7 +116,7 @@ def fit_bordered(
         tried = _assembled(model, tried_shared, tried_own, soft_limit)
         if tried is not None and tried.cost <= normal.cost:
             gain = normal.cost - tried.cost
-            finished = small or gain <= _SMALLEST_GAIN * normal.cost
+            finished = small or gain <= smallest_gain * normal.cost
             shared, own, normal, damping = tried_shared, tried_own, tried, max(damping / 10, 1e-12)
             if finished:
                 return _account(shared, own, normal, rounds, "step below rounding" if small else "cost settled")
@@ -137,7 +143,7 @@ def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_lim
         else:
             root = np.sqrt(1 + squares / soft_limit**2)
             cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
-            columns /= np.repeat(np.sqrt(root), 2)[:, None]
+            columns /= np.repeat(np.sqrt(root), observation.residuals.shape[1])[:, None]
         observations.append(observation)
         products.append(columns.T @ columns)
     shared_scale = _lengths(sum(np.diag(product)[:count] for product in products))
@@ -185,7 +191,7 @@ def _account(shared: np.ndarray, own: list[np.ndarray], normal: _Normal, rounds:
     reduced = normal.shared.copy()
     inverses = []
     for border, block in zip(normal.border, normal.own, strict=True):
-        if np.linalg.eigvalsh(block)[0] < _SINGULAR:
+        if len(block) and np.linalg.eigvalsh(block)[0] < _SINGULAR:
             raise undetermined
         inverses.append(np.linalg.inv(block))
         reduced -= border @ inverses[-1] @ border.T

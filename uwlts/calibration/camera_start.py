@@ -18,7 +18,7 @@ def linear_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[n
     points = placements[farthest].displaced(placements[farthest].direction(np.empty(0)))
     start = direct_linear(points, placements[farthest].pixels)
     shared = intrinsics.from_matrix(start.matrix)
-    poses = [_pose(placement, intrinsics.matrix(shared)) for placement in placements]
+    poses = [placement_pose(placement, intrinsics.matrix(shared)) for placement in placements]
     poses[farthest] = np.r_[cv2.Rodrigues(start.rotation)[0].ravel(), start.translation_mm]
     return shared, poses
 
@@ -38,10 +38,11 @@ def planar_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[n
             "from image to image"
         )
     shared = intrinsics.from_matrix(matrix)
-    return shared, [_pose(placement, intrinsics.matrix(shared)) for placement in placements]
+    return shared, [placement_pose(placement, intrinsics.matrix(shared)) for placement in placements]
 
 
-def _pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
+def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
+    """Rotation vector and shift (6,) of a placement seen by a camera without distortion."""
     points = placement.displaced(placement.direction(np.empty(0)))
     found, rotation, translation = cv2.solvePnP(points, placement.pixels, matrix, None)
     if not found:

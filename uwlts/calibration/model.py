@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from uwlts.files import written_aside
 from uwlts.json_file import described, read_json
-from uwlts.sensor import Description, Distortion, Positive, Vector
+from uwlts.sensor import Description, Distortion, Medium, Positive, Vector
 
 FORMAT = "uwlts-calibration"
 VERSION = 1
@@ -52,11 +52,37 @@ class WindowModel(Description):
     glass_index: Annotated[float, Field(ge=1, lt=4)] = 1.0
 
 
+class FanModel(Description):
+    """How the laser sheet departs from a plane, and what the laser's window does to it, in the camera frame.
+
+    The fan begins at ``apex_mm`` and runs along the unit vector ``axis``. A beam that enters the line optics tilted by
+    the angle ``bow_rad`` gives a cone rather than a plane. The normal of the laser's window is turned by
+    ``window_turn_rad`` against the sheet, about axis x normal, so that a medium turns the sheet about ``pivot_mm``.
+    """
+
+    apex_mm: Vector
+    axis: Vector
+    pivot_mm: Vector
+    bow_rad: float = 0.0
+    window_turn_rad: float = 0.0
+
+
 class SheetModel(Description):
-    """The laser sheet as a plane in the camera frame: the points x with ``normal . x = offset_mm``."""
+    """The laser sheet in the camera frame: in air, without bow, the points x with ``normal . x = offset_mm``.
+
+    Without a ``fan`` it is that plane in every medium; `uwlts.sheet_surface` says what it is with one.
+    """
 
     normal: Vector
     offset_mm: float
+    fan: FanModel | None = None
+
+
+class KnownMedium(Description):
+    """A medium as captures describe it, and the refractive index that its calibration found."""
+
+    medium: Medium
+    index: Annotated[float, Field(ge=1, lt=2)]
 
 
 class Calibration(Description):
@@ -66,8 +92,9 @@ class Calibration(Description):
     distortion. Without a window the calibration holds in the kind of medium in which the target was seen,
     ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix
     ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
-    ``stripe_along`` is as in the sensor description. ``residuals`` are named figures of each step, ``provenance`` tells
-    what the calibration was made from.
+    ``stripe_along`` is as in the sensor description. ``media`` are those of the evidence: in just these the index
+    found replaces the one that follows from the description. ``residuals`` are named figures of each step,
+    ``provenance`` tells what the calibration was made from.
     """
 
     sensor_name: str
@@ -78,6 +105,7 @@ class Calibration(Description):
     window: WindowModel | None
     sheet: SheetModel
     camera_from_object: Matrix4
+    media: tuple[KnownMedium, ...] = ()
     residuals: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
 
@@ -86,10 +114,17 @@ class Calibration(Description):
         if not _is_rigid(self.camera_from_object):
             raise ValueError("camera_from_object must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
         _require_unit(self.sheet.normal, "the sheet's normal")
+        if self.sheet.fan is not None:
+            _require_unit(self.sheet.fan.axis, "the axis of the fan")
         if self.window is not None:
             _require_unit(self.window.normal, "the window's normal")
         require_plain_json(self.residuals, self.provenance)
         return self
+
+    def index_of(self, medium: Medium) -> float:
+        """Refractive index of a medium at the laser's wavelength, as calibrated where it was; RangeError as there."""
+        known = next((found.index for found in self.media if found.medium == medium), None)
+        return medium.refractive_index(self.wavelength_nm) if known is None else known
 
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""

@@ -159,7 +159,7 @@ def gather(
     air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
 ) -> Evidence:
     """Find the target, the stripes on it and those on the step standard in all images; errors as for `calibrate`."""
-    sensor = _common_sensor([*air, *steps])
+    sensor = common_sensor([*air, *steps])
     media = {capture.header.medium.kind for capture in air}
     if len(media) > 1 or (steps and media != {"air"}):
         raise CalibrationError(
@@ -180,7 +180,7 @@ def gather(
         sensor=sensor, medium_kind=media.pop(), stage_direction=np.array(air[0].header.stage_direction),
         approaching=None if options.poses == "free" else _approaching(air), air=found,
         plate=steps[0].header.sensor.camera.window if steps else None, steps=on_steps,
-        sources=_sources(air, steps), warnings=warnings,
+        sources=sources_of(air, steps), warnings=warnings,
     )  # fmt: skip
 
 
@@ -227,9 +227,10 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     return CalibrationResult(calibration, found, camera, bias, stripe_points, sheet, used, window, warnings)
 
 
-def _common_sensor(captures: Sequence[Capture]) -> Sensor:
+def common_sensor(captures: Sequence[Capture]) -> Sensor:
+    """The first capture's sensor; CalibrationError where another has other optics, or there is none."""
     if not captures:
-        raise CalibrationError("no capture in air is given: a calibration starts with one of a target")
+        raise CalibrationError("no capture is given: a calibration starts with one of a target")
     sensor = captures[0].header.sensor
 
     def optics(capture: Capture) -> tuple[Any, ...]:
@@ -342,7 +343,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
     return warnings
 
 
-def _sources(air: Sequence[Capture], steps: Sequence[Capture]) -> dict[str, Any]:
+def sources_of(air: Sequence[Capture], steps: Sequence[Capture]) -> dict[str, Any]:
     return {
         "source": "calibration from captures",
         "air_captures": [{"file": capture.path.name, "name": capture.header.name} for capture in air],

@@ -137,6 +137,11 @@ class Camera(ABC):
         """How many frames since ``start`` were good, and how many of each fault."""
         return self._check.counts
 
+    @property
+    def running(self) -> bool:
+        """Whether it takes frames; no longer so after an error that says that it is gone."""
+        return self._started
+
     def open(self) -> None:
         """Connect to the camera, alone; opening an open camera does nothing."""
         if self._info is None:

@@ -8,28 +8,25 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 import uwlts
 from uwlts.capture import Capture, CaptureWriter, Frame, part_path
 from uwlts.errors import HardwareError
-from uwlts.hardware.camera import Camera, GrabbedFrame
+from uwlts.hardware.camera import Camera
+from uwlts.hardware.exposure import START_MS, Brightness, brightness, settled_exposure
 from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.laser_watch import LOOKS, LaserWatch, LitPlace, no_light, shows_laser, spread
+from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light, ScanPlan, check_plan
 from uwlts.importing.images import without_background
 from uwlts.sensor import Sensor
-from uwlts.stripe import StripeStatus, extract_stripe
+from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
-_TRIES = 3
-"""How often an image is asked for whose frame was lost on its way."""
-_PATIENCE_S = 3.0
-_STEPS_OF_EXPOSURE = 8
-_BRIGHT_SHARE = 0.98
-"""Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
-_CLOSE = 0.1
-_SATURATED_SHARE, _FAINT_SHARE = 0.05, 0.1
+_FAINT = 0.1
+_EXPOSED_AT = 5
+"""Positions, evenly spread over a plan, at which automatic exposure looks."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +43,8 @@ class Seen:
     """What the images of a scan showed so far.
 
     ``lines`` and ``found`` count the profile lines of laser images and those with a stripe, ``saturated`` and ``faint``
-    the laser images on which too many lines are at the full scale, or that hardly reach a tenth of it; ``repeated``
-    the images that were asked for again. ``exposure_ms`` are the exposures used.
+    the laser images on which many of the lit lines are at the full scale, or hardly reach a tenth of it; ``repeated``
+    the images that were asked for again. ``exposure_ms`` are the exposures used last.
     """
 
     lines: int = 0
@@ -88,11 +85,13 @@ def record_scan(
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[int, int, Seen], None] = lambda done, total, seen: None,
+    warn: Callable[[str], None] = lambda text: None,
 ) -> Seen:
     """Carry out a plan with an open camera and a stage that knows where it is, into a capture.
 
     An interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that
-    the recorded images have. ``progress(done, total, seen)`` is called after every image.
+    the recorded images have. ``progress(done, total, seen)`` is called after every image, ``warn(text)`` when there
+    is something to see to.
 
     Raises
     ------
@@ -104,29 +103,26 @@ def record_scan(
         The file exists, or cannot be written.
     """
     sensor = plan.described_sensor()
-    _check_camera(camera, sensor)
+    check_camera(camera, sensor)
     check_plan(plan, limits_mm=stage.limits_mm, fastest_mm_per_min=stage.settings.max_feed_mm_per_min)
-    zero_dn = plan.zero_dn(sensor)
-    dtype = np.dtype(np.uint16) if zero_dn or camera.info.bits > 8 else np.dtype(np.uint8)
+    dtype = np.dtype(np.uint16) if plan.background or camera.info.bits > 8 else np.dtype(np.uint8)
+    shots, seen = shots_of(plan), Seen()
     provenance = {
         "source": "scan", "title": plan.title, "camera": f"{camera.info.name} {camera.info.serial}".strip(),
-        "stage": f"Grbl {stage.version}", "background": plan.background, "laser_power": plan.laser_power,
-        "uwlts": uwlts.__version__,
+        "stage": f"Grbl {stage.version}", "images": len(shots), "background": plan.background,
+        "laser_power": plan.laser_power, "uwlts": uwlts.__version__,
     }  # fmt: skip
-    shots, seen = shots_of(plan), Seen()
     before_s = _recorded(part_path(out), seen) if resume else 0.0
     with CaptureWriter(out, plan.header(out.stem, provenance=provenance), dtype=dtype, overwrite=overwrite,
                        resume=resume) as writer:  # fmt: skip
         begun = len(writer)
-        taking = _Taking(plan, sensor, camera, stage, seen)
+        if begun == len(shots):
+            return seen
+        taking = _Taking(plan, sensor, Rig(plan, sensor, camera, stage), seen, warn)
+        taking.settle_exposures()
         start_s = time.monotonic() - before_s
         for shot in shots[begun:]:
-            position = taking.move_to(shot.position_mm)
-            image, exposure_ms = taking.image(shot.light)
-            dark = taking.image("lamp", exposure_ms=exposure_ms)[0] if zero_dn and shot.light == "laser" else None
-            taking.look(image, shot.light)
-            if zero_dn:
-                image = image.astype(np.uint16) if dark is None else without_background(image, dark, zero_dn=zero_dn)
+            position, image, exposure_ms = taking.take(shot, last=shot is shots[-1])
             writer.append(
                 Frame(image.astype(dtype, copy=False), position, shot.light == "laser", exposure_ms,
                       time.monotonic() - start_s)
@@ -145,7 +141,8 @@ def _recorded(part: Path, seen: Seen) -> float:
         return float(left.time_s[-1]) if len(left) else 0.0
 
 
-def _check_camera(camera: Camera, sensor: Sensor) -> None:
+def check_camera(camera: Camera, sensor: Sensor) -> None:
+    """Refuse a camera that is not the sensor's: another image size, or fewer bits; HardwareError."""
     described, found = sensor.camera, camera.info
     if (found.width_px, found.height_px) != (described.width_px, described.height_px):
         raise HardwareError(
@@ -159,101 +156,112 @@ def _check_camera(camera: Camera, sensor: Sensor) -> None:
 
 
 class _Taking:
-    """Takes images one by one, with the exposures settled at the first of each light."""
+    """Takes the images of a scan, with exposures settled before the first one of each light."""
 
-    def __init__(self, plan: ScanPlan, sensor: Sensor, camera: Camera, stage: GrblStage, seen: Seen):
-        self._plan, self._sensor, self._camera, self._stage, self._seen = plan, sensor, camera, stage, seen
-        self._settle_s = sensor.stage.settling_s if plan.stage.settle_s is None else plan.stage.settle_s
-        self._along_width = sensor.camera.stripe_along == "width"
-        self._position_mm: float | None = None
-        self._exposure_ms: float | None = None
+    def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: Seen, warn: Callable[[str], None]):
+        self._plan, self._sensor, self._rig, self._seen, self._warn = plan, sensor, rig, seen, warn
+        self._positions_mm = plan.stage.positions_mm()
+        self._lit: LitPlace | None = None
+        self._watch: LaserWatch | None = None
 
-    def move_to(self, position_mm: float) -> float:
-        """Move with the laser off and let the stage settle; the position read back."""
-        if self._position_mm is None or abs(self._position_mm - position_mm) > 1e-9:
-            self._laser(False)
-            self._read_back = self._stage.move_to(position_mm, feed_mm_per_min=self._plan.stage.feed_mm_per_min)
-            time.sleep(self._settle_s)
-            self._position_mm = position_mm
-        return self._read_back
-
-    def image(self, light: Light, *, exposure_ms: float | None = None) -> tuple[np.ndarray, float]:
-        """Image (H, W) in a light, and its exposure in ms."""
-        self._laser(light == "laser")
-        wanted = exposure_ms if exposure_ms is not None else self._exposure(light)
-        self._configure(wanted)
-        frame = self._grab()
-        return frame.image, wanted if frame.exposure_ms is None else frame.exposure_ms
-
-    def look(self, image: np.ndarray, light: Light) -> None:
-        """Count what an image shows."""
-        self._seen.images += 1
-        if light != "laser":
-            return
-        stripe = extract_stripe(image, stripe_along=self._sensor.camera.stripe_along)
-        self._seen.lines += len(stripe.status)
-        self._seen.found += int((stripe.status == StripeStatus.OK).sum())
-        brightest = self._brightest(image)
-        full = self._sensor.detector.full_scale_dn()
-        if (brightest >= full).mean() > _SATURATED_SHARE:
-            self._seen.saturated += 1
-        if np.quantile(brightest, _BRIGHT_SHARE) < _FAINT_SHARE * full:
-            self._seen.faint += 1
-
-    def _brightest(self, image: np.ndarray) -> np.ndarray:
-        """Brightest pixel of every profile line."""
-        return image.max(axis=0 if self._along_width else 1)
-
-    def _laser(self, on: bool) -> None:
-        if (self._stage.laser_power > 0) != on:
-            self._stage.laser(on, power=self._plan.laser_power)
-
-    def _exposure(self, light: Light) -> float:
-        """Exposure as planned, or such that the light just reaches the wanted level; settled once for each light."""
-        if light not in self._seen.exposure_ms:
-            planned: float | Literal["auto"] = self._plan.laser_ms if light == "laser" else self._plan.lamp_ms
-            self._seen.exposure_ms[light] = self._settled() if planned == "auto" else planned
-        return self._seen.exposure_ms[light]
-
-    def _settled(self) -> float:
-        """Exposure in ms at which all but the brightest lines stay below the wanted level."""
-        wishes, full = self._sensor.exposure, self._sensor.detector.full_scale_dn()
-        black = self._sensor.detector.black_level_dn
-        exposure = min(1.0, wishes.longest_ms)
-        for _ in range(_STEPS_OF_EXPOSURE):
-            self._configure(exposure)
-            level = float(np.quantile(self._brightest(self._grab().image), _BRIGHT_SHARE))
-            share = max(level - black, 0.5) / (full - black)
-            if abs(share / wishes.auto_level - 1) < _CLOSE or (exposure >= wishes.longest_ms and share < 1):
+    def settle_exposures(self) -> None:
+        """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
+        exposures, missing = self._seen.exposure_ms, []
+        for light in dict.fromkeys(self._plan.lights):
+            if light not in exposures and self._planned(light) == "auto":
+                missing.append(light)
+            elif light not in exposures:
+                exposures[light] = self._planned(light)
+        looked = spread(self._positions_mm, _EXPOSED_AT)
+        further = [position for position in spread(self._positions_mm, LOOKS) if position not in looked]
+        for position in looked + further if missing else ():
+            if position in further and "laser" in exposures:
                 break
-            # At the full scale nothing tells by how much it is too bright.
-            factor = 0.25 if level >= full else min(wishes.auto_level / share, 30.0)
-            exposure = min(exposure * factor, wishes.longest_ms)
-        return exposure
-
-    def _configure(self, exposure_ms: float) -> None:
-        if self._exposure_ms is not None and abs(self._exposure_ms / exposure_ms - 1) < 1e-6:
-            return
-        self._camera.stop()
-        self._camera.configure(
-            exposure_ms=exposure_ms, gain_db=self._plan.gain_db, bits=self._sensor.detector.bits, trigger="software"
+            self._rig.move_to(position)
+            for light in missing:
+                self._settle(light, position)
+        for light in missing:
+            if light not in exposures:
+                longest_ms = self._sensor.exposure.longest_ms
+                if light == "laser":
+                    raise no_light(self._positions_mm, longest_ms)
+                exposures[light] = longest_ms
+        self._watch = LaserWatch(
+            self._rig, self._sensor, self._positions_mm, difference=self._plan.background, lit=self._lit
         )
-        self._camera.start(faults="raise")
-        self._exposure_ms = exposure_ms
 
-    def _grab(self) -> GrabbedFrame:
-        """One image; asked for again if its frame was lost, as the stage is at rest. Between tries the laser is off."""
-        lit, last = self._stage.laser_power > 0, None
-        for _ in range(_TRIES):
-            self._laser(lit)
-            try:
-                self._camera.trigger()
-                return self._camera.grab(_PATIENCE_S + 1e-3 * (self._exposure_ms or 0.0))
-            except HardwareError as error:
-                last = error
-                self._laser(False)
-                self._seen.repeated += 1
-        raise HardwareError(f"{last} (asked for {_TRIES} times)")
+    def _planned(self, light: Light) -> float | str:
+        return self._plan.laser_ms if light == "laser" else self._plan.lamp_ms
+
+    def _settle(self, light: Light, position_mm: float) -> None:
+        """Shorten the exposure of a light if it is too long here; settle it if nothing was seen in it before."""
+        exposures = self._seen.exposure_ms
+        if light in exposures:
+            here = brightness(self._rig.image(light, exposures[light])[0], self._sensor, light)
+            if here.level <= self._sensor.exposure.auto_level:
+                return
+        exposure_ms = self._settled(light)
+        if exposure_ms is None:
+            return
+        if light == "laser":
+            # Daylight on an object's edges can look like a stripe at long exposures.
+            lit, unlit = (self._rig.image(each, exposure_ms)[0] for each in ("laser", "lamp"))
+            if not shows_laser(lit, unlit, self._sensor, difference=self._plan.background):
+                return
+            self._lit = LitPlace(position_mm, exposure_ms)
+        exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
+
+    def _settled(self, light: Light) -> float | None:
+        return settled_exposure(
+            lambda wanted: self._rig.image(light, wanted)[0], sensor=self._sensor, light=light,
+            start_ms=self._seen.exposure_ms.get(light, START_MS),
+        )  # fmt: skip
+
+    def take(self, shot: Shot, *, last: bool) -> tuple[float, np.ndarray, float]:
+        """Position read back, image (H, W) as it is stored, and its exposure in ms."""
+        position, light, zero_dn = self._rig.move_to(shot.position_mm), shot.light, self._plan.zero_dn(self._sensor)
+        image, exposure_ms = self._rig.image(light, self._seen.exposure_ms[light])
+        bright = brightness(image, self._sensor, light)
+        if bright.overexposed and self._planned(light) == "auto" and self._shorten(light, shot.position_mm):
+            image, exposure_ms = self._rig.image(light, self._seen.exposure_ms[light])
+            bright = brightness(image, self._sensor, light)
+        unlit = self._rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
+        if light == "laser":
+            stripe = extract_stripe(
+                image, stripe_along=self._sensor.camera.stripe_along, background=unlit,
+                saturation=self._sensor.detector.full_scale_dn(),
+            )  # fmt: skip
+            place = LitPlace(shot.position_mm, exposure_ms)
+            self._watch.see(image, stripe, bright, place, unlit=unlit, last=last)
+            self._count(stripe, bright)
+        self._seen.images += 1
+        self._seen.repeated = self._rig.repeated
+        if zero_dn:
+            image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)
+        return position, image, exposure_ms
+
+    def _shorten(self, light: Light, position_mm: float) -> bool:
+        """Settle the exposure of a light anew where it turns out to be too long; False where that does not help."""
+        before_ms, shorter_ms = self._seen.exposure_ms[light], self._settled(light)
+        if shorter_ms is None or shorter_ms >= before_ms:
+            return False
+        self._seen.exposure_ms[light] = shorter_ms
+        self._warn(
+            f"{light} images at {position_mm:g} mm are saturated on many lines: exposed by {shorter_ms:.3g} ms from "
+            f"here on, by {before_ms:.3g} ms before"
+        )
+        return True
+
+    def _count(self, stripe: Stripe, bright: Brightness) -> None:
+        seen = self._seen
+        seen.lines += len(stripe.status)
+        seen.found += int((stripe.status == StripeStatus.OK).sum())
+        if bright.overexposed:
+            seen.saturated += 1
+            if seen.saturated == 1:
+                self._warn("a laser image is saturated on many lines: shorten laser_ms")
+        if not bright.dark and bright.level < _FAINT:
+            seen.faint += 1
 
 
 def plan_text(plan: ScanPlan) -> str:

@@ -1,0 +1,154 @@
+"""Automatic exposure of real runs of ``uwlts scan`` at a served twin, against the exposures that the twin chooses."""
+
+import os
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.hardware.serve import ServedTwin, serve
+from twin.options import Options
+from twin.scene import Scene, load_scene
+from uwlts.capture import Capture
+from uwlts.library import load_sensor
+from uwlts.sensor import Sensor
+
+ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+SENSOR = """
+base = "thesis"
+name = "coarse"
+[camera]
+width_px = 640
+height_px = 512
+pixel_size_um = 10.6
+[stage]
+travel_mm = 400.0
+resolution_mm = 0.01
+settling_s = 0.0
+"""
+# A board, and between the positions that are looked at beforehand a bar 60 mm nearer.
+BAR = """
+title = "Board and bar"
+medium = "air"
+[motion]
+start_mm = -20.0
+step_mm = 2.0
+count = 21
+[[objects]]
+kind = "plate"
+width_mm = 200.0
+height_mm = 160.0
+reflectance = 0.1
+[[objects]]
+kind = "plate"
+width_mm = 5.0
+height_mm = 160.0
+position_mm = [5.0, 0.0, -20.0]
+reflectance = 0.8
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("exposure")
+    (place / "sensor.toml").write_text(SENSOR, encoding="utf-8")
+    (place / "bar.toml").write_text(BAR, encoding="utf-8")
+    return place
+
+
+@pytest.fixture(scope="module")
+def sensor(folder: Path) -> Sensor:
+    return load_sensor(folder / "sensor.toml")
+
+
+def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:
+    """Scan the scene's motion with automatic exposure; what the command said on standard error."""
+    motion, plan = scene.motion, folder / "plan.toml"
+    plan.write_text(
+        f'title = "Scan"\nsensor = "sensor.toml"\nmedium = "{scene.medium}"\ncamera = "{served.camera.address}"\n'
+        f'lights = {list(motion.lights)}\n[stage]\nport = "{served.controller.port}"\n'
+        f"start_mm = {served.track.start_mm}\nstep_mm = {motion.step_mm}\ncount = {motion.count}\n"
+        f"direction = {list(map(float, motion.unit_direction()))}\nfeed_mm_per_min = 900.0\n",
+        encoding="utf-8",
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home"], env=ENVIRONMENT,
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "placement"), [("plane", "near-turned"), ("spheres", "near"), ("step-scan", "near"), ("target", None)]
+)
+def test_it_agrees_with_the_twin(folder, sensor, tmp_path, name, placement):
+    """At the same three positions: the first, the middle and the last."""
+    scene = load_scene(name, changes={"placement": placement} if placement else {})
+    motion = scene.motion
+    way = (motion.count - 1) * motion.step_mm
+    scene = scene.model_copy(update={"motion": motion.model_copy(update={"count": 3, "step_mm": way / 2})})
+    with serve(scene, sensor, options=Options(spp=16), speed_up=50.0) as served:
+        # A sphere that just touches the sheet, at the last position, is faint, and this is said.
+        assert "saturated" not in scanned(scene, served, folder, tmp_path / "scan.h5")
+        expected = served.exposure_ms
+    with Capture(tmp_path / "scan.h5") as scan:
+        for laser_on, light in ((True, "laser"), (False, "lamp")):
+            used = set(scan.exposure_ms[scan.laser_on == laser_on].round(4).tolist())
+            # One exposure for each light. Both bring all but 2 % of the lit lines to 80 % of the full scale; here with
+            # shot noise, of whose values on the pixels at the peak the highest counts, and read to within 10 %.
+            assert len(used) == (light in scene.motion.lights)
+            for exposure_ms in used:
+                assert exposure_ms == pytest.approx(expected[light], rel=0.25)
+        saturated = [(scan.image(k).max(axis=0) >= 255).mean() for k in range(len(scan))]
+        # 2 % of the lines may be brighter than 80 %, so no more saturate.
+        assert max(saturated) < 0.02
+
+
+def test_what_comes_nearer_later_is_taken_again_with_a_shorter_exposure(folder, sensor, tmp_path):
+    scene = load_scene(folder / "bar.toml")
+    with serve(scene, sensor, options=Options(spp=4), speed_up=50.0) as served:
+        said = scanned(scene, served, folder, tmp_path / "scan.h5")
+    with Capture(tmp_path / "scan.h5") as scan:
+        exposures = scan.exposure_ms
+        saturated = np.array([(scan.image(k).max(axis=0) >= 255).mean() for k in range(len(scan))])
+    nearer = int(np.flatnonzero(np.diff(exposures))[0]) + 1
+    # The bar reaches over the positions 2.5 to 7.5 mm of the scene, from the twelfth on.
+    assert nearer == 12
+    # Eight times the reflectance, and 20 of some 400 mm nearer to laser and camera.
+    assert exposures[0] / exposures[-1] == pytest.approx(8 * (400 / 380) ** 2, rel=0.25)
+    assert set(exposures[:12]) == {exposures[0]} and set(exposures[12:]) == {exposures[-1]}
+    assert (saturated < 0.05).all()
+    # The dim board behind the bar is faint from there on, which is said at the end.
+    assert said.count("saturated on many lines: exposed by") == said.count("from here on") == 1
+    assert said.count("warning:") == 2 and "laser images are faint" in said
+
+
+def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, tmp_path):
+    scene = load_scene(folder / "bar.toml")
+    with serve(scene, sensor, options=Options(spp=4), speed_up=50.0) as served:
+        plan = folder / "watched.toml"
+        plan.write_text(
+            f'title = "Scan"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{served.camera.address}"\n'
+            f'laser_ms = {served.exposure_ms["laser"]}\n[stage]\nport = "{served.controller.port}"\n'
+            f"start_mm = {served.track.start_mm}\nstep_mm = 2.0\ncount = 12\nsettle_s = 0.6\nfeed_mm_per_min = 900.0\n",
+            encoding="utf-8",
+        )
+        scanning = subprocess.Popen(
+            [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(tmp_path / "scan.h5"), "--home",
+             "--watch"], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        with scanning:
+            lines = iter(scanning.stdout.readline, "")
+            address = next(line for line in lines if line.startswith("open ")).split()[1].rstrip(",")
+            with urllib.request.urlopen(address, timeout=10) as answer:
+                assert answer.status == 200 and scanning.poll() is None
+            assert "wrote" in "".join(lines) and scanning.wait(60) == 0
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(address, timeout=2)
+    with Capture(tmp_path / "scan.h5") as scan:
+        assert len(scan) == scan.header.provenance["images"] == 12

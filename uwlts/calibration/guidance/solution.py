@@ -1,0 +1,128 @@
+"""The camera as far as the recorded poses of the target determine it, and whether a new one fits the others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uwlts.calibration.camera_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.circle_bias import solve_without_bias
+from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.model import CameraModel
+from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
+from uwlts.calibration.sheet import SheetSolution, fit_sheet, points_on_target
+from uwlts.calibration.target_image import TargetImage
+from uwlts.errors import CalibrationError, RangeError
+from uwlts.placement import laser_pose
+from uwlts.sensor import Medium, Sensor
+from uwlts.targets import CircleTarget, Target, TargetView
+
+# A residual this many times that of the others, and this much beyond what noise alone may do, contradicts them.
+_CONTRADICTION, _ALLOWANCE_PX = 3.0, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPose:
+    """A pose of the target as recorded: what the lamp showed, the stripe (N, 2) on the target, the stage's position."""
+
+    view: TargetView
+    stripe: np.ndarray
+    stage_mm: float
+
+    def image(self) -> TargetImage:
+        """What it contributes to the camera; CalibrationError where its points are too few or on one line."""
+        return TargetImage(self.view.points_mm, self.view.pixels, self.stage_mm)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the poses are taken with: sensor, target, the medium it stands in, and how the poses belong together."""
+
+    sensor: Sensor
+    target: Target
+    medium: Medium
+    poses: Poses
+    approaching: bool = True
+    camera: CameraOptions = CameraOptions()
+
+
+def nominal_camera(setting: Setting) -> CameraModel:
+    """The described camera; through a window into a medium its focal length grows by the medium's index."""
+    camera = setting.sensor.camera
+    index = setting.medium.refractive_index(setting.sensor.laser.wavelength_nm) if camera.window.mounted else 1.0
+    f, (cx, cy) = camera.focal_length_px() * index, camera.principal_point()
+    distortion = camera.distortion if index == 1.0 else type(camera.distortion)()
+    return CameraModel(
+        width_px=camera.width_px, height_px=camera.height_px, fx_px=f, fy_px=f, cx_px=cx, cy_px=cy,
+        distortion=distortion,
+    )  # fmt: skip
+
+
+def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
+    """``T_camera_target`` (4, 4) of a view by a known camera.
+
+    Raises
+    ------
+    CalibrationError
+        No pose explains the points.
+    """
+    found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
+    if not found or not np.isfinite(translation).all():
+        raise CalibrationError("no pose of the target explains its image: is it the described target?")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return pose
+
+
+def solve_recorded(recorded: Sequence[RecordedPose], setting: Setting) -> CameraSolution:
+    """Camera and poses from what is recorded; CalibrationError where that does not determine them yet."""
+    camera = setting.sensor.camera
+
+    def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
+        return solve_camera(
+            images, width_px=camera.width_px, height_px=camera.height_px, poses=setting.poses,
+            approaching=setting.approaching, options=setting.camera, start=start,
+        )  # fmt: skip
+
+    images = [pose.image() for pose in recorded]
+    try:
+        if isinstance(setting.target, CircleTarget):
+            return solve_without_bias(images, solved, diameter_mm=setting.target.diameter_mm).solution
+        return solved(images, None)
+    except RangeError as error:
+        raise CalibrationError(str(error)) from error
+
+
+def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:
+    """Why the last image of ``after`` contradicts those before it, which ``before`` was solved from; empty if not."""
+    if before is None:
+        return ()
+    rms = after.image_rms_px()
+    usual = before.rms_px()
+    limit = _CONTRADICTION * usual + _ALLOWANCE_PX
+    # A wrong image pulls the others along, so they are looked at too.
+    worst = max(float(rms[-1]), float(np.sqrt(np.mean(rms[:-1] ** 2))))
+    if worst <= limit:
+        return ()
+    return (
+        f"contradicts the others: with it the residual is {worst:.2f} px, without it {usual:.2f} px, at most "
+        f"{limit:.2f} px is plausible; did the target bend, the stage slip, the lens turn?",
+    )
+
+
+def sheet_of(recorded: Sequence[RecordedPose], solution: CameraSolution, setting: Setting) -> SheetSolution:
+    """The laser sheet by the recorded stripes; CalibrationError where they do not determine it yet."""
+    target = setting.target
+    points = points_on_target(
+        solution.model, [pose.stripe for pose in recorded], solution.target_poses, extent_mm=plate_extent(target),
+        margin_mm=lattice_spacing(target) / 2,
+    )  # fmt: skip
+    return fit_sheet(points.points_mm, nominal_normal=laser_pose(setting.sensor).normal)
+
+
+def without_window(sensor: Sensor) -> Sensor:
+    """The sensor with its camera's window taken off."""
+    camera = sensor.camera
+    window = camera.window.model_copy(update={"mounted": False})
+    return sensor.model_copy(update={"camera": camera.model_copy(update={"window": window})})

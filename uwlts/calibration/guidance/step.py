@@ -1,0 +1,104 @@
+"""Whether a laser image of the step standard is good enough to find the window by, and how far away the standard is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.evidence import StepEvidence
+from uwlts.calibration.model import Calibration, WindowModel
+from uwlts.calibration.procedure import step_image
+from uwlts.errors import EvaluationError, ImageError
+from uwlts.metrology.artefact_descriptions import StepStandard
+from uwlts.reconstruction import points_on_sheet
+from uwlts.sensor import Sensor
+from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+
+PLACES = 3
+"""At so many depths the standard is wanted: near, in the middle and far."""
+_APART = 1 / 7
+_FEWEST_LINES = 20
+_MOST_SATURATED = 0.05
+_STRIPE = StripeOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class StepQuality:
+    """What a laser image shows of the step standard.
+
+    ``pixels`` (N, 2) are the stripe's, ``depth_mm`` is how far outside the window it is seen, by the nominal window,
+    ``reasons`` are why the image is refused.
+    """
+
+    pixels: np.ndarray
+    depth_mm: float | None
+    reasons: tuple[str, ...]
+
+
+def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor) -> float | None:
+    """Where to put the standard next, mm outside the window; None once it was seen at three depths apart.
+
+    Of the middles of the measuring volume's thirds the one farthest from where it was seen.
+    """
+    if len(apart_mm(seen_mm, sensor)) >= PLACES:
+        return None
+    near, far = sensor.volume.near_mm, sensor.volume.far_mm
+    middles = [near + (far - near) * (2 * k + 1) / (2 * PLACES) for k in range(PLACES)]
+    return max(middles, key=lambda middle: min((abs(middle - depth) for depth in seen_mm), default=np.inf))
+
+
+def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
+    """Those of the depths that are far from each other."""
+    chosen: list[float] = []
+    for depth in seen_mm:
+        if is_new(depth, chosen, sensor):
+            chosen.append(depth)
+    return chosen
+
+
+def is_new(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
+    """Whether a depth is farther from all others than a seventh of the measuring volume's depth."""
+    return all(abs(depth_mm - other) >= least_apart_mm(sensor) for other in seen_mm)
+
+
+def least_apart_mm(sensor: Sensor) -> float:
+    """How far apart two depths of the standard shall be."""
+    return _APART * (sensor.volume.far_mm - sensor.volume.near_mm)
+
+
+def judge_step(
+    image: np.ndarray,
+    calibration: Calibration,
+    window: WindowModel,
+    standard: StepStandard,
+    *,
+    medium_index: float,
+    full_dn: int,
+    options: StripeOptions = _STRIPE,
+) -> StepQuality:
+    """How good a laser image (H, W) of the step standard is, by a calibration in air and the nominal window."""
+    along = calibration.stripe_along
+    try:
+        stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)
+    except ImageError as error:
+        return StepQuality(np.empty((0, 2)), None, (str(error),))
+    pixels = stripe.pixels()
+    if len(pixels) < _FEWEST_LINES:
+        reason = f"the laser line is seen on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
+        return StepQuality(pixels, None, (f"{reason}; is the laser lit, the standard in the sheet?",))
+    reasons = []
+    clipped = (image.max(axis=0 if along == "width" else 1) >= full_dn) & (stripe.status != StripeStatus.NO_STRIPE)
+    saturated = float(clipped.sum()) / len(pixels)
+    if saturated > _MOST_SATURATED:
+        reasons.append(f"stripe saturated on {100 * saturated:.0f} % of its lines; shorten laser_ms")
+    evidence = StepEvidence(pixels, standard, medium_index, "this image")
+    try:
+        step_image(calibration, window, evidence)
+    except EvaluationError as error:
+        reasons.append(f"no step: {error}")
+    placed = calibration.model_copy(update={"window": window})
+    depths = points_on_sheet(placed, pixels, medium_index=medium_index).points_camera_mm[:, 2]
+    seen = depths[np.isfinite(depths)]
+    if not len(seen):
+        return StepQuality(pixels, None, (*reasons, "the laser line does not lie on the sheet"))
+    return StepQuality(pixels, float(np.median(seen)) - window.distance_mm - window.thickness_mm, tuple(reasons))

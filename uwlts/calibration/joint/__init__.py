@@ -1,0 +1,1 @@
+"""One least-squares estimate of camera, window, media and sheet from all evidence together."""

@@ -1,0 +1,169 @@
+"""The joint least squares: all evidence and all prior knowledge, weighted by the scatter that the evidence shows."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.bordered import BorderedFit, Observation, fit_bordered
+from uwlts.calibration.joint.noise import Noise, judged, strays
+from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.parameters import Parameters
+from uwlts.errors import CalibrationError
+from uwlts.sensor import Uncertainty
+
+Evidence = TargetEvidence | StepProfileEvidence
+Correct = Callable[[Sequence[Evidence], np.ndarray, Sequence[np.ndarray]], list[Evidence]]
+
+_FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3)}
+_SOFT_LIMIT = 3.0
+_ROUNDS = 10
+_SETTLED = 0.02
+_SETTLED_PX = 1e-3
+# Of a cost that is the number of residuals: parameters then move by a hundredth of their uncertainty at most.
+_SMALLEST_GAIN = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The shared parameters and what the evidence says of them.
+
+    Attributes
+    ----------
+    parameters : Parameters
+    values : (P,)
+    covariance : (P, P)
+    own : list of (b,)
+        Of every piece of evidence.
+    noise : dict
+        Of every kind of residual.
+    residuals : list of list of Residuals
+        Of every piece of evidence, strays included.
+    strays : int
+        Residuals left out.
+    rounds : int
+        Of the least squares, summed over all weightings.
+    stopped : str
+    """
+
+    parameters: Parameters
+    values: np.ndarray
+    covariance: np.ndarray
+    own: list[np.ndarray]
+    noise: dict[str, Noise]
+    residuals: list[list[Residuals]]
+    strays: int
+    rounds: int
+    stopped: str
+
+    def std(self) -> dict[str, float]:
+        """Standard uncertainty of every parameter."""
+        return dict(zip(self.parameters.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+
+def estimate(
+    parameters: Parameters,
+    evidence: Sequence[Evidence],
+    shared: np.ndarray,
+    own: Sequence[np.ndarray],
+    *,
+    uncertainty: Uncertainty,
+    correct: Correct | None = None,
+) -> Estimate:
+    """Least squares over all evidence, repeated until weights and corrections agree with the solution.
+
+    At first large residuals count linearly; then strays, beyond five standard deviations, are left out.
+
+    Parameters
+    ----------
+    shared : (P,)
+        Start.
+    own : sequence of (b,)
+        Starts of the evidence's own parameters.
+    correct : callable, optional
+        Evidence as found, shared and own parameters to the evidence without what is known to bias it there.
+
+    Raises
+    ------
+    CalibrationError
+        The start has no meaning, the evidence does not determine the parameters, or corrections do not settle.
+    """
+    problem = _Problem(parameters, uncertainty)
+    found, own, rounds = list(evidence), list(own), 0
+    known, soft = dict(_FIRST), _SOFT_LIMIT
+    left_out: list[list[np.ndarray]] | None = None
+    for _ in range(_ROUNDS):
+        fit = problem.fit(evidence, shared, own, known, left_out, soft)
+        shared, own, soft, rounds = fit.shared, fit.own[:-1], None, rounds + fit.rounds
+        residuals = problem.residuals(evidence, shared, own)
+        before, known = known, problem.noise(evidence, residuals)
+        left_out = [[strays(r, known[r.kind]) for r in parts] for parts in residuals]
+        used, evidence = evidence, found if correct is None else correct(found, shared, own)
+        moved = max(
+            (float(np.abs(a.placement.pixels - b.placement.pixels).max())
+             for a, b in zip(used, evidence, strict=True) if isinstance(a, TargetEvidence)), default=0.0,
+        )  # fmt: skip
+        steady = all(abs(known[k].effective_px() / before[k].effective_px() - 1) < _SETTLED for k in known)
+        if steady and moved <= _SETTLED_PX:
+            return Estimate(
+                parameters=parameters, values=shared, covariance=fit.covariance, own=own, noise=known,
+                residuals=residuals, strays=sum(int(mask.sum()) for parts in left_out for mask in parts),
+                rounds=rounds, stopped=fit.stopped,
+            )  # fmt: skip
+    raise CalibrationError(
+        f"the joint calibration did not settle in {_ROUNDS} rounds: the offsets of the circles' images still move by "
+        f"{moved:.2g} px; is the circles' diameter right?"
+    )
+
+
+class _Problem:
+    """The evidence as groups of a bordered least squares; the last group is what is known before."""
+
+    def __init__(self, parameters: Parameters, uncertainty: Uncertainty):
+        self._parameters = parameters
+        self._alignment = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
+        self._position_mm = uncertainty.stage_position_mm
+
+    def fit(
+        self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray], noise: dict[str, Noise],
+        left_out: list[list[np.ndarray]] | None, soft_limit: float | None,
+    ) -> BorderedFit:  # fmt: skip
+        def model(group: int, shared: np.ndarray, own: np.ndarray) -> Observation | None:
+            if group == len(evidence):
+                return self._prior(shared)
+            parts = evidence[group].residuals(self._parameters, shared, own)
+            if parts is None:
+                return None
+            columns = [np.column_stack([r.values, r.by_shared, r.by_own]) / noise[r.kind].effective_px() for r in parts]
+            if left_out is not None:
+                columns = [c[~mask] for c, mask in zip(columns, left_out[group], strict=True)]
+            std = evidence[group].own_std(alignment=self._alignment, position_mm=self._position_mm)
+            known = np.isfinite(std)
+            prior = np.zeros((known.sum(), columns[0].shape[1]))
+            prior[:, 0] = own[known] / std[known]
+            prior[:, 1 + len(shared) :] = (np.eye(len(own)) / std)[known]
+            rows = np.vstack([*columns, prior])
+            return Observation(rows[:, :1], rows[:, 1 : 1 + len(shared)], rows[:, 1 + len(shared) :])
+
+        return fit_bordered(model, shared, [*own, np.empty(0)], soft_limit=soft_limit, smallest_gain=_SMALLEST_GAIN)
+
+    def _prior(self, shared: np.ndarray) -> Observation:
+        std = self._parameters.prior_std()
+        known = np.isfinite(std)
+        off = (shared - self._parameters.prior_mean())[known] / std[known]
+        return Observation(off[:, None], np.diag(1.0 / std)[known], np.empty((len(off), 0)))
+
+    def residuals(
+        self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray]
+    ) -> list[list[Residuals]]:
+        found = [e.residuals(self._parameters, shared, o) for e, o in zip(evidence, own, strict=True)]
+        if any(parts is None for parts in found):
+            raise CalibrationError("the joint calibration went astray: a ray that was seen meets no sheet or target")
+        return found
+
+    def noise(self, evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> dict[str, Noise]:
+        result = {}
+        for kind in {r.kind: None for parts in residuals for r in parts}:
+            points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
+            result[kind] = judged(kind, [r for parts in residuals for r in parts if r.kind == kind], points)
+        return result

@@ -1,0 +1,89 @@
+"""How much the residuals scatter, which of them are strays, and how much of the scatter they share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.joint.observations import TARGET, Residuals
+
+_STRAY = 5.0
+_TO_STD = 1.4826
+_LAGS = 100
+_SHARED_LAG = 0.05
+_FINEST_PX = 1e-3
+"""No point of an image counts as better known, lest what is known before counts for nothing."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Scatter of one kind of residual.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Standard deviation of one residual, without strays.
+    together : float
+        Variance of a mean of many over that of as many independent ones: neighbours along a stripe, or images of the
+        same point of the target, err together.
+    """
+
+    sigma_px: float
+    together: float = 1.0
+
+    def effective_px(self) -> float:
+        """Standard deviation of independent residuals that would tell as little."""
+        return self.sigma_px * float(np.sqrt(self.together))
+
+
+def strays(residuals: Residuals, noise: Noise) -> np.ndarray:
+    """Which residuals (n,) are too large to be noise; of the target's points both coordinates."""
+    large = np.abs(residuals.values) > _STRAY * noise.sigma_px
+    if residuals.kind == TARGET:
+        large = np.repeat(large.reshape(-1, 2).any(axis=1), 2)
+    return large
+
+
+def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
+    """Scatter of all residuals of a kind; ``points`` (N, 3) are the target's, for residuals of that kind."""
+    values = np.concatenate([r.values for r in residuals])
+    spread = _TO_STD * float(np.median(np.abs(values)))
+    kept = np.abs(values) <= _STRAY * spread
+    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else spread
+    if sigma < _FINEST_PX:
+        return Noise(_FINEST_PX)
+    if kind == TARGET:
+        together = _of_points(values, np.vstack(points), kept, sigma)
+    else:
+        together = _of_neighbours(residuals, sigma)
+    return Noise(sigma, max(together, 1.0))
+
+
+def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:
+    """By how much residuals of the same point in several images share their error."""
+    _, point = np.unique(np.round(points[:, :2], 6), axis=0, return_inverse=True)
+    pairs, kept = values.reshape(-1, 2), kept.reshape(-1, 2).all(axis=1)
+    number = np.bincount(point[kept], minlength=point.max() + 1)
+    often = number >= 3
+    if not often.any():
+        return 1.0
+    sums = np.stack([np.bincount(point[kept], pairs[kept, axis], len(number)) for axis in (0, 1)])
+    # n times the variance of the mean of n, over the variance of one.
+    return float(np.mean(sums[:, often] ** 2 / number[often])) / sigma**2
+
+
+def _of_neighbours(residuals: Sequence[Residuals], sigma: float) -> float:
+    """1 + 2 sum of the autocorrelation along the stripe, up to where it fades, over all images."""
+    products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
+    for part in residuals:
+        for image in np.unique(part.image):
+            values = part.values[part.image == image]
+            values = np.clip(values, -_STRAY * sigma, _STRAY * sigma)
+            for lag in range(1, min(_LAGS, len(values) // 4)):
+                products[lag] += values[lag:] @ values[:-lag]
+                counts[lag] += len(values) - lag
+    with np.errstate(invalid="ignore"):
+        correlation = products / (counts * sigma**2)
+    faded = np.flatnonzero(~(correlation[1:] > _SHARED_LAG))
+    end = 1 + (faded[0] if len(faded) else _LAGS - 1)
+    return 1.0 + 2.0 * float(correlation[1:end].sum())

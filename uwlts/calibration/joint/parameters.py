@@ -1,0 +1,136 @@
+"""The parameters that all evidence shares: what they are called, where they start, what is known of them before."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uwlts.calibration.intrinsics import Intrinsics
+from uwlts.calibration.joint.rays import COLUMNS, LENS, WINDOW, RayJets, ray_jets
+from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
+from uwlts.calibration.joint.sheet_jets import DescribedSheet, PointJets, points_on_sheet
+from uwlts.calibration.model import CameraModel, SheetModel, WindowModel
+
+
+@dataclass(frozen=True)
+class View:
+    """Through what the camera looks: its window or none, and a medium by its number; None is air."""
+
+    window: bool
+    medium: int | None
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A parameter known before as ``mean`` with the standard uncertainty ``std``; infinite, the mean is but a start."""
+
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """Names and places of the shared parameters in one vector (P,).
+
+    Attributes
+    ----------
+    intrinsics : Intrinsics
+    sheet : DescribedSheet
+        The sheet as described.
+    window : WindowModel or None
+        The window as described; None where nothing is seen through it.
+    media : tuple of str
+        Names of the media other than air.
+    priors : dict
+        `Prior` of every parameter but the lens's, in the order of the vector.
+    """
+
+    intrinsics: Intrinsics
+    sheet: DescribedSheet
+    window: WindowModel | None
+    media: tuple[str, ...]
+    priors: dict[str, Prior]
+    names: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", (*self.intrinsics.names, *self.priors))
+
+    def start(self, lens: np.ndarray) -> np.ndarray:
+        """Vector (P,) with the lens's parameters as given and the others as known before."""
+        return np.concatenate([lens, [prior.mean for prior in self.priors.values()]])
+
+    def prior_std(self) -> np.ndarray:
+        """Standard uncertainty (P,) of each parameter before; infinite where nothing is known."""
+        return np.concatenate([np.full(len(self.intrinsics.names), np.inf), [p.std for p in self.priors.values()]])
+
+    def prior_mean(self) -> np.ndarray:
+        """What each parameter (P,) is before; zero where nothing is known."""
+        return np.concatenate([np.zeros(len(self.intrinsics.names)), [p.mean for p in self.priors.values()]])
+
+    def camera(self, values: np.ndarray) -> CameraModel:
+        """The camera of a vector."""
+        return self.intrinsics.model(values[: len(self.intrinsics.names)])
+
+    def window_model(self, values: np.ndarray) -> WindowModel | None:
+        """The window of a vector."""
+        if self.window is None:
+            return None
+        distance, slope_x, slope_y, thickness, index = (self.value(values, name) for name in WINDOW)
+        normal = np.array([slope_x, slope_y, 1.0])
+        return self.window.model_copy(
+            update={
+                "distance_mm": distance, "thickness_mm": thickness, "glass_index": index,
+                "normal": tuple((normal / np.linalg.norm(normal)).tolist()),
+            }
+        )  # fmt: skip
+
+    def sheet_model(self, values: np.ndarray) -> SheetModel:
+        """The sheet of a vector."""
+        return self.sheet.model(self._sheet_values(values))
+
+    def medium_index(self, values: np.ndarray, view: View) -> float:
+        """Index of a view's medium relative to air."""
+        return 1.0 if view.medium is None else self.value(values, self._index_name(view))
+
+    def rays(self, values: np.ndarray, view: View, pixels: np.ndarray) -> RayJets | None:
+        """Rays of pixels (N, 2) in the medium of a view."""
+        window = self.window_model(values) if view.window else None
+        return ray_jets(self.camera(values), window, pixels, medium_index=self.medium_index(values, view))
+
+    def on_sheet(self, values: np.ndarray, view: View, pixels: np.ndarray) -> PointJets | None:
+        """Points of the sheet in the medium of a view that pixels (N, 2) show."""
+        rays = self.rays(values, view, pixels)
+        if rays is None:
+            return None
+        return points_on_sheet(self.sheet, self._sheet_values(values), rays, self.medium_index(values, view))
+
+    def by_shared(self, by_rays: np.ndarray, view: View, by_sheet: np.ndarray | None = None) -> np.ndarray:
+        """Derivatives (N, P) by the shared parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
+        result = np.zeros((by_rays.shape[1], len(self.names)))
+        lens = by_rays[2 : 2 + len(LENS)]
+        result[:, : len(self.intrinsics.names)] = lens.T @ self.intrinsics.map
+        if view.window:
+            for name in WINDOW:
+                self.add(result, name, by_rays[COLUMNS.index(name)])
+        if view.medium is not None and view.window:
+            self.add(result, self._index_name(view), by_rays[COLUMNS.index("medium_index")])
+        if by_sheet is not None:
+            for name, column in zip(SHEET, by_sheet[:5], strict=True):
+                self.add(result, name, column)
+            if view.medium is not None:
+                self.add(result, self._index_name(view), by_sheet[5])
+        return result
+
+    def value(self, values: np.ndarray, name: str) -> float:
+        """A parameter but the lens's; zero for one that is not estimated."""
+        return float(values[self.names.index(name)]) if name in self.priors else 0.0
+
+    def add(self, by_shared: np.ndarray, name: str, column: np.ndarray) -> None:
+        """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
+        if name in self.priors:
+            by_shared[:, self.names.index(name)] += column
+
+    def _index_name(self, view: View) -> str:
+        return f"index of {self.media[view.medium]}"
+
+    def _sheet_values(self, values: np.ndarray) -> np.ndarray:
+        return np.array([self.value(values, name) for name in SHEET])

@@ -1,0 +1,194 @@
+"""Where the joint estimate starts: a camera of a single viewpoint, poses seen by it, and a plane as sheet."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from uwlts.calibration.camera_poses import solve_camera
+from uwlts.calibration.camera_start import placement_pose
+from uwlts.calibration.evidence import AirEvidence
+from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
+from uwlts.calibration.joint.observations import TargetEvidence
+from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.sheet_jets import DescribedSheet
+from uwlts.calibration.model import Calibration, CameraModel, SheetModel, WindowModel
+from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
+from uwlts.calibration.sheet import fit_sheet, object_frame
+from uwlts.calibration.target_placement import Placement, placements, single_images
+from uwlts.camera import directions
+from uwlts.errors import CalibrationError
+from uwlts.placement import camera_from_object, laser_pose
+from uwlts.refraction import trace_window
+from uwlts.sensor import Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Images of the target seen through the same.
+
+    Attributes
+    ----------
+    view : View
+    found : AirEvidence
+    approaching : bool or None
+        Whether the stage moves the sensor towards the target; None where it moves otherwise.
+    names : list of str
+        Of the captures.
+    """
+
+    view: View
+    found: AirEvidence
+    approaching: bool | None
+    names: list[str]
+
+    def placements(self, *, free: bool) -> list[Placement]:
+        """The images joined by the stage's motion, or one by one."""
+        if free or self.approaching is None:
+            return single_images(self.found.images)
+        return placements(self.found.images, approaching=self.approaching)
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesStart:
+    """Start of lens (L,) and of all placements' own parameters, with the stripes that lie on the target."""
+
+    intrinsics: Intrinsics
+    lens: np.ndarray
+    evidence: list[TargetEvidence]
+    own: list[np.ndarray]
+
+    def calibration(self, sensor: Sensor, window: WindowModel | None, model: SheetModel) -> Calibration:
+        """A calibration of the start, good enough to tell the treads of a step apart."""
+        frame = object_frame(model, laser_axis=laser_pose(sensor).axis)
+        return Calibration(
+            sensor_name=sensor.name, stripe_along=sensor.camera.stripe_along,
+            wavelength_nm=sensor.laser.wavelength_nm, camera=self.intrinsics.model(self.lens), window=window,
+            sheet=model, camera_from_object=tuple(map(tuple, frame.tolist())),
+        )  # fmt: skip
+
+
+def series_start(
+    series: Sequence[Series], sensor: Sensor, window: WindowModel | None, indices: Sequence[float], *,
+    options: CameraOptions, free: bool, margin_mm: float | None,
+) -> SeriesStart:  # fmt: skip
+    """Camera from the series that the window disturbs least, poses of all series, stripes that fall on the target.
+
+    Seen paraxially through the window, a plate d away from the pupil, t thick, of the index g, the medium of the index
+    n looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
+    """
+    image = sensor.camera
+    intrinsics = Intrinsics(options, width_px=image.width_px, height_px=image.height_px)
+    base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
+    staged = not free and base.approaching is not None
+    seen = solve_camera(
+        base.found.images, width_px=image.width_px, height_px=image.height_px,
+        poses="stage-normal" if staged else "free", approaching=bool(base.approaching), options=options,
+    ).model  # fmt: skip
+    lens = intrinsics.from_model(seen)
+    index = _index(base.view, indices)
+    for place, name in enumerate(intrinsics.names):
+        lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
+    camera, evidence, own = intrinsics.model(lens), [], []
+    for part in series:
+        index, through = _index(part.view, indices), window if part.view.window else None
+        alone = free or part.approaching is None
+        for placement in part.placements(free=free):
+            pose = _pose(camera, placement, through, index)
+            piece = _evidence(part, placement, camera, through, pose, sensor, index, margin_mm, staged=not alone)
+            evidence.append(piece)
+            own.append(pose if alone else np.concatenate([pose, np.zeros(2 + len(piece.images()))]))
+    return SeriesStart(intrinsics, lens, evidence, own)
+
+
+def sheet_start(
+    start: SeriesStart, sensor: Sensor, window: WindowModel | None, indices: Sequence[float]
+) -> tuple[DescribedSheet, np.ndarray] | None:
+    """The sheet as described, and turns and shift (3,) to the plane through the stripes that the window disturbs least.
+
+    None where no stripe falls on the target.
+
+    Raises
+    ------
+    CalibrationError
+        The stripes do not lie on a plane, or do not determine one.
+    """
+    views = {e.view for e in start.evidence if len(e.stripe_pixels)}
+    if not views:
+        return None
+    view = min(views, key=lambda v: (v.medium is not None, v.window))
+    camera, through = start.intrinsics.model(start.lens), window if view.window else None
+    points = []
+    for piece, own in zip(start.evidence, start.own, strict=True):
+        if piece.view == view and len(piece.stripe_pixels):
+            at = _on_target(
+                camera, through, _index(view, indices), piece.stripe_pixels, own, piece.stripe_shifts_mm,
+                piece.placement.direction(np.empty(0)),
+            )  # fmt: skip
+            rotation = cv2.Rodrigues(own[:3])[0]
+            points.append((at - piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))) @ rotation.T
+                          + own[3:6])  # fmt: skip
+    pose, plate = laser_pose(sensor), sensor.laser.window
+    sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal).model
+    normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
+    middle = camera_from_object(sensor)[:3, 3]
+    outer = plate.distance_mm + plate.thickness_mm if plate.mounted else 0.0
+    described = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
+    turns = (normal @ pose.axis / along, normal @ pose.fan / along)
+    return described, np.array([*turns, sheet.offset_mm - normal @ middle])
+
+
+def _index(view: View, indices: Sequence[float]) -> float:
+    return 1.0 if view.medium is None else indices[view.medium]
+
+
+def _pose(camera: CameraModel, placement: Placement, window: WindowModel | None, index: float) -> np.ndarray:
+    """Rotation vector and shift (6,) of a placement, seen through the window as if from a single viewpoint."""
+    rays = directions(camera, placement.pixels)
+    if not np.isfinite(rays).all():
+        raise CalibrationError("the distortion found first has no inverse where the target is seen: fix some of it")
+    seen = replace(placement, pixels=rays[:, :2] / rays[:, 2:])
+    pose = placement_pose(seen, np.diag([index, index, 1.0]))
+    if window is not None:
+        outer = window.distance_mm + window.thickness_mm
+        pose[5] += outer - index * (window.distance_mm + window.thickness_mm / window.glass_index)
+    return pose
+
+
+def _evidence(
+    series: Series, placement: Placement, camera: CameraModel, window: WindowModel | None, pose: np.ndarray,
+    sensor: Sensor, index: float, margin_mm: float | None, *, staged: bool,
+) -> TargetEvidence:  # fmt: skip
+    found = series.found
+    numbers = np.unique(placement.image)
+    pixels = np.vstack([found.stripes[number] for number in numbers])
+    image = np.repeat(numbers, [len(found.stripes[number]) for number in numbers])
+    stage_mm = np.array([entry.stage_mm for entry in found.images])
+    shifts = stage_mm[image] - stage_mm[placement.image[0]] if staged else np.zeros(len(image))
+    extent = plate_extent(found.target)
+    margin = lattice_spacing(found.target) / 2 if margin_mm is None else margin_mm
+    at = _on_target(camera, window, index, pixels, pose, shifts, placement.direction(np.empty(0)))
+    hull = ConvexHull(extent).equations
+    with np.errstate(invalid="ignore"):
+        on_target = (at[:, :2] @ hull[:, :2].T + hull[:, 2] <= margin).all(axis=1)
+    middle = extent.mean(axis=0)
+    return TargetEvidence(
+        view=series.view, placement=placement, stripe_pixels=pixels[on_target], stripe_image=image[on_target],
+        stripe_shifts_mm=shifts[on_target], across=1 if sensor.camera.stripe_along == "width" else 0, staged=staged,
+        radius_mm=float(np.linalg.norm(extent - middle, axis=1).max()), middle_mm=middle,
+    )  # fmt: skip
+
+
+def _on_target(
+    camera: CameraModel, window: WindowModel | None, index: float, pixels: np.ndarray, pose: np.ndarray,
+    shifts_mm: np.ndarray, direction: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Where rays meet the target: (N, 3) in its frame; NaN where one does not."""
+    rays = trace_window(directions(camera, pixels), window, medium_index=index)
+    rotation = cv2.Rodrigues(pose[:3])[0]
+    start = (rays.origins - pose[3:6]) @ rotation + shifts_mm[:, None] * direction
+    along = rays.directions @ rotation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return start - (start[:, 2] / along[:, 2])[:, None] * along

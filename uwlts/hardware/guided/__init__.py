@@ -1,0 +1,1 @@
+"""A guided calibration with camera and stage: what is planned, asked for, judged, shown and recorded."""

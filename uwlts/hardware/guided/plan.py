@@ -1,0 +1,232 @@
+"""What a guided calibration shall do: a TOML file with sensor, camera, stage, target, step and what is wanted."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from uwlts.calibration.camera_poses import Poses
+from uwlts.calibration.guidance.solution import Setting, without_window
+from uwlts.calibration.guidance.wishes import Wanted
+from uwlts.capture import CaptureHeader
+from uwlts.errors import DescriptionError, RangeError
+from uwlts.hardware.scan_plan import ScanPlan, StagePlan
+from uwlts.library import find, read_table, validated
+from uwlts.metrology.artefact_descriptions import StepStandard
+from uwlts.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.targets import parse_target
+
+
+class GuidedStage(Description):
+    """The stage, which also switches the laser; for free poses it stands still.
+
+    The target is shown at ``positions_mm``, or at ``count`` positions from ``first_mm`` to ``last_mm``, in the stage's
+    own coordinate. ``direction`` is where growing positions move the sensor, in the OCS. ``home`` finds the limit
+    switch first; without it the position that the controller counts is taken as it is.
+    """
+
+    port: str | None = None
+    positions_mm: tuple[float, ...] = ()
+    first_mm: float | None = None
+    last_mm: float | None = None
+    count: Annotated[int, Field(ge=2, le=1000)] = 12
+    direction: Vector = (0.0, 0.0, 1.0)
+    feed_mm_per_min: Positive = 300.0
+    settle_s: NotNegative | None = None
+    home: bool = False
+
+    @model_validator(mode="after")
+    def _one_way_to_tell(self) -> "GuidedStage":
+        ends = self.first_mm is not None, self.last_mm is not None
+        if any(ends) != all(ends) or (self.positions_mm and any(ends)):
+            raise ValueError("give positions_mm, or first_mm and last_mm with count, not parts of both")
+        return self
+
+    def places_mm(self) -> list[float]:
+        """All positions in their order; empty where none are told."""
+        if self.first_mm is None:
+            return list(self.positions_mm)
+        return np.linspace(self.first_mm, self.last_mm, self.count).tolist()
+
+
+class GuidedStep(Description):
+    """The step standard in the medium of use: put up near, in the middle and far, each time seen at ``positions_mm``.
+
+    Without positions the stage stands still. ``height_mm`` and the others are as `StepStandard` has them.
+    """
+
+    medium: str
+    height_mm: Positive
+    height_uncertainty_mm: NotNegative | None = None
+    reference: Literal["lower", "upper"] = "lower"
+    edge_mm: NotNegative = 1.0
+    positions_mm: tuple[float, ...] = ()
+    direction: Vector = (1.0, 0.0, 0.0)
+
+    def artefact(self) -> dict[str, Any]:
+        """The standard as captures name it."""
+        told = self.model_dump(include={"height_mm", "height_uncertainty_mm", "reference", "edge_mm"})
+        return StepStandard.model_validate(told).model_dump(exclude_none=True)
+
+
+class WantedPlan(Description):
+    """When the target images are enough; tilts in deg."""
+
+    focal_std_px: Positive = 0.5
+    centre_std_px: Positive = 0.5
+    coverage: Annotated[float, Field(gt=0, le=1)] = 0.85
+    tilt_deg: NotNegative = 12.0
+    fewest_images: Annotated[int, Field(ge=3)] = 8
+
+    def wanted(self) -> Wanted:
+        """The same in rad."""
+        return Wanted(
+            focal_std_px=self.focal_std_px, centre_std_px=self.centre_std_px, coverage=self.coverage,
+            tilt_rad=float(np.radians(self.tilt_deg)), fewest_images=self.fewest_images,
+        )  # fmt: skip
+
+
+class GuidedPlan(Description):
+    """A guided calibration as read from TOML.
+
+    The target stands in ``medium``; ``window_mounted`` tells whether the camera sees it through its window, as it does
+    in any medium but air. ``poses`` are as for `solve_camera`. Exposures are in ms or "auto". A free pose is taken once
+    the target has stood still for ``still_s``.
+    """
+
+    title: str
+    sensor: str = "thesis"
+    camera: str | None = None
+    medium: str = "air"
+    window_mounted: bool | None = None
+    poses: Poses = "free"
+    target: dict[str, Any]
+    stage: GuidedStage | None = None
+    step: GuidedStep | None = None
+    wanted: WantedPlan = WantedPlan()
+    most_images: Annotated[int, Field(ge=3)] = 40
+    laser_ms: Positive | Literal["auto"] = "auto"
+    lamp_ms: Positive | Literal["auto"] = "auto"
+    gain_db: float | None = None
+    laser_power: Annotated[float, Field(gt=0, le=1)] = 1.0
+    still_s: NotNegative = 0.8
+
+    @model_validator(mode="after")
+    def _stage_for_its_poses(self) -> "GuidedPlan":
+        if self.poses != "free" and (self.stage is None or len(self.stage.places_mm()) < 2):
+            raise ValueError(
+                f"poses '{self.poses}' need a [stage] with two positions or more: positions_mm, or first_mm and last_mm"
+            )
+        return self
+
+    def goal(self) -> Wanted:
+        """When the target images are enough; no more of them than there are positions of the stage."""
+        wanted = self.wanted.wanted()
+        if self.poses == "free" or self.stage is None:
+            return wanted
+        return replace(wanted, fewest_images=min(wanted.fewest_images, len(self.stage.places_mm())))
+
+    def connected(self, *, camera: str | None, port: str | None) -> "GuidedPlan":
+        """The plan with another address of the camera, or another port of the stage, if these are given."""
+        stage = self.stage if port is None else (self.stage or GuidedStage()).model_copy(update={"port": port})
+        return self.model_copy(update={"camera": camera or self.camera, "stage": stage})
+
+    def target_in_air(self) -> bool:
+        """Whether the target stands in air; DescriptionError where the sensor does not know the medium."""
+        return self.described_sensor().medium(self.medium).kind == "air"
+
+    def described_sensor(self) -> Sensor:
+        """The sensor of the plan, with its window; DescriptionError where it is unknown or not valid."""
+        path = find(self.sensor, "sensors")
+        return validated(Sensor, read_table(path, "sensors"), path)
+
+    def setting(self) -> Setting:
+        """How the target is seen.
+
+        Raises
+        ------
+        DescriptionError
+            Sensor, medium or target are not valid.
+        """
+        sensor = self.described_sensor()
+        medium = sensor.medium(self.medium)
+        mounted = medium.kind != "air" if self.window_mounted is None else self.window_mounted
+        approaching = self.stage is None or self.stage.direction[2] > 0
+        return Setting(
+            sensor=sensor if mounted else without_window(sensor), target=parse_target(self.target), medium=medium,
+            poses=self.poses, approaching=approaching,
+        )  # fmt: skip
+
+    def target_header(self, name: str, *, provenance: dict[str, Any]) -> CaptureHeader:
+        """Header of the capture of the target; errors as `setting`."""
+        setting = self.setting()
+        direction = (0.0, 0.0, 1.0) if self.stage is None else self.stage.direction
+        return self._header(name, setting.sensor, self.medium, direction, provenance, target=self.target)
+
+    def step_header(self, name: str, *, provenance: dict[str, Any]) -> CaptureHeader:
+        """Header of the capture of the step standard; DescriptionError where sensor or medium are not valid."""
+        return self._header(
+            name, self.described_sensor(), self.step.medium, self.step.direction, provenance,
+            artefact=self.step.artefact(),
+        )  # fmt: skip
+
+    def _header(
+        self, name: str, sensor: Sensor, medium: str, direction: Vector, provenance: dict[str, Any], **shown: Any
+    ) -> CaptureHeader:
+        unit = StagePlan(start_mm=0.0, direction=direction).direction
+        table = {
+            "name": name, "sensor": sensor, "medium_name": medium, "medium": sensor.medium(medium),
+            "stage_direction": unit, "saturation_dn": sensor.detector.full_scale_dn(), "provenance": provenance,
+        }  # fmt: skip
+        return validated(CaptureHeader, table | shown, f"the plan '{self.title}'")
+
+    def scan_plan(self, *, medium: str, positions_mm: list[float]) -> ScanPlan:
+        """The plan of the same images for the rig that takes them."""
+        stage = self.stage or GuidedStage()
+        first, last = (positions_mm[0], positions_mm[-1]) if positions_mm else (0.0, 0.0)
+        return ScanPlan(
+            title=self.title, sensor=self.sensor, medium=medium, lights=("lamp", "laser"), laser_ms=self.laser_ms,
+            lamp_ms=self.lamp_ms, gain_db=self.gain_db, laser_power=self.laser_power,
+            stage=StagePlan(
+                start_mm=first, step_mm=1.0 if last >= first else -1.0, feed_mm_per_min=stage.feed_mm_per_min,
+                settle_s=stage.settle_s,
+            ),
+        )  # fmt: skip
+
+
+def load_guided_plan(path: Path) -> GuidedPlan:
+    """Plan in a TOML file; a sensor beside it is found by its file name.
+
+    Raises
+    ------
+    DescriptionError
+        The file is missing, no TOML, or holds an unknown or wrong key; sensor, medium or target are not valid.
+    """
+    if not path.is_file():
+        raise DescriptionError(f"no plan at {path}: write one that tells sensor and target (docs/calibrate-live.md)")
+    table = read_table(path)
+    beside = path.parent / str(table.get("sensor", ""))
+    if beside.suffix == ".toml" and beside.is_file():
+        table["sensor"] = str(beside)
+    plan = validated(GuidedPlan, table, path)
+    plan.setting()
+    if plan.step is not None:
+        plan.described_sensor().medium(plan.step.medium)
+        if not plan.target_in_air():
+            raise DescriptionError(
+                f"{path}: the target stands in {plan.medium} and a [step] is planned; a target there tells the "
+                "window's distance itself: leave out [step], or set medium to air"
+            )
+    return plan
+
+
+def check_positions(positions_mm: list[float], *, limits_mm: tuple[float, float]) -> None:
+    """Refuse positions outside the travel before anything moves; RangeError."""
+    low, high = limits_mm
+    outside = [position for position in positions_mm if not low <= position <= high]
+    if outside:
+        raise RangeError(
+            f"the plan asks for {outside[0]:g} mm, the stage moves from {low:g} to {high:g} mm: change its positions"
+        )

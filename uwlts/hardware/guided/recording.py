@@ -1,0 +1,234 @@
+"""A guided calibration: leads through the poses of the target, then of the step standard, and records what is good.
+
+The captures are ordinary ones, from which the calibration can be repeated. Whatever ends the recording, they keep what
+was accepted, and the laser goes off.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+import uwlts
+from uwlts.calibration.guidance.solution import Setting
+from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
+from uwlts.calibration.guidance.wishes import State
+from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.procedure import CalibrationOptions, calibrate, nominal_window
+from uwlts.capture import Capture, CaptureHeader, CaptureWriter, part_path
+from uwlts.errors import DescriptionError, RangeError
+from uwlts.hardware.camera import open_camera
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.guided.attempt import Attempts
+from uwlts.hardware.guided.images import GuidedImages
+from uwlts.hardware.guided.operator import HandSwitchedLaser, Operator
+from uwlts.hardware.guided.page import GuidedPage
+from uwlts.hardware.guided.plan import GuidedPlan, check_positions
+from uwlts.hardware.guided.step import StepJudge, StepPhase
+from uwlts.hardware.guided.target import TargetPhase, places_left, recorded_poses, still_missing
+from uwlts.hardware.rig import Rig
+from uwlts.hardware.scan_plan import Light
+from uwlts.hardware.scanning import check_camera
+
+
+@dataclass(frozen=True)
+class GuidedRecording:
+    """What was recorded: captures of the target and, if planned, of the step standard; what is still missing."""
+
+    target: Path
+    step: Path | None
+    missing: tuple[str, ...]
+
+
+def target_path(out: Path) -> Path:
+    """Capture of the target beside the calibration."""
+    return out.with_name(f"{out.stem}-target.h5")
+
+
+def step_path(out: Path) -> Path:
+    """Capture of the step standard beside the calibration."""
+    return out.with_name(f"{out.stem}-step.h5")
+
+
+def record_guided(
+    plan: GuidedPlan,
+    out: Path,
+    *,
+    page: GuidedPage,
+    operator: Operator,
+    resume: bool = False,
+    overwrite: bool = False,
+    refractions: Literal[1, 2] = 2,
+    camera: CameraOptions | None = None,
+) -> GuidedRecording:
+    """Lead through a plan and record it beside the calibration that it is for.
+
+    Parameters
+    ----------
+    out : Path
+        The calibration; captures are called like it, with ``-target.h5`` and ``-step.h5``.
+    resume : bool
+        Go on with what is recorded, also with a finished capture of the target that is not enough.
+    overwrite : bool
+        Begin anew.
+    refractions, camera
+        As the calibration is going to be made.
+
+    Raises
+    ------
+    DescriptionError, RangeError
+        The plan cannot be carried out; nothing has moved.
+    HardwareError
+        Camera, stage or laser fail.
+    CalibrationError
+        The target does not give a calibration by which the step standard could be judged.
+    OutputError
+        A capture exists, or cannot be written.
+    """
+    if plan.camera is None:
+        raise DescriptionError("neither the plan nor the command line tells the camera: give --camera")
+    if plan.stage is not None and plan.stage.port is None:
+        raise DescriptionError("neither the plan nor the command line tells the stage's port: give --stage")
+    camera = camera or CameraOptions()
+    setting = replace(plan.setting(), camera=camera)
+    phase = _Phases(plan, setting, page, operator, resume, overwrite)
+    state = phase.target(target_path(out))
+    if plan.step is None:
+        return GuidedRecording(target_path(out), None, tuple(still_missing(state)))
+    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=camera)
+    with Capture(target_path(out)) as capture:
+        in_air = calibrate([capture], (), options=options).calibration
+    sensor = plan.described_sensor()
+    window = nominal_window(sensor.camera.window, sensor, refractions=refractions)
+    unseen = phase.step(step_path(out), StepJudge(plan, sensor, in_air, window))
+    return GuidedRecording(target_path(out), step_path(out), (*still_missing(state), *unseen))
+
+
+@dataclass(frozen=True)
+class _Phases:
+    """Both parts of the recording, each with camera and stage opened for it: between them the tank is worked at."""
+
+    plan: GuidedPlan
+    setting: Setting
+    page: GuidedPage
+    operator: Operator
+    resume: bool
+    overwrite: bool
+
+    def target(self, path: Path) -> State:
+        """Record the target; how far that leads."""
+        full = self.setting.sensor.detector.full_scale_dn()
+        if self.resume and path.is_file() and not part_path(path).exists():
+            done = Attempts(None, self.setting, self.plan.goal(), full_dn=full)
+            with Capture(path) as capture:
+                state = done.state(recorded_poses(capture, done))
+            if not self._to_go_on(state):
+                self.operator.say(f"{path.name} is complete: {len(state.recorded)} poses")
+                return state
+            os.replace(path, part_path(path))
+        positions = [] if self.plan.poses == "free" else self.plan.stage.places_mm()
+        with self._opened(self.plan.medium, positions) as (rig, provenance, dtype):
+            header = self.plan.target_header(path.stem, provenance=provenance)
+            known, before_s = _left_over(path) if self.resume else ({}, 0.0)
+            scan = self.plan.scan_plan(medium=self.plan.medium, positions_mm=positions)
+            images = GuidedImages(rig, scan, self.setting.sensor, dtype=dtype, known_ms=known)
+            attempts = Attempts(images, self.setting, self.plan.goal(), full_dn=full)
+            state = attempts.state(self._before(path, attempts))
+            with self._writer(path, header, dtype) as writer:
+                phase = TargetPhase(
+                    self.plan, self.setting, images=images, attempts=attempts, operator=self.operator, page=self.page,
+                    writer=writer, before_s=before_s,
+                )  # fmt: skip
+                return phase.run(state)
+
+    def _to_go_on(self, state: State) -> bool:
+        """Whether a finished recording of the target is not enough, and more poses can be taken."""
+        if self.plan.poses == "free":
+            return bool(still_missing(state)) and len(state.recorded) < self.plan.most_images
+        return bool(places_left(self.plan, state))
+
+    def _before(self, path: Path, attempts: Attempts) -> list[Any]:
+        if not (self.resume and part_path(path).exists()):
+            return []
+        with Capture(part_path(path)) as capture:
+            return recorded_poses(capture, attempts)
+
+    def step(self, path: Path, judge: StepJudge) -> list[str]:
+        """Record the step standard; what is missing of it."""
+        plan, seen = self.plan.step, []
+        if self.resume:
+            left = part_path(path) if part_path(path).exists() else path
+            if left.is_file():
+                with Capture(left) as capture:
+                    seen = judge.depths_mm(capture)
+            if left == path and path.is_file():
+                if next_depth_mm(seen, judge.sensor) is None:
+                    self.operator.say(f"{path.name} is complete")
+                    return []
+                os.replace(path, part_path(path))
+        request = f"bring the sensor into {plan.medium}, with its window, and the step standard before it"
+        self.page.request(request)
+        self.operator.wait(request)
+        with self._opened(plan.medium, list(plan.positions_mm)) as (rig, provenance, dtype):
+            header = self.plan.step_header(path.stem, provenance=provenance)
+            known, before_s = _left_over(path) if self.resume else ({}, 0.0)
+            scan = self.plan.scan_plan(medium=plan.medium, positions_mm=list(plan.positions_mm))
+            images = GuidedImages(rig, scan, judge.sensor, dtype=dtype, known_ms=known)
+            with self._writer(path, header, dtype) as writer:
+                phase = StepPhase(
+                    self.plan, judge, images=images, operator=self.operator, page=self.page, writer=writer,
+                    before_s=before_s,
+                )  # fmt: skip
+                seen = phase.run(seen)
+        count = len(apart_mm(seen, judge.sensor))
+        return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
+
+    def _writer(self, path: Path, header: CaptureHeader, dtype: np.dtype) -> CaptureWriter:
+        return CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume)
+
+    @contextmanager
+    def _opened(self, medium: str, positions_mm: list[float]) -> Iterator[tuple[Rig, dict[str, Any], np.dtype]]:
+        """Camera and stage, ready to take images, with what captures tell of them."""
+        sensor = self.setting.sensor
+        with self._stage(positions_mm) as stage, open_camera(self.plan.camera) as camera:
+            check_camera(camera, sensor)
+            provenance = {
+                "source": "guided calibration", "title": self.plan.title,
+                "camera": f"{camera.info.name} {camera.info.serial}".strip(),
+                "stage": "none" if self.plan.stage is None else f"Grbl {stage.version}",
+                "laser_power": self.plan.laser_power, "uwlts": uwlts.__version__,
+            }  # fmt: skip
+            dtype = np.dtype(np.uint16) if camera.info.bits > 8 else np.dtype(np.uint8)
+            scan = self.plan.scan_plan(medium=medium, positions_mm=positions_mm)
+            yield Rig(scan, sensor, camera, stage), provenance, dtype
+
+    @contextmanager
+    def _stage(self, positions_mm: list[float]) -> Iterator[GrblStage | HandSwitchedLaser]:
+        told = self.plan.stage
+        if told is None:
+            yield HandSwitchedLaser(self.operator)
+            return
+        with GrblStage(told.port) as stage:
+            check_positions(positions_mm, limits_mm=stage.limits_mm)
+            fastest = stage.settings.max_feed_mm_per_min
+            if told.feed_mm_per_min > fastest:
+                raise RangeError(f"feed_mm_per_min is {told.feed_mm_per_min:g}, the stage does at most {fastest:g}")
+            if told.home:
+                stage.home()
+            elif not stage.position_known:
+                stage.unlock()
+            yield stage
+
+
+def _left_over(path: Path) -> tuple[dict[Light, float], float]:
+    """Exposures in ms of an interrupted recording, and the time in s of its last image."""
+    if not part_path(path).exists():
+        return {}, 0.0
+    with Capture(part_path(path)) as capture:
+        lights = ["laser" if on else "lamp" for on in capture.laser_on.tolist()]
+        known = dict(zip(lights, capture.exposure_ms.tolist(), strict=True))
+        return known, float(capture.time_s[-1]) if len(capture) else 0.0

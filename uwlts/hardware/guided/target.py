@@ -1,0 +1,226 @@
+"""The target's part of a guided calibration: at the stage's positions, or wherever the operator is led to hold it."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from uwlts.calibration.guidance.quality import judge_novelty, way_px
+from uwlts.calibration.guidance.solution import RecordedPose, Setting, pose_of
+from uwlts.calibration.guidance.wishes import State, Wish, best_wish, gain_of, missing, missing_sheet, wish_words
+from uwlts.capture import Capture, CaptureWriter, Frame
+from uwlts.hardware.guided.attempt import Attempt, Attempts, Found
+from uwlts.hardware.guided.images import GuidedImages
+from uwlts.hardware.guided.operator import Operator
+from uwlts.hardware.guided.page import GuidedPage
+from uwlts.hardware.guided.plan import GuidedPlan
+from uwlts.targets import TargetView
+
+_TRIES = 3
+_SAME_POSITION_MM = 0.02
+# Free poses have no stage position; this tells their images apart without looking like a way that the stage went.
+_NUMBER_MM = 1e-3
+# A pose is taken without being asked for if it helps this much of what the best one would.
+_USEFUL = 0.25
+_RESETTLE_S = 2.0
+
+
+def recorded_poses(capture: Capture, attempts: Attempts) -> list[RecordedPose]:
+    """The poses that a capture of the target holds, as they were judged when they were taken."""
+    stripes = {float(capture.stage_mm[k]): image for k, image in capture.frames(laser_on=True)}
+    poses = []
+    for frame, image in capture.frames(laser_on=False):
+        view, stage_mm = attempts.find(image).view, float(capture.stage_mm[frame])
+        if view is not None:
+            shown = stage_mm in stripes
+            stripe = attempts.stripe(stripes[stage_mm], view).pixels if shown else np.empty((0, 2))
+            poses.append(RecordedPose(view, stripe, stage_mm))
+    return poses
+
+
+def still_missing(state: State) -> list[str]:
+    """What camera and laser sheet still lack."""
+    return [*missing(state), *missing_sheet(state)]
+
+
+def places_left(plan: GuidedPlan, state: State) -> list[float]:
+    """Stage positions of a plan that are not recorded yet; none for free poses."""
+    if plan.poses == "free" or plan.stage is None:
+        return []
+    done = np.array([pose.stage_mm for pose in state.recorded])
+    return [place for place in plan.stage.places_mm() if not (np.abs(done - place) <= _SAME_POSITION_MM).any()]
+
+
+class TargetPhase:
+    """Records poses of the target until what is wanted is reached.
+
+    Parameters
+    ----------
+    clock : callable
+        Time in s.
+    """
+
+    def __init__(
+        self,
+        plan: GuidedPlan,
+        setting: Setting,
+        *,
+        images: GuidedImages,
+        attempts: Attempts,
+        operator: Operator,
+        page: GuidedPage,
+        writer: CaptureWriter,
+        before_s: float,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._plan, self._setting, self._images, self._attempts = plan, setting, images, attempts
+        self._operator, self._page, self._writer, self._clock = operator, page, writer, clock
+        self._start_s = clock() - before_s
+        self._settled_s = -np.inf
+
+    def run(self, state: State) -> State:
+        """Go on from a state; how far it came.
+
+        Raises
+        ------
+        HardwareError
+            Camera, stage or laser fail.
+        OutputError
+            The capture cannot be written.
+        """
+        self._show_state(state)
+        return self._free(state) if self._plan.poses == "free" else self._by_stage(state)
+
+    def _by_stage(self, state: State) -> State:
+        places = places_left(self._plan, state)
+        for number, place in enumerate(places):
+            self._page.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
+            position = self._images.move_to(place)
+            for _ in range(_TRIES):
+                attempt = self._attempts.attempt(state, position)
+                state = self._done(attempt, state, f"{position:.2f} mm")
+                if not attempt.reasons or not self._can_change(attempt):
+                    break
+        return state
+
+    def _can_change(self, attempt: Attempt) -> bool:
+        """Whether another attempt at the same place may be better: another exposure, or a target come to rest."""
+        if any(reason.startswith("moved") for reason in attempt.reasons):
+            return True
+        return self._improve_light(attempt.reasons)
+
+    def _free(self, state: State) -> State:
+        watch = _Watch(self._plan.still_s, self._clock)
+        wish, refused = None, []
+        while still_missing(state) and len(state.recorded) < self._plan.most_images:
+            found = self._attempts.look()
+            wish = wish or best_wish(state, spin_rad=_spin(None if found.reasons else found.view, state))
+            answer = self._operator.answer()
+            if answer == "done":
+                break
+            watch.see(found.view)
+            self._improve_light(found.reasons)
+            reasons = self._why_wait(found, state, wish, [*(p.view for p in state.recorded), *refused])
+            self._lead(found, state, wish, reasons)
+            if answer is None and (reasons or not watch.still):
+                continue
+            attempt = self._attempts.attempt(state, _NUMBER_MM * self._next_number(state))
+            state = self._done(attempt, state, f"image {len(state.recorded) + 1}")
+            watch.see(None)
+            if attempt.reasons:
+                refused = [attempt.found.view] if attempt.found.view is not None else []
+            else:
+                wish = None
+        return state
+
+    def _next_number(self, state: State) -> int:
+        return 1 + max((round(pose.stage_mm / _NUMBER_MM) for pose in state.recorded), default=0)
+
+    def _why_wait(self, found: Found, state: State, wish: Wish | None, known: list[TargetView]) -> tuple[str, ...]:
+        """Why the target as it stands need not be taken."""
+        reasons = found.reasons or judge_novelty(found.view, known, self._attempts.limits)
+        if reasons or wish is None or missing_sheet(state):
+            return reasons
+        gain = gain_of(state, found.view, pose_of(found.view, state.camera))
+        return () if gain >= _USEFUL * wish.gain else ("adds little to what there is",)
+
+    def _lead(self, found: Found, state: State, wish: Wish | None, reasons: tuple[str, ...]) -> None:
+        """Show the image, and say what to do next."""
+        pose = None if found.reasons else pose_of(found.view, state.camera)
+        sheet = missing_sheet(state)
+        words = "move the target" if wish is None else wish_words(wish, state, pose)
+        if sheet and not missing(state):
+            words = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
+        self._page.request(words if reasons else "hold it still")
+        self._operator.hint(f"next: {words if wish is None or sheet else wish_words(wish, state, None)}")
+        points = None if found.view is None else found.view.pixels
+        self._page.live(
+            found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=None,
+            remark="; ".join(reasons) or "good",
+        )  # fmt: skip
+
+    def _improve_light(self, reasons: tuple[str, ...]) -> bool:
+        """Settle the lamp's exposure anew where an image was too bright or too dark, but not all the time."""
+        light = any(reason.startswith(("saturated", "faint", "too dark")) for reason in reasons)
+        if not light or self._clock() - self._settled_s < _RESETTLE_S:
+            return False
+        changed = self._images.resettle("lamp")
+        self._settled_s = self._clock()
+        return changed
+
+    def _done(self, attempt: Attempt, state: State, name: str) -> State:
+        """Record what was accepted, and say what became of it; the state after it."""
+        if not attempt.reasons:
+            self._record(attempt)
+            state = attempt.state
+        line = f"{name}: {attempt.line()}"
+        self._operator.say(line)
+        self._page.add(line)
+        stripe = attempt.pose.stripe if attempt.pose else None
+        points = attempt.found.view.pixels if attempt.found.view is not None else None
+        self._page.live(
+            attempt.found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=stripe, remark=line
+        )
+        self._show_state(state)
+        return state
+
+    def _record(self, attempt: Attempt) -> None:
+        stage_mm = attempt.pose.stage_mm
+        for taken, laser_on in ((attempt.lamp, False), (attempt.laser, True)):
+            if taken is not None:
+                image, exposure_ms = taken
+                self._writer.append(Frame(image, stage_mm, laser_on, exposure_ms, self._clock() - self._start_s))
+
+    def _show_state(self, state: State) -> None:
+        self._page.recorded(state.coverage, [pose.view.pixels for pose in state.recorded])
+
+
+class _Watch:
+    """Notices when the target has stood still for a moment."""
+
+    def __init__(self, still_s: float, clock: Callable[[], float]):
+        self._still_s, self._clock = still_s, clock
+        self._reference: TargetView | None = None
+        self._since = clock()
+
+    def see(self, view: TargetView | None) -> None:
+        """Look at the latest image's view, None where the target was not found."""
+        moved = view is None or self._reference is None or way_px(self._reference, view) > 0.5
+        if moved:
+            self._reference, self._since = view, self._clock()
+
+    @property
+    def still(self) -> bool:
+        """Whether it has stood still for long enough."""
+        return self._reference is not None and self._clock() - self._since >= self._still_s
+
+
+def _spin(view: TargetView | None, state: State) -> float:
+    """How the target is turned in the image, as it was last seen."""
+    if view is not None:
+        pose = pose_of(view, state.camera)
+    elif len(state.poses):
+        pose = state.poses[-1]
+    else:
+        return 0.0
+    return float(np.arctan2(pose[1, 0], pose[0, 0]))
