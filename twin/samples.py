@@ -49,11 +49,12 @@ def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """By how much the points on the pupil are shifted, cyclically, in pixels (P,): (2, P), from 0 to 1.
 
     The few points of a pixel turn a blurred edge into steps; where they lie elsewhere in neighbouring pixels, the steps
-    do too. The 16 pixels of a block 4 px square take 16 evenly spread shifts (the R2 sequence, Roberts 2018),
-    neighbours such that lie far apart.
+    do too. The 16 pixels of a block 4 px square take 8 evenly spread shifts (the R2 sequence, Roberts 2018) and their
+    negatives, whose points are mirrored about the pupil's middle: the block as a whole does not shift what it sees.
     """
     order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])[rows % 4, columns % 4]
-    return np.stack([(order * 0.7548776662466927) % 1, (order * 0.5698402909980532) % 1])
+    shift = (order % 8 + 0.5) * np.array([0.7548776662466927, 0.5698402909980532])[:, None] % 1
+    return np.where(order < 8, shift, 1 - shift)
 
 
 def _kernel(x: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ an interrupted recording keeps all its complete frames; closing it gives it its 
 """
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -245,6 +246,16 @@ class CaptureWriter:
             raise self._storage_failed(error) from error
 
 
+def _what_is_wrong(error: Exception) -> str:
+    """HDF5's words on a file that it cannot open, or the two most usual ones in plain words."""
+    found = re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error))
+    if found:
+        return f"{int(found[1]):,} of its {int(found[2]):,} bytes are there; copy it again"
+    if "file signature not found" in str(error):
+        return "it is no HDF5 file"
+    return f"HDF5 says: {error}"
+
+
 class Capture:
     """A capture opened for reading: per-frame arrays in memory, images read on demand.
 
@@ -277,7 +288,7 @@ class Capture:
             unfinished = not self.finished or has_writer(self.path)
             self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
         except _DAMAGE as error:
-            raise CaptureError(f"{self.path} is not a capture, or is truncated: HDF5 says: {error}") from error
+            raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:
             self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
             self._read_frames()

@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 import uwlts
 from uwlts.console import progress_bar, run
-from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.errors import CaptureError, DescriptionError, OutputError, RangeError
 from uwlts.files import refuse_unsuitable
 
 app = App(
@@ -233,6 +233,8 @@ def calibrate(
     air: Files = (),
     water: Files = (),
     step: Files = (),
+    spheres: Files = (),
+    new_water: Flag = False,
     joint: Flag = False,
     live: Path | None = None,
     out: Path,
@@ -265,6 +267,10 @@ def calibrate(
         The same in the medium of use, seen through the window, whose distance is found with all else.
     step
         Captures of the step standard in the medium of use; without any in it the calibration is for air only.
+    spheres
+        Scans of a sphere standard: they tell the stage's direction and, by the spheres' sizes, the water's index.
+    new_water
+        The spheres were scanned in other water than the target, or on another day: find its index for itself.
     joint
         Estimate all together; what is known before and how well is the sensor's description's.
     live
@@ -298,7 +304,9 @@ def calibrate(
     from contextlib import ExitStack
 
     from uwlts.calibration.intrinsics import CameraOptions
+    from uwlts.calibration.joint.advice import advice_lines
     from uwlts.calibration.joint.procedure import calibrate_jointly
+    from uwlts.calibration.joint.stored import is_joint
     from uwlts.calibration.model import write_calibration
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.calibration.procedure import calibrate as solve
@@ -311,7 +319,7 @@ def calibrate(
         require_index(index)
     refuse_unsuitable(out, overwrite=overwrite)
     if live is not None:
-        if air or water or step:
+        if air or water or step or spheres:
             raise DescriptionError("--live records its own captures: give either it, or --air, --water and --step")
         air, water, step, poses = _led_through(
             live, out, camera=camera, stage=stage, port=port, resume=resume, overwrite=overwrite and not resume,
@@ -321,26 +329,91 @@ def calibrate(
         raise DescriptionError("nothing to calibrate from: give --air or --water with captures of a target, or --live")
     options = CalibrationOptions(
         refractions=refractions, poses=poses, camera=CameraOptions(distortion=distortion), medium_index=index,
-        stripe=StripeOptions(method=method) if method else StripeOptions(),
+        same_water=not new_water, stripe=StripeOptions(method=method) if method else StripeOptions(),
     )  # fmt: skip
     with ExitStack() as stack, progress_bar("calibrating") as progress:
         air_captures = [stack.enter_context(Capture(path)) for path in air]
         step_captures = [stack.enter_context(Capture(path)) for path in step]
         water_captures = [stack.enter_context(Capture(path)) for path in water]
+        sphere_captures = [stack.enter_context(Capture(path)) for path in spheres]
 
         def report(stage: str, done: int, total: int) -> None:
             progress(done, total)
 
         result = (
-            calibrate_jointly([*air_captures, *water_captures], step_captures, options=options, progress=report)
-            if water or joint
+            calibrate_jointly(
+                [*air_captures, *water_captures], step_captures, sphere_captures, options=options, progress=report
+            )
+            if water or joint or spheres
             else solve(air_captures, step_captures, options=options, progress=report)
         )
     write_calibration(out, result.calibration, overwrite=overwrite)
     print("\n".join(calibration_lines(result.calibration)))
+    if is_joint(result.calibration):
+        print("\n".join(advice_lines(result.calibration)))
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(f"wrote {out}")
+
+
+@app.command
+def certificate(
+    calibration: Path,
+    *,
+    out: Path | None = None,
+    before: Path | None = None,
+    check: Path | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Write a calibration's certificate: what it was made from, where it holds, what lengths are worth, what is weak.
+
+    A page to read and print, and beside it the same as sealed JSON. With --check it is verified instead: exit code 1
+    where the certificate was changed or belongs to another calibration.
+
+    Example: uwlts certificate calibration.json --out certificate.html
+
+    Example: uwlts certificate calibration.json --check certificate.json
+
+    Parameters
+    ----------
+    calibration
+        Calibration file; only a joint one tells uncertainties.
+    out
+        Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
+    before
+        Another calibration of the same sensor to set beside it.
+    check
+        Certificate (JSON) to verify against the calibration.
+    overwrite
+        Replace existing files.
+    """
+    from datetime import UTC, datetime
+
+    from uwlts.calibration.model import read_calibration
+    from uwlts.certificate import (
+        certificate_lines,
+        certificate_of,
+        check_certificate,
+        refuse_unsuitable_page,
+        write_certificate,
+    )
+
+    if check is not None:
+        if out is not None or before is not None:
+            raise DescriptionError("--check verifies and writes nothing: give it without --out and --before")
+        against = check_certificate(check, calibration)
+        print("\n".join(against) or f"{check} is as it was issued, and is about {calibration}")
+        if against:
+            sys.exit(1)
+        return
+    page = out or calibration.with_name(f"{calibration.stem}.certificate.html")
+    refuse_unsuitable_page(page, calibration, overwrite=overwrite)
+    known = read_calibration(calibration)
+    beside = None if before is None else (before.name, read_calibration(before))
+    content = certificate_of(known, calibration, issued=datetime.now(UTC).isoformat(timespec="seconds"))
+    write_certificate(page, content, known, before=beside, overwrite=overwrite)
+    print("\n".join(certificate_lines(content)))
+    print(f"wrote {page} and {page.with_suffix('.json').name}")
 
 
 @app.command
@@ -460,7 +533,7 @@ def reconstruct(
     calibration
         Calibration of the sensor, or one by polynomials.
     out
-        Cloud to write (PLY with intensity, frame and line of every point).
+        Cloud to write (PLY with intensity, frame and line of every point, and by a joint calibration its uncertainty).
     index
         Refractive index of the medium, in place of the one that follows from the capture.
     method
@@ -470,6 +543,7 @@ def reconstruct(
     overwrite
         Replace an existing file.
     """
+    from uwlts.calibration.joint.stored import is_joint
     from uwlts.calibration.polynomial_model import read_any_calibration
     from uwlts.capture import Capture
     from uwlts.cloud import write_cloud
@@ -478,12 +552,15 @@ def reconstruct(
 
     refuse_unsuitable(out, overwrite=overwrite)
     options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
+    known = read_any_calibration(calibration)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
         scan = reconstruct_capture(
-            opened, read_any_calibration(calibration), options=options, index=index, progress=progress
+            opened, known, options=options, index=index, with_uncertainty=is_joint(known), progress=progress
         )
+        lit = int(opened.laser_on.sum())
     write_cloud(out, scan.cloud, overwrite=overwrite)
     lines = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in scan.lines_by_status.items() if count)
+    print(f"laser images with a point: {len(set(scan.cloud.frame.tolist()))} of {lit}")
     print(f"profile lines: {lines}")
     lost = {name: count for name, count in scan.rays_by_status.items() if count and name != "ok"}
     if lost:
@@ -542,6 +619,40 @@ def evaluate(
         write_cloud(coloured, judgement.cloud, overwrite=overwrite)
     print("\n".join(evaluation_lines(judgement.content)))
     print(f"wrote {out}")
+
+
+@app.command
+def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> None:
+    """Measure a known object and answer pass or fail: exit code 0 or 1.
+
+    Each calibrated size must agree with its certificate within both uncertainties (E_n at most 1, ISO/IEC 17043) and,
+    with a limit, keep it beyond doubt (ISO 14253-1).
+
+    Example: uwlts verify step.h5 --calibration calibration.json --limit 0.05
+
+    Parameters
+    ----------
+    capture
+        Scan of an artefact with calibrated sizes.
+    calibration
+        Calibration of the sensor; a joint one tells how well it measures.
+    limit
+        Largest permissible error in mm.
+    """
+    from uwlts.calibration.polynomial_model import read_any_calibration
+    from uwlts.capture import Capture
+    from uwlts.verify import verify as measured
+
+    if limit is not None and not limit > 0:
+        raise RangeError(f"--limit is {limit:g} mm; a permissible error is positive")
+    known = read_any_calibration(calibration)
+    with Capture(capture) as opened:
+        verdicts = measured(opened, known, limit_mm=limit)
+    print("\n".join(verdict.words() for verdict in verdicts))
+    if not all(verdict.passed for verdict in verdicts):
+        print("FAIL")
+        sys.exit(1)
+    print("pass")
 
 
 @app.command

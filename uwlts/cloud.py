@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,12 @@ from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError
 from uwlts.files import written_aside
+from uwlts.uncertainty.points import PAIRS, PointUncertainty
 
 NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
 
+_PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
@@ -39,6 +42,8 @@ class PointCloud:
         Image of the scan and row (or column) of that image; -1 where unknown.
     deviation_mm : (N,) float32 or None
         Signed distance to the fitted or true surface; NaN where not evaluated.
+    uncertainty : PointUncertainty or None
+        How well the points are known.
     metadata : dict
         What JSON can hold: medium, sensor, artefact, capture, digest of the calibration.
 
@@ -53,6 +58,7 @@ class PointCloud:
     frame: np.ndarray
     line: np.ndarray
     deviation_mm: np.ndarray | None = None
+    uncertainty: PointUncertainty | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -68,6 +74,12 @@ class PointCloud:
         if self.deviation_mm is not None:
             deviation = _per_point("deviation_mm", self.deviation_mm, np.float32, len(points))
             object.__setattr__(self, "deviation_mm", deviation)
+        if self.uncertainty is not None:
+            random, patterns = self.uncertainty.random_mm2, self.uncertainty.patterns_mm
+            if random.shape != (len(points), 6) or patterns.shape[1:] != points.shape:
+                raise CaptureError(
+                    f"the uncertainty of {len(points)} points has the shapes {random.shape} and {patterns.shape}"
+                )
         _as_json(self.metadata)
 
     def __len__(self) -> int:
@@ -77,8 +89,10 @@ class PointCloud:
 def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
     """Write a cloud as binary little-endian PLY, whole or not at all.
 
-    The vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). The metadata is JSON
-    in numbered comments, short enough for every reader.
+    The vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). Where the uncertainty
+    is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to systematic_zz, and
+    pattern0_x, pattern0_y and so on in mm (`PointUncertainty`). The metadata is JSON in numbered comments, short enough
+    for every reader.
 
     Raises
     ------
@@ -90,6 +104,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         dtype=[
             ("x", "<f8"), ("y", "<f8"), ("z", "<f8"),
             ("intensity", "<f4"), ("deviation", "<f4"), ("frame", "<i4"), ("line", "<i4"),
+            *((name, "<f4") for name in _uncertainty_names(cloud.uncertainty)),
         ],
     )  # fmt: skip
     vertices["x"], vertices["y"], vertices["z"] = cloud.points_mm.T
@@ -97,6 +112,9 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     vertices["deviation"] = np.nan if cloud.deviation_mm is None else cloud.deviation_mm
     vertices["frame"] = cloud.frame
     vertices["line"] = cloud.line
+    if cloud.uncertainty is not None:
+        for name, column in zip(_uncertainty_names(cloud.uncertainty), _columns(cloud.uncertainty), strict=True):
+            vertices[name] = column
     ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
     with written_aside(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
@@ -134,10 +152,36 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
             frame=_indices(path, "frame", column("frame", NO_INDEX, np.float64)),
             line=_indices(path, "line", column("line", NO_INDEX, np.float64)),
             deviation_mm=None if np.isnan(deviation).all() else deviation,
+            uncertainty=_uncertainty(names, column),
             metadata=_metadata(path, comments),
         )
     except CaptureError as error:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def _uncertainty_names(uncertainty: PointUncertainty | None) -> list[str]:
+    if uncertainty is None:
+        return []
+    covariances = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
+    return covariances + [f"pattern{m}_{axis}" for m in range(len(uncertainty.patterns_mm)) for axis in "xyz"]
+
+
+def _columns(uncertainty: PointUncertainty) -> np.ndarray:
+    """Columns (12 + 3 M, N) in the order of their names."""
+    patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
+    return np.vstack([uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, patterns])
+
+
+def _uncertainty(names: Sequence[str], column: Callable[[str, float, type], np.ndarray]) -> PointUncertainty | None:
+    known = {name.removeprefix("scalar_") for name in names}
+    count = sum(f"pattern{m}_x" in known for m in range(len(known)))
+    wanted = [f"random_{pair}" for pair in _PAIR_NAMES]
+    wanted += [f"pattern{m}_{axis}" for m in range(count) for axis in "xyz"]
+    if count == 0 or not known.issuperset(wanted):
+        return None
+    columns = np.stack([column(name, np.nan, np.float32) for name in wanted])
+    patterns = columns[6:].reshape(count, 3, -1)
+    return PointUncertainty(columns[:6].T.copy(), np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
 
 
 def _read_only(values: Any, kind: type) -> np.ndarray:

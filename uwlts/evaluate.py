@@ -15,6 +15,7 @@ from uwlts.json_file import read_json
 from uwlts.metrology.artefacts import Artefact, evaluate_cloud
 from uwlts.metrology.truth import TruthComparison, best_fit_motion, compare_with_truth
 from uwlts.truth import Truth
+from uwlts.uncertainty.figures import figure_uncertainties
 
 FORMAT = "uwlts-evaluation"
 VERSION = 1
@@ -61,6 +62,10 @@ def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, 
     if artefact is not None:
         evaluation = evaluate_cloud(cloud, artefact)
         content |= {"artefact": artefact.model_dump(mode="json"), "evaluation": evaluation.as_dict()}
+        content["uncertainty"] = {
+            name: {"random_mm": known.random_mm, "systematic_mm": known.systematic_mm, "expanded_mm": known.expanded_mm}
+            for name, known in figure_uncertainties(cloud, artefact).items()
+        }
         deviation = evaluation.deviation_mm
     return Judgement(content, replace(cloud, deviation_mm=deviation))
 

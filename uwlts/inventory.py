@@ -177,7 +177,10 @@ def evaluation_lines(content: dict[str, Any]) -> list[str]:
     """What an evaluation says."""
     lines = [f"evaluation of {content['cloud']}"]
     if evaluation := content["evaluation"]:
-        lines += [f"  {name}: {value:+.4f} mm" for name, value in evaluation["figures_mm"].items()]
+        known = content.get("uncertainty", {})
+        for name, value in evaluation["figures_mm"].items():
+            expanded = f" ± {known[name]['expanded_mm']:.4f} mm (k = 2)" if name in known else " mm"
+            lines.append(f"  {name}: {value:+.4f}{expanded}")
         lines.append(f"  points: {evaluation['points_used']} used, {evaluation['points_rejected']} rejected")
     if truth := content["truth"]:
         for name, part in (("against truth", truth), ("the same after a best-fit motion", truth["after_best_fit"])):

@@ -180,7 +180,7 @@ def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> SheetPoints:
     parallel = np.abs(approach) <= _PARALLEL
     if parallel.any():
         approach[parallel] = np.nan
-    length = gap / approach if sheet.bulge == 0.0 else sheet.crossings(rays.origins.T, rays.directions.T)[0]
+    length = gap / approach if sheet.is_plane() else sheet.crossings(rays.origins.T, rays.directions.T)[0]
     points = (rays.origins.T + length * rays.directions.T).T
     status = rays.status
     if not np.all(length > 0):

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
 from uwlts.reconstruction import ObjectPoints, reconstruct_profile
 from uwlts.refraction import RayStatus
-from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe, why_no_stripe
+from uwlts.uncertainty.propagation import point_uncertainty
 
 AnyCalibration = Calibration | PolynomialCalibration
 
@@ -57,6 +58,11 @@ def check_fits(capture: Capture, calibration: AnyCalibration) -> None:
         raise CalibrationError(
             f"{capture.path.name} has images of {camera.width_px} x {camera.height_px} pixels, the calibration is for "
             f"{model.width_px} x {model.height_px}"
+            + (
+                ": the images are turned by a quarter turn, turn them back"
+                if (camera.height_px, camera.width_px) == (model.width_px, model.height_px)
+                else ": calibrate with images of this size, or use the calibration of the camera that took these"
+            )
         )
     if camera.stripe_along != calibration.stripe_along:
         raise CalibrationError(
@@ -155,13 +161,14 @@ def find_stripes(
         amplitudes.append(stripe.amplitude[good])
         progress(number + 1, len(capture))
     if not centres:
-        raise CaptureError(f"{capture.path.name} holds no image with the laser on: nothing to reconstruct")
+        raise CaptureError(
+            f"{capture.path.name} holds no image with the laser on among {len(capture)}: nothing to reconstruct"
+        )
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
-        found = ", ".join(f"{count} {name}" for name, count in by_status.items() if count)
-        raise CaptureError(
-            f"no stripe in any of the {len(centres)} laser images of {capture.path.name} (lines: {found})"
-        )
+        lit = (image for _, image in capture.frames(laser_on=True))
+        reason = why_no_stripe(lit, stripe_along=header.sensor.camera.stripe_along, full_dn=header.saturation_dn)
+        raise CaptureError(f"no stripe in any of the {len(centres)} laser images of {capture.path.name}: {reason}")
     return FoundStripes(*(np.concatenate(parts) for parts in (frames, lines, centres, amplitudes)), by_status)
 
 
@@ -171,20 +178,27 @@ def reconstruct_capture(
     *,
     options: StripeOptions = StripeOptions(),
     index: float | None = None,
+    with_uncertainty: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Scan:
     """Point cloud of a capture: `find_stripes`, then `reconstruct_stripes`, with the errors of both."""
     check_fits(capture, calibration)
     stripes = find_stripes(capture, options=options, progress=progress)
-    return reconstruct_stripes(capture, stripes, calibration, index=index)
+    return reconstruct_stripes(capture, stripes, calibration, index=index, with_uncertainty=with_uncertainty)
 
 
 def reconstruct_stripes(
-    capture: Capture, stripes: FoundStripes, calibration: AnyCalibration, *, index: float | None = None
+    capture: Capture,
+    stripes: FoundStripes,
+    calibration: AnyCalibration,
+    *,
+    index: float | None = None,
+    with_uncertainty: bool = False,
 ) -> Scan:
     """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
 
-    ``index`` replaces the refractive index that follows from the capture's medium. Without a window in the light's way
+    ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` tells how well
+    the points are known by a joint calibration; in the OCS, whatever the poses. Without a window in the light's way
     the calibration's window is left out. Points that a calibration by polynomials does not reach are left out and
     counted in ``rays_by_status``.
 
@@ -213,6 +227,9 @@ def reconstruct_stripes(
             "medium_index": index, "artefact": header.artefact, "calibration": calibration_digest(calibration),
         },
     )  # fmt: skip
+    if with_uncertainty:
+        known = point_uncertainty(capture, calibration, frame[good], stripes.line[good], stripes.centre_px[good])
+        cloud = replace(cloud, uncertainty=known)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     by_status = {status.name.lower(): int(rays[status]) for status in RayStatus}
     return Scan(cloud, good, stripes.lines_by_status, by_status)
@@ -225,6 +242,7 @@ def _points(
     stage, direction = capture.stage_mm[frame], np.array(capture.header.stage_direction)
     if isinstance(calibration, PolynomialCalibration):
         return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
+    direction = np.array(calibration.stage_direction_of(capture.header.stage_direction))
     if not capture.header.sensor.camera.window.mounted:
         calibration = calibration.model_copy(update={"window": None})
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)

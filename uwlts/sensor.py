@@ -232,14 +232,19 @@ class Medium(Description):
             wavelength_nm=wavelength_nm, temperature_c=self.temperature_c, salinity_g_kg=self.salinity_g_kg
         )
 
+    def index_per_kelvin(self, wavelength_nm: float) -> float:
+        """Change of the index with temperature; 0 where it is given."""
+        if self.index is not None or self.kind == "air":
+            return 0.0
+        # The formula ends at 30 degC.
+        here = self.model_copy(update={"temperature_c": min(self.temperature_c, 29.0)})
+        return here.warmer_by(1.0).refractive_index(wavelength_nm) - here.refractive_index(wavelength_nm)
+
     def index_uncertainty(self, wavelength_nm: float, uncertainty: "Uncertainty") -> float:
         """Standard uncertainty of the index, from the temperature's where it follows from that."""
         if self.index is not None or self.kind == "air":
             return uncertainty.index
-        # The formula ends at 30 degC.
-        here = self.model_copy(update={"temperature_c": min(self.temperature_c, 29.0)})
-        per_kelvin = here.warmer_by(1.0).refractive_index(wavelength_nm) - here.refractive_index(wavelength_nm)
-        return math.hypot(per_kelvin * uncertainty.temperature_k, _INDEX_FORMULA)
+        return math.hypot(self.index_per_kelvin(wavelength_nm) * uncertainty.temperature_k, _INDEX_FORMULA)
 
     def warmer_by(self, kelvin: float) -> "Medium":
         """The same medium at another temperature."""
@@ -403,8 +408,9 @@ class Uncertainty(Description):
     """Standard uncertainties of what drawings, data sheets and certificates say, for the joint calibration.
 
     Of the windows: distance and tilt of the camera's, thickness and index of its glass, tilt of the laser's against the
-    sheet. ``bow_deg`` is the tilt of the beam into the line optics, ``temperature_k`` that of a medium whose index
-    follows from its temperature, ``index`` that of one whose index is given. Of the stage: each position, the scale of
+    sheet. ``bow_deg`` is the tilt of the beam into the line optics. ``temperature_k`` is that of a medium whose index
+    follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
+    medium whose index is given. Of the stage: each position, the scale of
     all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
     its plane when it bends like a dish, and the height of the steps.
     """
@@ -416,6 +422,7 @@ class Uncertainty(Description):
     laser_window_tilt_deg: Positive = 0.5
     bow_deg: Positive = 0.5
     temperature_k: Positive = 1.0
+    drift_k: NotNegative = 0.2
     index: Positive = 1e-4
     stage_position_mm: Positive = 0.005
     stage_scale: Positive = 1e-4

@@ -1,10 +1,11 @@
 """The laser sheet in a medium: a plane, or slightly a cone, turned by the laser's window.
 
-A beam tilted by the angle b into the line optics keeps its component across the fan, so that the rays run on a cone
-about the normal: at the distance r from the apex, z of it along the axis, the sheet bulges by b (r - z). A sheet that
-meets the laser's window at the angle t to the window's normal is turned by t (1 - 1 / n) in a medium of the index n
-(Snell's law). As rays off the axis meet the window at other angles, the sheet then bulges by n b + (n - 1 / n) t times
-r - z. All this holds to second order in the rays' angles to the axis, with the shift in the glass left out.
+A ray at the angle a to the axis leaves a sheet whose beam enters the line optics tilted by the angle b with the part
+b (1 - cos a) across it; the laser's window, at the angle t to the sheet, keeps what runs along its face, divided by the
+medium's index n (Snell's law). At the distance r from where the rays seem to come from, z of it along the axis, the
+sheet in the medium therefore lies off a plane by (b (r - q) + t w (z - q)) / n, where q = r cos a follows from
+q^2 = n^2 z^2 - (n^2 - 1) r^2, and w is the share of z that lies behind the window; and that plane is turned by
+t (1 - 1 / n) about the window. This holds to first order in b and t; what the glass shifts is left out.
 """
 
 from dataclasses import dataclass
@@ -15,31 +16,56 @@ from uwlts.calibration.model import FanModel, SheetModel
 
 # A bulge is a few hundredths of a millimetre and almost constant along a ray: each round gains three digits or more.
 _ROUNDS = 4
+# No ray that has passed the window runs there; the square of q / r of points that a search may try.
+_GRAZING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class FanDistances:
+    """Distances (N,) of points from where a fan seems to begin in a medium: all, along the axis, and q.
+
+    ``away`` (3, N) are the points from there, and ``wet`` is the share of the distance along that is in the medium.
+    """
+
+    away: np.ndarray
+    all: np.ndarray
+    along: np.ndarray
+    in_air: np.ndarray
+    wet: np.ndarray
+
+    def bulges(self) -> tuple[np.ndarray, np.ndarray]:
+        """What the beam's tilt and the window's turn are multiplied by, over the index: (N,), (N,)."""
+        return self.all - self.in_air, self.wet * (self.along - self.in_air)
 
 
 @dataclass(frozen=True, eq=False)
 class SheetSurface:
-    """The points x with ``normal . x - bulge (|x - apex| - axis . (x - apex)) = offset_mm``, camera frame.
+    """Points that the sheet lights, camera frame, mm: the plane ``normal . x = offset_mm`` and the bulge of the fan.
 
     Attributes
     ----------
     normal : (3,)
     offset_mm : float
-    bulge : float
+    index : float
+        Of the medium.
     fan : FanModel or None
-        Where the apex lies and the axis runs; None for a plane.
+        None for a plane.
     """
 
     normal: np.ndarray
     offset_mm: float
-    bulge: float = 0.0
+    index: float = 1.0
     fan: FanModel | None = None
+
+    def is_plane(self) -> bool:
+        """Whether nothing bends the sheet."""
+        return self.fan is None or (self.fan.bow_rad == 0.0 and self.fan.window_turn_rad == 0.0)
 
     def crossings(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distances (N,) in mm along rays (3, N) to the surface, and its gradient along the rays there (N,)."""
         along = self.normal @ directions
         reach = (self.offset_mm - self.normal @ origins) / along
-        if self.fan is None or self.bulge == 0.0:
+        if self.is_plane():
             return reach, along
         for _ in range(_ROUNDS):
             points = origins + reach * directions
@@ -50,21 +76,37 @@ class SheetSurface:
     def miss_mm(self, points: np.ndarray) -> np.ndarray:
         """How far points (3, N) lie beyond the surface, (N,)."""
         miss = self.normal @ points - self.offset_mm
-        return miss if self.fan is None else miss - self.bulge * bulge_reach_mm(points, self.fan)
+        if self.is_plane():
+            return miss
+        at = fan_distances(points, self.fan, medium_index=self.index)
+        of_bow, of_turn = at.bulges()
+        return miss - (self.fan.bow_rad * of_bow + self.fan.window_turn_rad * of_turn) / self.index
 
     def gradient(self, points: np.ndarray) -> np.ndarray:
         """Gradient (3, N) of `miss_mm`."""
-        if self.fan is None:
+        if self.is_plane():
             return np.repeat(self.normal[:, None], points.shape[1], axis=1)
-        away = points - np.array(self.fan.apex_mm)[:, None]
-        outward = away / np.linalg.norm(away, axis=0)
-        return self.normal[:, None] - self.bulge * (outward - np.array(self.fan.axis)[:, None])
+        at, n = fan_distances(points, self.fan, medium_index=self.index), self.index
+        axis = np.array(self.fan.axis)[:, None]
+        of_air = (n**2 * at.along * axis - (n**2 - 1.0) * at.away) / at.in_air
+        of_bow = at.away / at.all - of_air
+        of_turn = at.wet * (axis - of_air) + (1.0 - at.wet) * (1.0 - at.in_air / at.along) * axis
+        return self.normal[:, None] - (self.fan.bow_rad * of_bow + self.fan.window_turn_rad * of_turn) / n
 
 
-def bulge_reach_mm(points: np.ndarray, fan: FanModel) -> np.ndarray:
-    """Distance (N,) of points (3, N) from the fan's apex less its part along the axis."""
-    away = points - np.array(fan.apex_mm)[:, None]
-    return np.linalg.norm(away, axis=0) - np.array(fan.axis) @ away
+def fan_distances(points: np.ndarray, fan: FanModel, *, medium_index: float) -> FanDistances:
+    """Distances of points (3, N); in a medium a fan seems to begin farther away than it does."""
+    axis = np.array(fan.axis)
+    behind = medium_index * behind_window_mm(fan)
+    away = points - (np.array(fan.pivot_mm) - behind * axis)[:, None]
+    along, square = axis @ away, np.einsum("in,in->n", away, away)
+    in_air = np.sqrt(np.maximum(medium_index**2 * along**2 - (medium_index**2 - 1.0) * square, _GRAZING * square))
+    return FanDistances(away, np.sqrt(square), along, in_air, 1.0 - behind / along)
+
+
+def behind_window_mm(fan: FanModel) -> float:
+    """How far behind the window's outer face the fan begins, along its axis."""
+    return float(np.array(fan.axis) @ (np.array(fan.pivot_mm) - np.array(fan.apex_mm)))
 
 
 def sheet_surface(sheet: SheetModel, *, medium_index: float) -> SheetSurface:
@@ -78,6 +120,6 @@ def sheet_surface(sheet: SheetModel, *, medium_index: float) -> SheetSurface:
     return SheetSurface(
         normal=turned,
         offset_mm=float(sheet.offset_mm + (turned - normal) @ np.array(fan.pivot_mm)),
-        bulge=fan.bow_rad * medium_index + fan.window_turn_rad * (medium_index - 1.0 / medium_index),
+        index=medium_index,
         fan=fan,
     )

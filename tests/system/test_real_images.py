@@ -1,4 +1,4 @@
-"""Photographs that nobody of this project made, of the Ciclop scanner: imported, and what the software makes of them.
+"""Photographs that nobody of this project made, of the Ciclop scanner and of dots, and what the software makes of them.
 
 They lie beside the project where their licence leaves them, and are not part of it.
 """
@@ -15,6 +15,7 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.capture import Capture
 from uwlts.importing import import_folder
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
+from uwlts.targets.lattice import detect_lattice
 
 PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "shared" / "real" / "ciclop"
 pytestmark = pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason=f"the real images are not here: {PHOTOGRAPHS}")
@@ -96,3 +97,21 @@ def test_either_of_two_lines_on_the_board_is_straight(tmp_path: Path, peak: Peak
     # same: half a pixel at the median, 1.5 px but for one row in twenty.
     assert np.median(straight) < 0.5
     assert np.mean(straight < 1.5) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("number", "points", "columns_rows", "residual_px"),
+    # 02 was printed in whole dots of the printer, which moves rows and columns by half a pixel.
+    [("01", 6400, {98, 69}, 0.05), ("02", 1300, {41, 35}, 0.8), ("05", 4300, {85, 52}, 0.05)],
+)
+def test_dots_under_strong_distortion_are_numbered(number, points, columns_rows, residual_px):
+    image = cv2.imread(str(PHOTOGRAPHS.parent / "dot-patterns" / f"dot_pattern_{number}.jpg"), cv2.IMREAD_GRAYSCALE)
+    found = detect_lattice(image)
+    assert len(found.indices) > points and set((np.ptp(found.indices, axis=0) + 1).tolist()) == columns_rows
+    # A wrong number is a whole spacing off a smooth map of the numbers to the image, that is 25 px and more.
+    steps = found.indices - found.indices.mean(axis=0)
+    x, y = (2 * steps / np.ptp(steps, axis=0).max()).T
+    terms = np.column_stack([x**i * y**j for i in range(10) for j in range(10 - i)])
+    centres = found.circles.centres
+    away = np.linalg.norm(centres - terms @ np.linalg.lstsq(terms, centres, rcond=None)[0], axis=1)
+    assert np.sqrt(np.mean(away**2)) < residual_px and away.max() < 2

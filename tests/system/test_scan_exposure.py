@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 import urllib.request
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from twin.hardware.serve import ServedTwin, serve
 from twin.options import Options
 from twin.scene import Scene, load_scene
-from uwlts.capture import Capture
+from uwlts.capture import Capture, part_path
 from uwlts.library import load_sensor
 from uwlts.sensor import Sensor
 
@@ -128,27 +129,61 @@ def test_what_comes_nearer_later_is_taken_again_with_a_shorter_exposure(folder, 
     assert said.count("warning:") == 2 and "laser images are faint" in said
 
 
-def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, tmp_path):
-    scene = load_scene(folder / "bar.toml")
-    with serve(scene, sensor, options=Options(spp=4), speed_up=50.0) as served:
-        plan = folder / "watched.toml"
-        plan.write_text(
-            f'title = "Scan"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{served.camera.address}"\n'
-            f'laser_ms = {served.exposure_ms["laser"]}\n[stage]\nport = "{served.controller.port}"\n'
-            f"start_mm = {served.track.start_mm}\nstep_mm = 2.0\ncount = 12\nsettle_s = 0.6\nfeed_mm_per_min = 900.0\n",
-            encoding="utf-8",
-        )
-        scanning = subprocess.Popen(
-            [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(tmp_path / "scan.h5"), "--home",
-             "--watch"], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        with scanning:
+def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subprocess.Popen[str]:
+    """A scan with its page, slow enough for the page to come."""
+    plan = folder / "watched.toml"
+    plan.write_text(
+        f'title = "Scan"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{served.camera.address}"\n'
+        f'laser_ms = {served.exposure_ms["laser"]}\n[stage]\nport = "{served.controller.port}"\n'
+        f"start_mm = {served.track.start_mm}\nstep_mm = 2.0\ncount = {count}\nsettle_s = 0.5\n"
+        "feed_mm_per_min = 900.0\n",
+        encoding="utf-8",
+    )
+    return subprocess.Popen(
+        [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home", "--watch"],
+        env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def refused(address: str) -> bool:
+    """Whether the page goes within five seconds."""
+    deadline = time.monotonic() + 5
+    while time.monotonic() < deadline:
+        try:
+            urllib.request.urlopen(address, timeout=2).close()
+        except OSError:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def test_a_killed_scan_takes_its_page_with_it_and_leaves_the_laser_off(folder, sensor, tmp_path):
+    with serve(load_scene(folder / "bar.toml"), sensor, options=Options(spp=4), speed_up=50.0) as served:
+        with watched(folder, served, tmp_path / "scan.h5", count=21) as scanning:
             lines = iter(scanning.stdout.readline, "")
             address = next(line for line in lines if line.startswith("open ")).split()[1].rstrip(",")
-            with urllib.request.urlopen(address, timeout=10) as answer:
-                assert answer.status == 200 and scanning.poll() is None
-            assert "wrote" in "".join(lines) and scanning.wait(60) == 0
-    with pytest.raises(OSError, match="refused"):
-        urllib.request.urlopen(address, timeout=2)
+            urllib.request.urlopen(address, timeout=10).close()
+            while not served.controller.state().laser_on:
+                assert scanning.poll() is None
+            scanning.kill()
+            assert scanning.wait(10) < 0
+        assert refused(address)
+        # The guard process has seen the program end, and sent the reset.
+        assert not served.controller.state().laser_on
+        with Capture(part_path(tmp_path / "scan.h5")) as part:
+            assert 1 <= len(part) < 21
+
+
+def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, tmp_path):
+    with (
+        serve(load_scene(folder / "bar.toml"), sensor, options=Options(spp=4), speed_up=50.0) as served,
+        watched(folder, served, tmp_path / "scan.h5", count=12) as scanning,
+    ):
+        lines = iter(scanning.stdout.readline, "")
+        address = next(line for line in lines if line.startswith("open ")).split()[1].rstrip(",")
+        with urllib.request.urlopen(address, timeout=10) as answer:
+            assert answer.status == 200 and scanning.poll() is None
+        assert "wrote" in "".join(lines) and scanning.wait(60) == 0
+    assert refused(address)
     with Capture(tmp_path / "scan.h5") as scan:
         assert len(scan) == scan.header.provenance["images"] == 12

@@ -105,4 +105,4 @@ def step_views(sensor: Sensor, *, noise=Noise()):
 
 def gathered(sensor: Sensor, series, steps=()) -> Gathered:
     """What captures with these views would give; ``sensor`` is what the drawings say."""
-    return Gathered(sensor, {"water": MEDIUM}, list(series), list(steps), {}, [])
+    return Gathered(sensor, {"water": MEDIUM}, list(series), list(steps), [], {}, [])

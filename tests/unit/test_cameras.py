@@ -190,7 +190,7 @@ def test_what_cannot_be_replayed_is_said(tmp_path):
         camera.configure()
         camera.start()
         camera.grab(1.0)
-        with pytest.raises(ImageError, match="image-1.png cannot be read"):
+        with pytest.raises(ImageError, match="image-1.png is a PNG file that is truncated"):
             camera.grab(1.0)
     cv2.imwrite(str(folder / "image-1.png"), np.zeros((24, 31), np.uint8))
     with ReplayCamera(folder) as camera:

@@ -8,7 +8,7 @@ import pytest
 from tests.unit.calibration_views import WATER, built_sensor
 from tests.unit.joint_views import Noise, gathered, lit_points, step_views, target_series
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.joint.observations import StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.observations import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.sheet_jets import DescribedSheet
@@ -51,27 +51,32 @@ def pulls(result):
 
 
 @pytest.mark.parametrize("medium_index", [1.0, WATER])
-def test_the_sheet_is_where_fermat_sees_the_fan(medium_index):
-    """Bow and turned window; what the glass shifts, 4 um with this tilt, goes into the offset, the rest is small."""
-    turn = np.radians(0.15)
-    window = BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.15})
+@pytest.mark.parametrize(("tilt_deg", "bow"), [(0.15, BOW), (1.0, 0.003), (1.0, -0.003), (-1.0, 0.003)])
+def test_the_sheet_is_where_fermat_sees_the_fan(medium_index, tilt_deg, bow):
+    """Bow and turned window, to the ends of the fan at 22.5 deg.
+
+    The glass shifts the sheet by t d (1 - 1 / g) = 35 um for a degree between beam and normal, a tenth of that more at
+    the ends of the fan.
+    """
+    turn = np.radians(tilt_deg)
+    window = BUILT.laser.window.model_copy(update={"tilt_y_deg": tilt_deg})
     sensor = BUILT.model_copy(update={"laser": BUILT.laser.model_copy(update={"window": window})})
     pose = laser_pose(sensor)
-    normal = np.cos(BOW) * pose.normal - np.sin(BOW) * pose.axis
+    normal = np.cos(bow) * pose.normal - np.sin(bow) * pose.axis
     outer = pose.origin_mm + (window.distance_mm + window.thickness_mm) * pose.axis
-    fan = FanModel(apex_mm=tuple(pose.origin_mm), axis=tuple(pose.axis), pivot_mm=tuple(outer), bow_rad=BOW,
-                   window_turn_rad=turn - BOW)  # fmt: skip
+    fan = FanModel(apex_mm=tuple(pose.origin_mm), axis=tuple(pose.axis), pivot_mm=tuple(outer), bow_rad=bow,
+                   window_turn_rad=turn - bow)  # fmt: skip
     sheet = SheetModel(normal=tuple(normal), offset_mm=float(normal @ pose.origin_mm), fan=fan)
     lit = np.vstack(
         [
-            lit_points(sensor, normal=pose.axis, point=pose.origin_mm + reach * pose.axis, index=medium_index, bow=BOW)
+            lit_points(sensor, normal=pose.axis, point=pose.origin_mm + reach * pose.axis, index=medium_index, bow=bow)
             for reach in (300.0, 450.0, 600.0)
         ]
     )
     miss = sheet_surface(sheet, medium_index=medium_index).miss_mm(lit.T)
     plane = sheet_surface(sheet.model_copy(update={"fan": None}), medium_index=medium_index).miss_mm(lit.T)
-    assert np.ptp(miss) < 0.002
-    assert abs(miss).max() < 0.006
+    assert np.ptp(miss) < 0.005 * abs(tilt_deg) + 5e-4
+    assert abs(miss).max() < 0.040 * (abs(tilt_deg) + np.degrees(abs(bow)))
     assert np.ptp(plane) > 0.03
 
 
@@ -133,7 +138,10 @@ def test_every_derivative_is_what_differences_say(view, kind):
         parts = evidence.residuals(parameters, values[: len(shared)], values[len(shared) :])
         return np.concatenate([part.values for part in parts])
 
-    analytic = np.vstack([np.hstack([part.by_shared, part.by_own]) for part in found])
+    analytic = np.zeros((sum(len(part.values) for part in found), len(vector)))
+    rows = np.split(np.arange(len(analytic)), np.cumsum([len(part.values) for part in found])[:-1])
+    for place, part in zip(rows, found, strict=True):
+        analytic[np.ix_(place, np.r_[: len(shared), len(shared) + part.own])] = np.hstack([part.by_shared, part.by_own])
     for place, column in enumerate(analytic.T):
         reach = 1e-6 * max(1.0, abs(vector[place]))
         ahead, behind = vector.copy(), vector.copy()
@@ -146,10 +154,13 @@ def test_every_derivative_is_what_differences_say(view, kind):
 def _without_residuals(evidence, parts):
     if isinstance(evidence, StepProfileEvidence):
         return replace(evidence, pixels=evidence.pixels - np.outer(parts[0].values, (0, 1)))
-    placement = evidence.placement
-    placement = replace(placement, pixels=placement.pixels - parts[0].values.reshape(-1, 2))
-    moved = evidence.stripe_pixels - np.outer(parts[1].values, (0, 1)) if len(parts) > 1 else evidence.stripe_pixels
-    return replace(evidence, placement=placement, stripe_pixels=moved)
+    pixels, stripe = evidence.placement.pixels.copy(), evidence.stripe_pixels.copy()
+    for part in parts:
+        if part.kind == TARGET:
+            pixels[evidence.placement.image == part.image] -= part.values.reshape(-1, 2)
+        else:
+            stripe[evidence.stripe_image == part.image, 1] -= part.values
+    return replace(evidence, placement=replace(evidence.placement, pixels=pixels), stripe_pixels=stripe)
 
 
 @pytest.fixture(scope="module")

@@ -593,7 +593,7 @@ def test_captures_that_are_refused(files, tmp_path):
         pytest.raises(CalibrationError, match="at 7 stage positions; .* degree 7 need at"),
     ):
         calibrate_polynomials([a], degree=7)
-    with Capture(empty) as a, pytest.raises(CalibrationError, match="at 0 stage positions.*no circles"):
+    with Capture(empty) as a, pytest.raises(CalibrationError, match="found in no image of empty.h5: too dark"):
         calibrate_polynomials([a])
     with Capture(empty) as a, pytest.raises(RangeError, match="degree is 0"):
         calibrate_polynomials([a], degree=0)

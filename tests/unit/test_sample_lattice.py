@@ -47,6 +47,8 @@ def test_the_pupils_shifts_are_spread_over_a_block_of_pixels():
     distance = np.hypot(*(apart - np.rint(apart)))[~np.eye(16, dtype=bool)]
     # In a square grid, 16 points lie 1/4 apart on the torus that the square is; two thirds of it are well spread.
     assert distance.min() > 2 / 3 / 4
+    mirrored = np.abs(block[:, :, None] + block[:, None] - 1).max(axis=0).min(axis=1)
+    assert mirrored.max() < 1e-12
 
 
 @pytest.mark.parametrize("along", ["width", "height"])

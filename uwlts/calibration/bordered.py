@@ -15,14 +15,18 @@ _SINGULAR = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Residuals (n, c) of one group and their derivatives by shared (c n, k) and own (c n, b) parameters."""
+    """Residuals (n, c) of one group and their derivatives by shared (c n, k) and own (c n, b) parameters.
+
+    Derivatives by but some of the group's own parameters may be given, the others' being zero: ``own`` tells which.
+    """
 
     residuals: np.ndarray
     by_shared: np.ndarray
     by_own: np.ndarray
+    own: np.ndarray | None = None
 
 
-Model = Callable[[int, np.ndarray, np.ndarray], Observation | None]
+Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observation] | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +63,7 @@ class _Normal:
     """Normal equations in blocks, with columns scaled to length one, and the cost they belong to."""
 
     cost: float
-    observations: list[Observation]
+    residuals: list[np.ndarray]
     shared: np.ndarray
     border: list[np.ndarray]
     own: list[np.ndarray]
@@ -76,13 +80,16 @@ def fit_bordered(
     *,
     soft_limit: float | None = None,
     smallest_gain: float = 1e-13,
+    damping: float = 1e-4,
+    enough_rounds: int | None = None,
 ) -> BorderedFit:
     """Least squares over all groups; each step eliminates the groups' own parameters (Schur complement).
 
     Parameters
     ----------
     model : callable
-        (group, shared, own of the group) to its `Observation`, or None where the parameters have no meaning.
+        (group, shared, own of the group) to its `Observation`, or several that make it up, or None where the
+        parameters have no meaning.
     shared : (k,)
         Start.
     own : sequence of (b,)
@@ -92,6 +99,10 @@ def fit_bordered(
         without it.
     smallest_gain : float
         The iteration ends when a step lowers the cost by less than this share of it.
+    damping : float
+        Of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution.
+    enough_rounds : int, optional
+        The iteration ends after so many rounds, settled or not.
 
     Raises
     ------
@@ -102,7 +113,6 @@ def fit_bordered(
     normal = _assembled(model, shared, own, soft_limit)
     if normal is None:
         raise CalibrationError("the calibration's start puts what was seen behind the camera: check points and poses")
-    damping = 1e-4
     for rounds in range(1, _ROUNDS + 1):
         shared_step, own_steps = _step(normal, damping)
         tried_shared = shared + shared_step
@@ -112,7 +122,7 @@ def fit_bordered(
             for step, scale in zip((shared_step, *own_steps), (normal.shared_scale, *normal.own_scales), strict=True)
         )
         # Scaled steps are in the unit of the residuals, summed over all of them.
-        small = size <= _SMALLEST_STEP * np.sqrt(sum(o.residuals.size for o in normal.observations))
+        small = size <= _SMALLEST_STEP * np.sqrt(sum(r.size for r in normal.residuals))
         tried = _assembled(model, tried_shared, tried_own, soft_limit)
         if tried is not None and tried.cost <= normal.cost:
             gain = normal.cost - tried.cost
@@ -120,10 +130,12 @@ def fit_bordered(
             shared, own, normal, damping = tried_shared, tried_own, tried, max(damping / 10, 1e-12)
             if finished:
                 return _account(shared, own, normal, rounds, "step below rounding" if small else "cost settled")
-        elif small or damping > 1e8:
+        elif small or damping > 1e8 or (tried is not None and tried.cost - normal.cost <= smallest_gain * normal.cost):
             return _account(shared, own, normal, rounds, "no step lowers the cost further")
         else:
             damping *= 10
+        if rounds == enough_rounds:
+            return _account(shared, own, normal, rounds, "enough rounds")
     raise CalibrationError(
         f"the camera calibration did not settle in {_ROUNDS} rounds: either the target images do not determine the "
         f"camera (tilt the target, or fix some parameters), or they contradict each other"
@@ -131,21 +143,29 @@ def fit_bordered(
 
 
 def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_limit: float | None) -> _Normal | None:
-    count, cost, observations, products = len(shared), 0.0, [], []
+    count, cost, residuals, products = len(shared), 0.0, [], []
     for group, values in enumerate(own):
-        observation = model(group, shared, values)
-        if observation is None or not np.isfinite(observation.residuals).all():
+        found = model(group, shared, values)
+        if found is None:
             return None
-        columns = np.hstack([observation.by_shared, observation.by_own, observation.residuals.reshape(-1, 1)])
-        squares = np.sum(observation.residuals**2, axis=1)
-        if soft_limit is None:
-            cost += float(squares.sum())
-        else:
-            root = np.sqrt(1 + squares / soft_limit**2)
-            cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
-            columns /= np.repeat(np.sqrt(root), observation.residuals.shape[1])[:, None]
-        observations.append(observation)
-        products.append(columns.T @ columns)
+        parts = [found] if isinstance(found, Observation) else found
+        product = np.zeros((count + len(values) + 1,) * 2)
+        for part in parts:
+            if not np.isfinite(part.residuals).all():
+                return None
+            columns = np.hstack([part.by_shared, part.by_own, part.residuals.reshape(-1, 1)])
+            squares = np.sum(part.residuals**2, axis=1)
+            if soft_limit is None:
+                cost += float(squares.sum())
+            else:
+                root = np.sqrt(1 + squares / soft_limit**2)
+                cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
+                columns /= np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
+            places = np.arange(len(values)) if part.own is None else part.own
+            at = np.r_[0:count, count + places, count + len(values)]
+            product[np.ix_(at, at)] += columns.T @ columns
+        residuals.append(np.vstack([part.residuals for part in parts]))
+        products.append(product)
     shared_scale = _lengths(sum(np.diag(product)[:count] for product in products))
     matrix, gradient = np.zeros((count, count)), np.zeros(count)
     border, blocks, gradients, scales = [], [], [], []
@@ -158,7 +178,7 @@ def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_lim
         blocks.append(scaled[count:-1, count:-1])
         gradients.append(scaled[count:-1, -1])
         scales.append(scale)
-    return _Normal(cost, observations, matrix, border, blocks, gradient, gradients, shared_scale, scales)
+    return _Normal(cost, residuals, matrix, border, blocks, gradient, gradients, shared_scale, scales)
 
 
 def _lengths(squares: np.ndarray) -> np.ndarray:
@@ -197,7 +217,7 @@ def _account(shared: np.ndarray, own: list[np.ndarray], normal: _Normal, rounds:
         reduced -= border @ inverses[-1] @ border.T
     if np.linalg.eigvalsh(reduced)[0] < _SINGULAR:
         raise undetermined
-    count = sum(o.residuals.size for o in normal.observations)
+    count = sum(r.size for r in normal.residuals)
     freedom = count - len(shared) - sum(map(len, own))
     sigma = float(np.sqrt(normal.cost / freedom))
     covariance = np.linalg.inv(reduced)
@@ -208,7 +228,7 @@ def _account(shared: np.ndarray, own: list[np.ndarray], normal: _Normal, rounds:
     return BorderedFit(
         shared=shared,
         own=own,
-        residuals=[o.residuals for o in normal.observations],
+        residuals=normal.residuals,
         covariance=sigma**2 * covariance / np.outer(normal.shared_scale, normal.shared_scale),
         own_covariances=own_covariances,
         sigma=sigma,

@@ -1,16 +1,19 @@
 """From captures to what a calibration needs: target points, stripes on the target, stripes on the step standard."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import ValidationError
 
+from uwlts.calibration.guidance.quality import why_not_found
 from uwlts.calibration.target_image import TargetImage
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.metrology.artefact_descriptions import StepStandard
-from uwlts.stripe import StripeOptions, extract_stripe
+from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
+from uwlts.stripe.absence import has_stripe
 from uwlts.targets import Target, detect_target, parse_target
 
 Progress = Callable[[str, int, int], None]
@@ -18,6 +21,8 @@ Progress = Callable[[str, int, int], None]
 
 _SAME_POSITION_MM = 1e-6
 _FEWEST_LINES = 20
+# So many images of a capture tell why there is no stripe in it.
+_LOOKED_AT = 15
 _STRIPE = StripeOptions()
 
 
@@ -36,6 +41,8 @@ class AirEvidence:
         Stripe pixels on the target at the position of each image; empty where there are none.
     warnings : list of str
         Images left out, and why.
+    no_stripe : str
+        Why there is no stripe at all; empty where there is one.
     """
 
     target: Target
@@ -43,6 +50,7 @@ class AirEvidence:
     frames: list[tuple[int, int]]
     stripes: list[np.ndarray]
     warnings: list[str]
+    no_stripe: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +71,7 @@ def air_evidence(
     Raises
     ------
     CalibrationError
-        The captures show no target, or different ones.
+        The captures tell no target, or different ones, or it was found in none of their images.
     DescriptionError
         A target's description cannot be read.
     """
@@ -74,6 +82,7 @@ def air_evidence(
         raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
     total, done = sum(map(len, captures)), 0
     images, frames, stripes, warnings = [], [], [], []
+    reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
         for frame, image in capture.frames(laser_on=False):
@@ -83,7 +92,9 @@ def air_evidence(
                 frames.append((number, frame))
                 stripes.append([])
             except (TargetError, CalibrationError) as error:
-                warnings.append(f"{capture.path.name}, frame {frame}: left out, {error}")
+                reason = why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
+                reasons[reason] += 1
+                warnings.append(f"{capture.path.name}, frame {frame}: left out, {reason}")
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
         for frame, image in capture.frames(laser_on=True):
@@ -96,8 +107,13 @@ def air_evidence(
                     f"{capture.stage_mm[frame]:g} mm"
                 )
             done = _report(progress, "target", done, total)
+    if not images:
+        raise CalibrationError(
+            f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
+        )
     joined = [np.vstack(pieces) if pieces else np.empty((0, 2)) for pieces in stripes]
-    return AirEvidence(targets[0], images, frames, joined, warnings)
+    no_stripe = "" if any(map(len, joined)) else no_stripe_in(captures)
+    return AirEvidence(targets[0], images, frames, joined, warnings, no_stripe)
 
 
 def step_evidence(
@@ -136,6 +152,53 @@ def step_evidence(
                 found.append(StepEvidence(pieces[0], standard, index, f"{capture.path.name}, frame {frame}"))
             done = _report(progress, "step", done, total)
     return found, warnings
+
+
+def no_stripe_in(captures: Sequence[Capture]) -> str:
+    """Why no stripe was found in captures, in words; of a target, none where it was found."""
+    header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
+    if not count:
+        return f"{_names(captures)}: no image with the laser on; take one at every position"
+    along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
+    lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
+    if any(has_stripe(image, stripe_along=along) for image in lit):
+        return f"the {where} with a stripe were taken at other stage positions than those at which the target was found"
+    reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
+    return f"no stripe in any of the {count} {where}: {reason}"
+
+
+def _names(captures: Sequence[Capture]) -> str:
+    return ", ".join(capture.path.name for capture in captures)
+
+
+def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
+    """Why none of the images shows the target; ``reasons`` count what was wrong with those with the laser off."""
+    if not any(map(len, captures)):
+        return "there are no images in it"
+    if any(_shows(image, target) for capture in captures for image in _lit(capture, 3)):
+        return (
+            "images marked as taken with the laser on show it instead: lamp and laser images are exchanged, or none is "
+            "marked as a lamp image"
+        )
+    count = reasons.total()
+    if not count:
+        return "all of them were taken with the laser on; take one under the lamp at every position too"
+    return "; ".join(f"{reason} ({times} of {count} images)" for reason, times in reasons.most_common(2))
+
+
+def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
+    """At most so many of the images with the laser on, from the first to the last."""
+    lit = np.flatnonzero(capture.laser_on)
+    for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
+        yield capture.image(int(lit[place]))
+
+
+def _shows(image: np.ndarray, target: Target) -> bool:
+    try:
+        detect_target(image, target)
+    except (TargetError, CalibrationError):
+        return False
+    return True
 
 
 def _add_stripe(

@@ -85,6 +85,13 @@ class KnownMedium(Description):
     index: Annotated[float, Field(ge=1, lt=2)]
 
 
+class KnownStage(Description):
+    """A stage by the direction in which captures say it moves the sensor, and the one found, both in the OCS."""
+
+    described: Vector
+    direction: Vector
+
+
 class Calibration(Description):
     """A calibrated sensor.
 
@@ -93,8 +100,8 @@ class Calibration(Description):
     ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix
     ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
     ``stripe_along`` is as in the sensor description. ``media`` are those of the evidence: in just these the index
-    found replaces the one that follows from the description. ``residuals`` are named figures of each step,
-    ``provenance`` tells what the calibration was made from.
+    found replaces the one that follows from the description. ``stages`` are those whose direction was found.
+    ``residuals`` are named figures of each step, ``provenance`` tells what the calibration was made from.
     """
 
     sensor_name: str
@@ -106,6 +113,7 @@ class Calibration(Description):
     sheet: SheetModel
     camera_from_object: Matrix4
     media: tuple[KnownMedium, ...] = ()
+    stages: tuple[KnownStage, ...] = ()
     residuals: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
 
@@ -122,9 +130,13 @@ class Calibration(Description):
         return self
 
     def index_of(self, medium: Medium) -> float:
-        """Refractive index of a medium at the laser's wavelength, as calibrated where it was; RangeError as there."""
-        known = next((found.index for found in self.media if found.medium == medium), None)
+        """Refractive index of a medium at the laser's wavelength, as last calibrated where it was; else RangeError."""
+        known = next((found.index for found in reversed(self.media) if found.medium == medium), None)
         return medium.refractive_index(self.wavelength_nm) if known is None else known
+
+    def stage_direction_of(self, described: Vector) -> Vector:
+        """Unit direction in the OCS of a stage that is described so, as calibrated where it was."""
+        return next((found.direction for found in self.stages if np.allclose(found.described, described)), described)
 
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""

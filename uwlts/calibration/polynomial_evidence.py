@@ -132,6 +132,8 @@ def stripes_on_plate(
             warnings.append(f"stage position {image.stage_mm:g} mm: left out, the stripe does not fall on the target")
     positions = np.sort([stage for *_, stage in parts])
     different = int(np.count_nonzero(np.diff(positions) > _SAME_POSITION_MM)) + 1 if len(positions) else 0
+    if evidence.no_stripe:
+        raise CalibrationError(evidence.no_stripe)
     if different <= degree:
         raise CalibrationError(
             f"target and stripe were found together at {different} stage positions; polynomials of degree {degree} "
@@ -182,7 +184,8 @@ def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np
     if np.sum((depth_nominal - np.median(depth_nominal)) * (depth[known] - np.median(depth[known]))) <= 0:
         raise CalibrationError(
             "the stripe moves through the image the other way than the stage's positions say: check the sign of the "
-            f"captures' stage_direction, {header.stage_direction}, and on which side the laser stands"
+            f"captures' stage_direction, {header.stage_direction}, on which side the laser stands, and that the images "
+            "are not turned by 180 deg or mirrored"
         )
     from_axis = np.hypot(*(stripes.pixels[known] - camera.principal_point()).T)
     middle = np.argsort(from_axis, kind="stable")[:_ORIGIN_POINTS]

@@ -2,17 +2,27 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any, Literal
 
 import numpy as np
 
+import uwlts
 from uwlts.calibration.camera_poses import CameraSolution, Poses, solve_camera
 from uwlts.calibration.circle_bias import UnbiasedSolution, solve_without_bias
-from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, step_evidence
+from uwlts.calibration.evidence import (
+    AirEvidence,
+    Progress,
+    StepEvidence,
+    air_evidence,
+    no_stripe_in,
+    step_evidence,
+)
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.model import Calibration, WindowModel
 from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
+from uwlts.calibration.sources import source_of
 from uwlts.calibration.summary import camera_figures, sheet_figures, window_figures
 from uwlts.calibration.target_image import TargetImage
 from uwlts.calibration.window import StepImage, WindowSolution, label_step, solve_window
@@ -45,6 +55,10 @@ class CalibrationOptions:
         How far the plate reaches beyond its outermost points; half their spacing unless given.
     medium_index : float, optional
         Replaces the index of the medium of the step images.
+    same_water : bool
+        Jointly: whether scans of spheres were taken in the same water as the target, not only in one described alike.
+    sizes_known : bool
+        Jointly: whether the spheres' diameters count as calibrated; they are estimated otherwise.
     bounds_mm : (low, high), optional
         Window distances to search.
     """
@@ -56,6 +70,8 @@ class CalibrationOptions:
     correct_circles: bool = True
     margin_mm: float | None = None
     medium_index: float | None = None
+    same_water: bool = True
+    sizes_known: bool = True
     bounds_mm: tuple[float, float] | None = None
 
 
@@ -167,8 +183,6 @@ def gather(
             "is to find the window, else all in the medium of use"
         )
     found = air_evidence(air, stripe=options.stripe, progress=progress)
-    if not found.images:
-        raise CalibrationError(f"the target was found in no image; {'; '.join(found.warnings[:3])}")
     warnings = [*found.warnings, *_window_warnings(air, steps, options)]
     on_steps: list[StepEvidence] = []
     if steps:
@@ -176,6 +190,8 @@ def gather(
             steps, medium_index=options.medium_index, stripe=options.stripe, progress=progress
         )
         warnings += left_out
+        if not on_steps:
+            raise CalibrationError(no_stripe_in(steps))
     return Evidence(
         sensor=sensor, medium_kind=media.pop(), stage_direction=np.array(air[0].header.stage_direction),
         approaching=None if options.poses == "free" else _approaching(air), air=found,
@@ -188,6 +204,8 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     """Calibrate from what the captures show, with the errors of `calibrate`; ``start`` is a camera nearly as sought."""
     sensor, found = evidence.sensor, evidence.air
     camera, unbiased = _camera(evidence, options, start)
+    if found.no_stripe:
+        raise CalibrationError(found.no_stripe)
     margin = lattice_spacing(found.target) / 2 if options.margin_mm is None else options.margin_mm
     stripe_points = points_on_target(
         camera.model, found.stripes, camera.target_poses, extent_mm=plate_extent(found.target), margin_mm=margin
@@ -233,15 +251,24 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
         raise CalibrationError("no capture is given: a calibration starts with one of a target")
     sensor = captures[0].header.sensor
 
-    def optics(capture: Capture) -> tuple[Any, ...]:
+    def optics(capture: Capture) -> dict[str, object]:
         camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
-        return camera.width_px, camera.height_px, camera.stripe_along, laser.wavelength_nm
+        return {
+            "image size": f"{camera.width_px} x {camera.height_px} px", "stripe_along": camera.stripe_along,
+            "wavelength": f"{laser.wavelength_nm:g} nm",
+        }  # fmt: skip
 
     for capture in captures[1:]:
-        if optics(capture) != optics(captures[0]):
+        own, other = optics(capture), optics(captures[0])
+        differ = ", ".join(
+            f"its {name} is {own[name]} against {other[name]}" for name in own if own[name] != other[name]
+        )
+        if differ:
+            camera = capture.header.sensor.camera
+            turned = (camera.height_px, camera.width_px) == (sensor.camera.width_px, sensor.camera.height_px)
             raise CalibrationError(
-                f"{capture.path.name} comes from another sensor than {captures[0].path.name}: image size, stripe_along "
-                f"and wavelength are {optics(capture)} against {optics(captures[0])}"
+                f"{capture.path.name} comes from another sensor than {captures[0].path.name}: {differ}"
+                + ("; the images of one are turned by a quarter turn" if turned and "size" in differ else "")
             )
     return sensor
 
@@ -343,12 +370,13 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
     return warnings
 
 
-def sources_of(air: Sequence[Capture], steps: Sequence[Capture]) -> dict[str, Any]:
+def sources_of(air: Sequence[Capture], steps: Sequence[Capture], spheres: Sequence[Capture] = ()) -> dict[str, Any]:
+    """What a calibration was made from, by what and when, for its provenance."""
     return {
         "source": "calibration from captures",
-        "air_captures": [{"file": capture.path.name, "name": capture.header.name} for capture in air],
-        "step_captures": [
-            {"file": capture.path.name, "name": capture.header.name, "medium": capture.header.medium_name}
-            for capture in steps
-        ],
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "software": f"uwlts {uwlts.__version__}",
+        "air_captures": [source_of(capture) for capture in air],
+        "step_captures": [source_of(capture) for capture in steps],
+        "sphere_captures": [source_of(capture) for capture in spheres],
     }

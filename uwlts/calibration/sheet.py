@@ -20,6 +20,9 @@ _LEAST_SHAPE = 0.01
 # Strays are few; where more points leave the plane, there is none.
 _LARGEST_REJECTED = 0.2
 _LARGEST_TURN = np.radians(60)
+# From here on a normal that lies much closer to where turned images would put it is taken for that.
+_TURNED_IMAGES = np.radians(20)
+_HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,8 @@ def points_on_target(
         on_plate = (points - origin) @ pose[:3, :2] @ hull[:, :2].T + hull[:, 2] <= margin_mm
         kept.append(points[on_plate.all(axis=1)])
         images.append(np.full(len(kept[-1]), index))
+    if not any(map(len, stripes)):
+        raise CalibrationError(f"no stripe was found in any of {len(stripes)} images of the target")
     if not sum(map(len, kept)):
         raise CalibrationError(
             f"none of the stripes in {len(stripes)} images falls on the target: check the target's description and the "
@@ -112,7 +117,9 @@ def points_on_target(
     return StripePoints(np.vstack(kept), np.concatenate(images))
 
 
-def fit_sheet(points_mm: np.ndarray, *, nominal_normal: np.ndarray) -> SheetSolution:
+def fit_sheet(
+    points_mm: np.ndarray, *, nominal_normal: np.ndarray, largest_rejected: float = _LARGEST_REJECTED
+) -> SheetSolution:
     """Plane by orthogonal distances, without points farther than five robust standard deviations.
 
     Parameters
@@ -121,6 +128,8 @@ def fit_sheet(points_mm: np.ndarray, *, nominal_normal: np.ndarray) -> SheetSolu
         Camera frame.
     nominal_normal : (3,)
         Unit vector; the normal is turned to its side.
+    largest_rejected : float
+        Share of the points that may lie elsewhere.
 
     Raises
     ------
@@ -139,16 +148,23 @@ def fit_sheet(points_mm: np.ndarray, *, nominal_normal: np.ndarray) -> SheetSolu
             f"{longer:.3g} mm along the longer one and a scatter of {plane.std_mm:.3g} mm: move the target further "
             f"between the images"
         )
-    if robust.rejected_share > _LARGEST_REJECTED:
+    if robust.rejected_share > largest_rejected:
         raise CalibrationError(
             f"{100 * robust.rejected_share:.0f} % of the stripe points do not lie on the plane of the others: check "
             f"the stage positions, and that the stripe falls on the target"
         )
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
+    to_turned = float(np.arccos(min(abs(plane.normal @ (_HALF_TURN * nominal_normal)), 1.0)))
+    if turn > _TURNED_IMAGES and to_turned < turn / 3:
+        raise CalibrationError(
+            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description, as it is "
+            f"where the images are turned by 180 deg or mirrored, or the laser stands on the camera's other side: turn "
+            f"the images, or correct the description"
+        )
     if turn > _LARGEST_TURN:
         raise CalibrationError(
             f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description: check "
-            f"stripe_along and where the laser stands"
+            f"stripe_along, where the laser stands, and whether the images are turned or mirrored"
         )
     return SheetSolution(
         model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=float(plane.normal @ plane.point_mm)),

@@ -235,7 +235,8 @@ def _refuse(distance: float, low: float, high: float, changes: np.ndarray, heigh
     if not inner[0] < distance < inner[1]:
         raise CalibrationError(
             f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
-            f"check the medium's index and the step's height, or widen the bounds"
+            "check the medium's index and the step's height, and that the images are not turned or mirrored, or widen "
+            "the bounds"
         )
 
 

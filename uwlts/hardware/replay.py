@@ -4,14 +4,13 @@ import re
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from uwlts.capture import Capture
 from uwlts.errors import HardwareError, ImageError
 from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+from uwlts.importing.images import SUFFIXES, read_image
 
-_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 # Frames that may wait to be fetched, as in the buffers of a camera's driver; later ones are lost.
 _BUFFERS = 32
 
@@ -46,10 +45,10 @@ class ReplayCamera(Camera):
         self._shown = 0
         if self._path.is_dir():
             self._files = sorted(
-                (path for path in self._path.iterdir() if path.suffix.lower() in _SUFFIXES), key=_natural
+                (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES), key=_natural
             )
             if not self._files:
-                raise HardwareError(f"the folder {self._path} holds no image ({', '.join(_SUFFIXES)})")
+                raise HardwareError(f"the folder {self._path} holds no image ({', '.join(SUFFIXES)})")
             first = _read(self._files[0])
             (height, width), bits = first.shape, 8 * first.itemsize
         elif self._path.is_file():
@@ -148,12 +147,10 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _read(path: Path) -> np.ndarray:
     """A grey image (H, W) of uint8 or uint16; ImageError for anything else."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ImageError(f"{path} cannot be read: it is truncated, or no image")
-    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+    image = read_image(path)
+    if image.ndim != 2:
         raise ImageError(
-            f"{path} is {image.dtype} of shape {image.shape}, expected a grey image of 8 or 16 bit: "
+            f"{path} is a colour image, expected a grey image of 8 or 16 bit: "
             "`uwlts import` takes colour images, and makes a capture of them that can be shown"
         )
     return image

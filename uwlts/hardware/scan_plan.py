@@ -51,7 +51,8 @@ class ScanPlan(Description):
     ``camera`` is an address of `uwlts.hardware.camera.open_camera`. At every position the images in ``lights`` are
     taken in turn: "laser" with the laser on, "lamp" with it off, under whatever other light there is. With
     ``background`` an image without laser is taken before every laser image and subtracted from it. Exposures are in ms,
-    or "auto". ``laser_power`` is the share of the laser's power.
+    or "auto". ``laser_power`` is the share of the laser's power. With ``check_steps`` an early place is visited
+    once more at the end, to see whether the stage has lost steps.
     """
 
     title: str
@@ -65,6 +66,7 @@ class ScanPlan(Description):
     lamp_ms: Positive | Literal["auto"] = "auto"
     gain_db: float | None = None
     laser_power: Annotated[float, Field(gt=0, le=1)] = 1.0
+    check_steps: bool = True
     target: dict[str, Any] | None = None
     artefact: dict[str, Any] | None = None
 

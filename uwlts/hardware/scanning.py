@@ -18,8 +18,10 @@ from uwlts.hardware.camera import Camera
 from uwlts.hardware.exposure import START_MS, Brightness, brightness, settled_exposure
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.laser_watch import LOOKS, LaserWatch, LitPlace, no_light, shows_laser, spread
+from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light, ScanPlan, check_plan
+from uwlts.hardware.slip import Place, SlipWatch, centres_of
 from uwlts.importing.images import without_background
 from uwlts.sensor import Sensor
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
@@ -98,7 +100,9 @@ def record_scan(
     RangeError, DesignError, DescriptionError
         The plan cannot be carried out; nothing has moved.
     HardwareError
-        Camera, stage or laser fail, or the camera has another image size than the sensor's description.
+        Camera, stage or laser fail, or the camera has another image size than the sensor's description. Or the stage
+        has lost steps, which is seen at the end: all images are in ``out.part`` then, and ``resume`` takes them as they
+        are.
     OutputError
         The file exists, or cannot be written.
     """
@@ -128,6 +132,9 @@ def record_scan(
                       time.monotonic() - start_s)
             )  # fmt: skip
             progress(shot.number + 1, len(shots), seen)
+        # What is replayed does not know where the stage is.
+        if plan.check_steps and not isinstance(camera, ReplayCamera):
+            taking.check_steps()
     return seen
 
 
@@ -163,6 +170,7 @@ class _Taking:
         self._positions_mm = plan.stage.positions_mm()
         self._lit: LitPlace | None = None
         self._watch: LaserWatch | None = None
+        self._slip = SlipWatch()
 
     def settle_exposures(self) -> None:
         """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
@@ -227,11 +235,8 @@ class _Taking:
             bright = brightness(image, self._sensor, light)
         unlit = self._rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
         if light == "laser":
-            stripe = extract_stripe(
-                image, stripe_along=self._sensor.camera.stripe_along, background=unlit,
-                saturation=self._sensor.detector.full_scale_dn(),
-            )  # fmt: skip
-            place = LitPlace(shot.position_mm, exposure_ms)
+            stripe, place = self._stripe(image, unlit), LitPlace(shot.position_mm, exposure_ms)
+            self._slip.see(Place(position, exposure_ms, centres_of(stripe)))
             self._watch.see(image, stripe, bright, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         self._seen.images += 1
@@ -239,6 +244,29 @@ class _Taking:
         if zero_dn:
             image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)
         return position, image, exposure_ms
+
+    def _stripe(self, image: np.ndarray, unlit: np.ndarray | None) -> Stripe:
+        return extract_stripe(
+            image, stripe_along=self._sensor.camera.stripe_along, background=unlit,
+            saturation=self._sensor.detector.full_scale_dn(),
+        )  # fmt: skip
+
+    def check_steps(self) -> None:
+        """Visit an early place again, if one has relief; HardwareError where the stage stands elsewhere than before."""
+        if self._slip.relief is None:
+            return
+        place = self._slip.relief.place
+        self._rig.move_to(place.position_mm)
+        image = self._rig.image("laser", place.exposure_ms)[0]
+        unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
+        slip_mm, error_mm = self._slip.relief.slip(centres_of(self._stripe(image, unlit)))
+        if self._slip.relief.tells(slip_mm, error_mm):
+            raise HardwareError(
+                f"the stage has lost steps, or sensor or object were moved: back at {place.position_mm:g} mm the "
+                f"stripe lies as if the stage stood {slip_mm:+.2f} mm (std {error_mm:.2f} mm) beside it. All images "
+                "are recorded, but from somewhere on at wrong positions: find the cause (feed, acceleration, something "
+                "in the way) and scan anew with --overwrite, or take them as they are with --resume"
+            )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:
         """Settle the exposure of a light anew where it turns out to be too long; False where that does not help."""

@@ -2,24 +2,11 @@
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
 from uwlts.sensor import Sensor
-from uwlts.stripe import StripeStatus, extract_stripe
-
-_BLACK = 0.02
-"""Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
-
-_WHITE = 0.5
-"""Share of clipped pixels above which an image is white: lit targets and stripes clip in spots only."""
-
-_FEWEST_LINES = 20
-"""Profile lines with a stripe from which an image shows one; noise passes for it on single lines."""
-
-_MOST = 0.5
-"""Share of the profile lines on which a stripe across the wrong side must be seen to be named as the reason."""
+from uwlts.stripe.absence import BLACK, WHITE, has_stripe, is_black, runs_across, white_share
 
 
 def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> None:
@@ -78,35 +65,33 @@ class Content:
             Most of it is saturated.
         """
         self.seen[laser_on] += 1
-        white = float(np.mean(image >= self.saturation_dn))
-        if white > _WHITE:
+        white = white_share(image, self.saturation_dn)
+        if white > WHITE:
             raise ImageError(
                 f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): expose "
                 "shorter, or leave it out (ignore)"
             )
-        # Single hot pixels shine in the dark too.
-        if cv2.medianBlur(image, 3).max() < _BLACK * self.saturation_dn:
+        if is_black(image, self.saturation_dn):
             self.black[laser_on].append(name)
 
     def look_for_stripe(self, image: np.ndarray) -> None:
         """Take a laser image (H, W) into account, from which its background is subtracted if there is one."""
         along = self.sensor.camera.stripe_along
-        if _lines_with_stripe(image, along) >= _FEWEST_LINES:
+        if has_stripe(image, stripe_along=along):
             self.with_stripe += 1
-            return
-        across = "height" if along == "width" else "width"
-        self.sideways += _lines_with_stripe(image, across) > _MOST * image.shape[across == "width"]
+        else:
+            self.sideways += runs_across(image, stripe_along=along)
 
     def refuse_black(self) -> None:
         """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
         if self.seen[True] and len(self.black[True]) == self.seen[True]:
             raise ImageError(
-                f"all {self.seen[True]} laser images are black, no pixel reaches {100 * _BLACK:g} % of full scale: is "
+                f"all {self.seen[True]} laser images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
                 "the laser on, the exposure long enough, the channel that of its colour, bits right?"
             )
         if self.target and self.seen[False] and len(self.black[False]) == self.seen[False]:
             raise ImageError(
-                f"all {self.seen[False]} lamp images are black, no pixel reaches {100 * _BLACK:g} % of full scale: is "
+                f"all {self.seen[False]} lamp images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
                 "the lamp on, the exposure long enough, bits right?"
             )
 
@@ -130,13 +115,3 @@ class Content:
         elif self.with_stripe < lasers:
             warnings.append(f"{lasers - self.with_stripe} of {lasers} laser images show no stripe")
         return warnings
-
-
-def _lines_with_stripe(image: np.ndarray, along: str) -> int:
-    """Number of profile lines with a stripe, or several."""
-    try:
-        status = extract_stripe(image, stripe_along=along).status
-    except ImageError:
-        # Too few pixels to tell a stripe from its background.
-        return 0
-    return int(np.count_nonzero((status != StripeStatus.NO_STRIPE) & (status != StripeStatus.SATURATED)))

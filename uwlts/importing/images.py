@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from uwlts.errors import ImageError
+from uwlts.importing.decoding import decode, pages
 
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
@@ -35,13 +36,14 @@ def read_image(path: Path) -> np.ndarray:
         found = "it is empty" if not content else f"it begins with {content[:8]!r}"
         raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
     try:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        image, damage = decode(content)
     except cv2.error as error:
         raise ImageError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    if image is None:
-        raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes); copy it again")
-    if kind == "TIFF" and (pages := cv2.imcount(str(path))) > 1:
-        raise ImageError(f"{path} holds {pages} pages; expected one image per file: split it")
+    if image is None or damage:
+        found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
+        raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
+    if kind == "TIFF" and (count := pages(str(path))) > 1:
+        raise ImageError(f"{path} holds {count} pages; expected one image per file: split it")
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path} holds values of {image.dtype}; expected whole numbers of 8 or 16 bit")
     if image.ndim == 3 and image.shape[2] not in (1, 3):

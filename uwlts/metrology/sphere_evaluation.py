@@ -99,7 +99,8 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int 
     Raises
     ------
     EvaluationError
-        Fewer spheres than the artefact has; the message says which were found and where.
+        Fewer spheres than the artefact has; the message says which were found and where. Or they are hollow, as
+        turned images make them.
     """
     found = _in_order(_found_spheres(points, artefact, np.random.default_rng(seed)), artefact)
     deviation = np.full(len(points), np.nan)
@@ -107,6 +108,11 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int 
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):
         members, robust = _within_cap(points, sphere, artefact.cap_angle_deg)
         used = members[robust.inliers]
+        if np.mean((points[used] - robust.fit.centre_mm) @ TOWARDS_SENSOR) < 0:
+            raise EvaluationError(
+                "the spheres are hollow: their points lie behind their centres, where the sensor cannot see them. Are "
+                "the images turned by 180 deg or mirrored against those of the calibration?"
+            )
         deviation[used] = robust.fit.residuals_mm
         fits.append((robust.fit, fit_sphere(points[used], diameter / 2)))
         spheres.append(

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from uwlts.metrology.artefact_descriptions import Artefact, Pipe, SphereStandard, StepStandard
+from uwlts.metrology.artefact_descriptions import Artefact
+from uwlts.metrology.calibrated import calibrated_quantity
 from uwlts.report.gather import Campaign, Measurement
 from uwlts.report.numbers import MISSING, fixed
 from uwlts.report.published import CALIBRATION, Reference
@@ -110,27 +111,11 @@ def _place(row: Row) -> int:
 
 
 def _figure_row(name: str, figure: str, value: float, artefact: Artefact | None, published: tuple[float, ...]) -> Row:
-    quantity, true, uncertainty = _calibrated(figure, artefact)
-    if true is None:
-        return Row(name, quantity, measured=value, published=published)
-    return Row(name, quantity, true, true + value, value, published, uncertainty)
-
-
-def _calibrated(figure: str, artefact: Artefact | None) -> tuple[str, float | None, float | None]:
-    """Quantity whose error a figure is, its calibrated value and the uncertainty of that."""
-    numbers = [int(number) for number in re.findall(r"\d+", figure)]
-    which = numbers[0] - 1 if numbers else 0
-    match artefact:
-        case SphereStandard() if figure.startswith("SSE") and which < len(artefact.spacings_mm):
-            pair = figure.removeprefix("SSE")
-            return f"sphere spacing{pair}", artefact.spacings_mm[which], artefact.spacing_uncertainty_mm
-        case SphereStandard() if figure.startswith("diameter error") and which < len(artefact.diameters_mm):
-            return f"diameter, sphere {which + 1}", artefact.diameters_mm[which], artefact.diameter_uncertainty_mm
-        case StepStandard() if figure == "height error":
-            return "step height", artefact.height_mm, artefact.height_uncertainty_mm
-        case Pipe() if figure == "diameter error":
-            return "pipe diameter", artefact.diameter_mm, artefact.diameter_uncertainty_mm
-    return _QUANTITIES.get(figure, figure), None, None
+    known = calibrated_quantity(figure, artefact)
+    if known is None:
+        return Row(name, _QUANTITIES.get(figure, figure), measured=value, published=published)
+    true = known.value_mm
+    return Row(name, known.name, true, true + value, value, published, known.uncertainty_mm)
 
 
 def _window_rows(campaign: Campaign, reference: Reference | None) -> list[Row]:

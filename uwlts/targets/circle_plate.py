@@ -44,9 +44,13 @@ def detect_circle_plate(image, target: CircleTarget) -> TargetView:
     inside = ((indices >= 0) & (indices < (target.columns, target.rows))).all(1)
     if np.count_nonzero(~inside) > MAX_STRAY * len(indices):
         low, high = indices.min(0), indices.max(0)
+        exchanged = (indices - np.array(target.origin))[:, ::-1] + np.array(target.origin)
+        fits = ((exchanged >= 0) & (exchanged < (target.columns, target.rows))).all()
+        mirrored = "they fit with columns and rows exchanged, as in a mirrored image"
+        advice = mirrored if fits else "check columns, rows and origin"
         raise TargetError(
             f"found circles from place ({low[0]}, {low[1]}) to ({high[0]}, {high[1]}), {np.count_nonzero(~inside)} of "
-            f"{len(indices)} outside the described {target.columns} x {target.rows}; check columns, rows and origin"
+            f"{len(indices)} outside the described {target.columns} x {target.rows}; {advice}"
         )
     circles, indices = circles[inside], indices[inside]
     order = np.lexsort((indices[:, 0], indices[:, 1]))

@@ -6,22 +6,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.bordered import BorderedFit, Observation, fit_bordered
-from uwlts.calibration.joint.noise import Noise, judged, strays
+from uwlts.calibration.joint.noise import Noise, judged, strays, with_slope_bias
 from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.sphere_scans import SPHERE, SphereScanEvidence
 from uwlts.errors import CalibrationError
 from uwlts.sensor import Uncertainty
 
-Evidence = TargetEvidence | StepProfileEvidence
+Evidence = TargetEvidence | StepProfileEvidence | SphereScanEvidence
 Correct = Callable[[Sequence[Evidence], np.ndarray, Sequence[np.ndarray]], list[Evidence]]
 
-_FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3)}
+_FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3), SPHERE: Noise(0.3)}
 _SOFT_LIMIT = 3.0
 _ROUNDS = 10
 _SETTLED = 0.02
+UNSETTLED = "the residuals' scatter changes from round to round"
 _SETTLED_PX = 1e-3
-# Of a cost that is the number of residuals: parameters then move by a hundredth of their uncertainty at most.
-_SMALLEST_GAIN = 1e-9
+# Of a cost that is the number of residuals: parameters then move by a hundredth of their uncertainty at most. What the
+# first round finds is but a start for the next.
+_SMALLEST_GAIN, _FIRST_GAIN = 1e-9, 1e-5
+_DAMPING, _FIRST_DAMPING = 1e-9, 1e-4
+_FIRST_ROUNDS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,25 +95,30 @@ def estimate(
     """
     problem = _Problem(parameters, uncertainty)
     found, own, rounds = list(evidence), list(own), 0
-    known, soft = dict(_FIRST), _SOFT_LIMIT
+    known = dict(_FIRST)
     left_out: list[list[np.ndarray]] | None = None
-    for _ in range(_ROUNDS):
-        fit = problem.fit(evidence, shared, own, known, left_out, soft)
-        shared, own, soft, rounds = fit.shared, fit.own[:-1], None, rounds + fit.rounds
+    for number in range(_ROUNDS):
+        first, last = number == 0, number == _ROUNDS - 1
+        fit = problem.fit(evidence, shared, own, known, left_out)
+        shared, own, rounds = fit.shared, fit.own[:-1], rounds + fit.rounds
         residuals = problem.residuals(evidence, shared, own)
         before, known = known, problem.noise(evidence, residuals)
         left_out = [[strays(r, known[r.kind]) for r in parts] for parts in residuals]
-        used, evidence = evidence, found if correct is None else correct(found, shared, own)
+        used, corrected = evidence, found if correct is None else correct(found, shared, own)
+        evidence = [
+            e.linearised(parts, [~mask for mask in masks])
+            for e, parts, masks in zip(corrected, residuals, left_out, strict=True)
+        ]
         moved = max(
             (float(np.abs(a.placement.pixels - b.placement.pixels).max())
              for a, b in zip(used, evidence, strict=True) if isinstance(a, TargetEvidence)), default=0.0,
         )  # fmt: skip
         steady = all(abs(known[k].effective_px() / before[k].effective_px() - 1) < _SETTLED for k in known)
-        if steady and moved <= _SETTLED_PX:
+        if moved <= _SETTLED_PX and not first and (steady or last):
             return Estimate(
                 parameters=parameters, values=shared, covariance=fit.covariance, own=own, noise=known,
                 residuals=residuals, strays=sum(int(mask.sum()) for parts in left_out for mask in parts),
-                rounds=rounds, stopped=fit.stopped,
+                rounds=rounds, stopped=fit.stopped if steady else UNSETTLED,
             )  # fmt: skip
     raise CalibrationError(
         f"the joint calibration did not settle in {_ROUNDS} rounds: the offsets of the circles' images still move by "
@@ -126,26 +136,27 @@ class _Problem:
 
     def fit(
         self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray], noise: dict[str, Noise],
-        left_out: list[list[np.ndarray]] | None, soft_limit: float | None,
+        left_out: list[list[np.ndarray]] | None,
     ) -> BorderedFit:  # fmt: skip
-        def model(group: int, shared: np.ndarray, own: np.ndarray) -> Observation | None:
+        def model(group: int, shared: np.ndarray, own: np.ndarray) -> list[Observation] | None:
             if group == len(evidence):
-                return self._prior(shared)
+                return [self._prior(shared)]
             parts = evidence[group].residuals(self._parameters, shared, own)
             if parts is None:
                 return None
-            columns = [np.column_stack([r.values, r.by_shared, r.by_own]) / noise[r.kind].effective_px() for r in parts]
-            if left_out is not None:
-                columns = [c[~mask] for c, mask in zip(columns, left_out[group], strict=True)]
+            masks = [np.zeros(len(r.values), dtype=bool) for r in parts] if left_out is None else left_out[group]
+            rows = [_weighted(r, ~mask, noise[r.kind]) for r, mask in zip(parts, masks, strict=True)]
             std = evidence[group].own_std(alignment=self._alignment, position_mm=self._position_mm)
-            known = np.isfinite(std)
-            prior = np.zeros((known.sum(), columns[0].shape[1]))
-            prior[:, 0] = own[known] / std[known]
-            prior[:, 1 + len(shared) :] = (np.eye(len(own)) / std)[known]
-            rows = np.vstack([*columns, prior])
-            return Observation(rows[:, :1], rows[:, 1 : 1 + len(shared)], rows[:, 1 + len(shared) :])
+            known = np.flatnonzero(np.isfinite(std))
+            off = (own[known] / std[known])[:, None]
+            return [*rows, Observation(off, np.zeros((len(off), len(shared))), np.diag(1.0 / std[known]), known)]
 
-        return fit_bordered(model, shared, [*own, np.empty(0)], soft_limit=soft_limit, smallest_gain=_SMALLEST_GAIN)
+        if left_out is None:
+            how = {"smallest_gain": _FIRST_GAIN, "damping": _FIRST_DAMPING, "soft_limit": _SOFT_LIMIT}
+            how |= {"enough_rounds": _FIRST_ROUNDS}
+        else:
+            how = {"smallest_gain": _SMALLEST_GAIN, "damping": _DAMPING}
+        return fit_bordered(model, shared, [*own, np.empty(0)], **how)
 
     def _prior(self, shared: np.ndarray) -> Observation:
         std = self._parameters.prior_std()
@@ -165,5 +176,16 @@ class _Problem:
         result = {}
         for kind in {r.kind: None for parts in residuals for r in parts}:
             points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
-            result[kind] = judged(kind, [r for parts in residuals for r in parts if r.kind == kind], points)
+            of_kind = [r for parts in residuals for r in parts if r.kind == kind]
+            result[kind] = judged(kind, of_kind, points)
+            if kind == SPHERE:
+                spheres = sum(len(e.diameters_mm) for e in evidence if isinstance(e, SphereScanEvidence))
+                per_sphere = sum(len(r.values) for r in of_kind) / spheres
+                result[kind] = with_slope_bias(result[kind], points_per_sphere=per_sphere)
         return result
+
+
+def _weighted(residuals: Residuals, used: np.ndarray, noise: Noise) -> Observation:
+    scale = noise.effective_px()
+    values = residuals.values[used, None] / scale
+    return Observation(values, residuals.by_shared[used] / scale, residuals.by_own[used] / scale, residuals.own)

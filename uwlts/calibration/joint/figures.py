@@ -20,6 +20,7 @@ def joint_figures(result: Estimate) -> dict[str, Any]:
             "std": list(std.values()),
             "std_before": [float(before) if np.isfinite(before) else None for before in prior],
             "covariance": result.covariance.tolist(),
+            "described_sheet": {name: value.tolist() for name, value in vars(result.parameters.sheet).items()},
             "scatter_px": {kind: noise.sigma_px for kind, noise in result.noise.items()},
             "shared_variance": {kind: noise.together for kind, noise in result.noise.items()},
             "residuals": sum(len(r.values) for parts in result.residuals for r in parts),

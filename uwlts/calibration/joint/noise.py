@@ -11,6 +11,9 @@ _STRAY = 5.0
 _TO_STD = 1.4826
 _LAGS = 100
 _SHARED_LAG = 0.05
+_SLOPE_BIAS_PX = 0.03
+"""Size of the error of a stripe's centre that goes with the slope of the surface, as rendered spheres show it."""
+
 _FINEST_PX = 1e-3
 """No point of an image counts as better known, lest what is known before counts for nothing."""
 
@@ -26,14 +29,17 @@ class Noise:
     together : float
         Variance of a mean of many over that of as many independent ones: neighbours along a stripe, or images of the
         same point of the target, err together.
+    besides : float
+        What to add to that for errors that the residuals do not show.
     """
 
     sigma_px: float
     together: float = 1.0
+    besides: float = 0.0
 
     def effective_px(self) -> float:
         """Standard deviation of independent residuals that would tell as little."""
-        return self.sigma_px * float(np.sqrt(self.together))
+        return self.sigma_px * float(np.sqrt(self.together + self.besides))
 
 
 def strays(residuals: Residuals, noise: Noise) -> np.ndarray:
@@ -59,6 +65,11 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
     return Noise(sigma, max(together, 1.0))
 
 
+def with_slope_bias(noise: Noise, *, points_per_sphere: float) -> Noise:
+    """Noise on spheres, whose points share what the stripe's centre is off where the surface leans."""
+    return Noise(noise.sigma_px, noise.together, points_per_sphere * (_SLOPE_BIAS_PX / noise.sigma_px) ** 2)
+
+
 def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:
     """By how much residuals of the same point in several images share their error."""
     _, point = np.unique(np.round(points[:, :2], 6), axis=0, return_inverse=True)
@@ -76,12 +87,11 @@ def _of_neighbours(residuals: Sequence[Residuals], sigma: float) -> float:
     """1 + 2 sum of the autocorrelation along the stripe, up to where it fades, over all images."""
     products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for part in residuals:
-        for image in np.unique(part.image):
-            values = part.values[part.image == image]
-            values = np.clip(values, -_STRAY * sigma, _STRAY * sigma)
-            for lag in range(1, min(_LAGS, len(values) // 4)):
-                products[lag] += values[lag:] @ values[:-lag]
-                counts[lag] += len(values) - lag
+        kept = (np.abs(part.values) <= _STRAY * sigma).astype(np.float64)
+        values = kept * part.values
+        for lag in range(1, min(_LAGS, len(values) // 4)):
+            products[lag] += values[lag:] @ values[:-lag]
+            counts[lag] += kept[lag:] @ kept[:-lag]
     with np.errstate(invalid="ignore"):
         correlation = products / (counts * sigma**2)
     faded = np.flatnonzero(~(correlation[1:] > _SHARED_LAG))

@@ -1,11 +1,15 @@
 """What each piece of evidence says of the parameters: residuals in pixels, and their derivatives.
 
 A residual is the distance in the image between what was found and what the parameters predict. It is calculated on the
-object, where the ray of the found pixel should meet a known point or plane, and brought back to the image by the
-derivative by the pixel: exact to the second order in the residual, and without a search for the predicted pixel.
+object, where the ray of a pixel should meet a known point or plane, and brought back to the image by the derivative by
+the pixel: exact to the second order in the distance between that pixel and the predicted one, and without a search for
+the latter. At first the pixel is the found one. Were it so to the end, its noise would be in residuals and derivatives
+alike, and hundreds of thousands of them would pull weak parameters aside; so it is moved to where the last solution
+predicts it.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,16 +23,28 @@ TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals (n,) in px with their derivatives by shared (n, P) and own (n, b) parameters, and which kind they are.
+    """Residuals (n,) in px of one kind from one image, with their derivatives by shared and own parameters.
 
-    ``image`` (n,) tells from which image of its evidence each comes.
+    Attributes
+    ----------
+    kind : str
+    values : (n,)
+        Of the target's points both coordinates in turn.
+    by_shared : (n, P)
+    by_own : (n, c)
+        By those of the evidence's own parameters that matter in this image.
+    own : (c,)
+        Which of them these are.
+    image : int
+        Number of the image.
     """
 
     kind: str
     values: np.ndarray
     by_shared: np.ndarray
     by_own: np.ndarray
-    image: np.ndarray
+    own: np.ndarray
+    image: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +71,10 @@ class TargetEvidence:
     radius_mm : float
         Largest distance of a point of the target from its middle; there the target's bow is given.
     middle_mm : (2,)
+    predicted : (N, 2), optional
+        Pixels near those predicted of the target's points, where rays are taken; as found unless given.
+    stripe_predicted : (M, 2), optional
+        The same of the stripe.
     """
 
     view: View
@@ -66,6 +86,8 @@ class TargetEvidence:
     staged: bool
     radius_mm: float
     middle_mm: np.ndarray
+    predicted: np.ndarray | None = None
+    stripe_predicted: np.ndarray | None = None
 
     def images(self) -> np.ndarray:
         """Numbers of the images whose stage positions have errors of their own."""
@@ -73,11 +95,10 @@ class TargetEvidence:
 
     def pose(self, parameters: Parameters, shared: np.ndarray, own: np.ndarray, image: int) -> np.ndarray:
         """``T_camera_target`` (4, 4) of one of the images."""
-        shift = self.placement.shifts_mm[self.placement.image == image][:1]
-        pose = _Pose.of(self, parameters, shared, own, shift, np.array([image]))
+        pose = _Pose.of(self, parameters, shared, own, image)
         result = np.eye(4)
         result[:3, :3] = pose.rotation
-        result[:3, 3] = pose.shift - pose.rotation @ (pose.direction * pose.travel[0])
+        result[:3, 3] = pose.shift - pose.rotation @ (pose.direction * pose.travel)
         return result
 
     def own_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
@@ -87,61 +108,84 @@ class TargetEvidence:
         return np.concatenate([np.full(6, np.inf), [alignment] * 2, np.full(len(self.images()), position_mm)])
 
     def residuals(self, parameters: Parameters, shared: np.ndarray, own: np.ndarray) -> list[Residuals] | None:
-        """Those of the target's points and of the stripe; None where a ray meets nothing."""
-        circles = self._of_points(parameters, shared, own)
-        if circles is None or not len(self.stripe_pixels):
-            return None if circles is None else [circles]
-        stripes = self._of_stripes(parameters, shared, own)
-        return None if stripes is None else [circles, stripes]
+        """Those of the target's points and of the stripe, image by image; None where a ray meets nothing."""
+        found = []
+        for image in np.unique(self.placement.image):
+            pose = _Pose.of(self, parameters, shared, own, image)
+            here, lit = self.placement.image == image, self.stripe_image == image
+            parts = [self._of_points(parameters, shared, pose, here)]
+            if lit.any():
+                parts.append(self._of_stripe(parameters, shared, pose, lit))
+            if any(part is None for part in parts):
+                return None
+            found += parts
+        return found
 
-    def _of_points(self, parameters: Parameters, shared: np.ndarray, own: np.ndarray) -> Residuals | None:
-        placement = self.placement
-        rays = parameters.rays(shared, self.view, placement.pixels)
+    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> "TargetEvidence":
+        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
+        predicted, stripe_predicted = self.placement.pixels.copy(), self.stripe_pixels.copy()
+        for part, kept in zip(residuals, used, strict=True):
+            moved = np.where(kept, part.values, 0.0)
+            if part.kind == TARGET:
+                predicted[self.placement.image == part.image] -= moved.reshape(-1, 2)
+            else:
+                stripe_predicted[self.stripe_image == part.image, self.across] -= moved
+        return replace(self, predicted=predicted, stripe_predicted=stripe_predicted)
+
+    def _of_points(
+        self, parameters: Parameters, shared: np.ndarray, pose: "_Pose", here: np.ndarray
+    ) -> Residuals | None:
+        found_px = self.placement.pixels[here]
+        at_px = found_px if self.predicted is None else self.predicted[here]
+        rays = parameters.rays(shared, self.view, at_px)
         if rays is None:
             return None
-        pose = _Pose.of(self, parameters, shared, own, placement.shifts_mm, placement.image)
         start, along = pose.into_target(rays.origins), pose.rotation.T @ rays.directions
         bow = parameters.value(shared, "target_bow")
-        known = placement.points_mm
-        height = bow * self._bulge(known)
-        reach = (height - start[2]) / along[2]
+        known = self.placement.points_mm[here]
+        bulge = self._bulge(known)
+        reach = (bow * bulge - start[2]) / along[2]
         if not (reach > 0).all():
             return None
-        here = rays.origins + reach * rays.directions
-        by_rays = np.einsum("ij,cjn->cin", pose.rotation.T, rays.origins_by + reach * rays.directions_by)
+        at = rays.origins + reach * rays.directions
+        by_rays = pose.rotation.T @ (rays.origins_by + reach * rays.directions_by)
         slope = along[:2] / along[2]
 
         def flat(moved: np.ndarray) -> np.ndarray:
             """From a change (..., 3, N) of the point to that (..., 2, N) of where the ray meets the target."""
             return moved[..., :2, :] - slope * moved[..., 2:, :]
 
-        scale = flat(by_rays[:2])  # (2 pixel, 2 target, N)
+        by_rays = flat(by_rays)
         found = (start + reach * along)[:2] - known[:, :2].T
-        into = np.linalg.inv(np.moveaxis(scale, 2, 0).transpose(0, 2, 1))  # target mm to px
+        into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), target mm to px
 
         def to_pixels(moved: np.ndarray) -> np.ndarray:
-            """From (C, 2, N) to rows (2 N, C)."""
-            return np.einsum("npt,ctn->npc", into, moved).reshape(2 * len(known), -1)
+            """From (2, N, c) to rows (2 N, c)."""
+            return (into @ moved.transpose(1, 0, 2)).reshape(2 * len(known), -1)
 
-        by_scale = flat(pose.by_scale())
+        by_scale = flat(pose.by_scale()[:, None])
         by_shared = np.empty((2, len(known), len(parameters.names)))
-        for axis, moved in enumerate(np.moveaxis(flat(by_rays), 1, 0)):
-            by_shared[axis] = parameters.by_shared(moved, self.view)
-            parameters.add(by_shared[axis], "target_bow", slope[axis] * self._bulge(known))
+        for axis in (0, 1):
+            by_shared[axis] = parameters.by_shared(by_rays[:, axis], self.view)
+            parameters.add(by_shared[axis], "target_bow", slope[axis] * bulge)
             parameters.add(by_shared[axis], "stage_scale", by_scale[axis])
         return Residuals(
             kind=TARGET,
-            values=np.einsum("npt,tn->np", into, found).ravel(),
-            by_shared=np.einsum("npt,tnc->npc", into, by_shared).reshape(2 * len(known), -1),
-            by_own=to_pixels(flat(pose.by_own(here))),
-            image=np.repeat(placement.image, 2),
+            values=(found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel(),
+            by_shared=to_pixels(by_shared),
+            by_own=to_pixels(flat(pose.by_own(at)).transpose(1, 2, 0)),
+            own=pose.own,
+            image=pose.image,
         )
 
-    def _of_stripes(self, parameters: Parameters, shared: np.ndarray, own: np.ndarray) -> Residuals | None:
-        points = parameters.on_sheet(shared, self.view, self.stripe_pixels)
+    def _of_stripe(
+        self, parameters: Parameters, shared: np.ndarray, pose: "_Pose", here: np.ndarray
+    ) -> Residuals | None:
+        found_px = self.stripe_pixels[here]
+        at_px = found_px if self.stripe_predicted is None else self.stripe_predicted[here]
+        points = parameters.on_sheet(shared, self.view, at_px)
         if points is None:
             return None
-        pose = _Pose.of(self, parameters, shared, own, self.stripe_shifts_mm, self.stripe_image)
         at = pose.into_target(points.points)
         bow = parameters.value(shared, "target_bow")
         offset = at[:2] - self.middle_mm[:, None]
@@ -153,15 +197,16 @@ class TargetEvidence:
         bulge = self._bulge(at.T)
         by_shared = parameters.by_shared(by_rays, self.view, by_sheet)
         parameters.add(by_shared, "target_bow", -bulge)
-        parameters.add(by_shared, "stage_scale", np.einsum("in,in->n", gradient, pose.by_scale()))
+        parameters.add(by_shared, "stage_scale", pose.by_scale() @ gradient)
         by_own = np.einsum("in,cin->nc", gradient, pose.by_own(points.points))
         per_px = by_rays[COLUMNS.index("uv"[self.across])]
         return Residuals(
             kind=STRIPE,
-            values=(at[2] - bow * bulge) / per_px,
+            values=(found_px - at_px)[:, self.across] + (at[2] - bow * bulge) / per_px,
             by_shared=by_shared / per_px[:, None],
             by_own=by_own / per_px[:, None],
-            image=self.stripe_image,
+            own=pose.own,
+            image=pose.image,
         )
 
     def _bulge(self, points: np.ndarray) -> np.ndarray:
@@ -171,60 +216,55 @@ class TargetEvidence:
 
 @dataclass(frozen=True, eq=False)
 class _Pose:
-    """How points of the camera frame lie to the target, for each of them; and the derivatives of that."""
+    """How the target stands to the camera in one image, and the derivatives of that by the parameters ``own`` (c,).
+
+    The stage has moved by ``travel`` mm along ``direction``, ``nominal`` without its errors; where it has one of its
+    own, that is the last of the parameters.
+    """
 
     rotation: np.ndarray
     rotation_by: np.ndarray
     shift: np.ndarray
     direction: np.ndarray
     direction_by: np.ndarray
-    travel: np.ndarray
-    nominal: np.ndarray
-    column: np.ndarray
-    own: int
+    travel: float
+    nominal: float
+    own: np.ndarray
+    image: int
 
     @classmethod
-    def of(cls, evidence: TargetEvidence, parameters: Parameters, shared: np.ndarray, own: np.ndarray,
-           shifts_mm: np.ndarray, image: np.ndarray) -> "_Pose":  # fmt: skip
+    def of(
+        cls, evidence: TargetEvidence, parameters: Parameters, shared: np.ndarray, own: np.ndarray, image: int
+    ) -> "_Pose":
         rotation, by = cv2.Rodrigues(own[:3])
         direction = evidence.placement.direction(own[6:8])
-        by_tilt = np.zeros((0, 3))
-        nominal, travel = np.zeros(len(image)), np.zeros(len(image))
-        column = np.full(len(image), -1)
+        by_tilt, nominal, travel, columns = np.zeros((0, 3)), 0.0, 0.0, np.arange(6)
         if evidence.staged:
-            length = abs(direction[2])
-            by_tilt = ((np.eye(3) - np.outer(direction, direction))[:, :2] * length).T
-            nominal = shifts_mm
-            numbers = evidence.images()
-            column = np.searchsorted(numbers, image)
-            first = ~np.isin(image, numbers)
-            errors = np.append(own[8:], 0.0)
-            column[first] = len(numbers)
-            travel = shifts_mm * (1.0 + parameters.value(shared, "stage_scale")) + errors[column]
-            column = np.where(first, -1, column)
+            by_tilt = ((np.eye(3) - np.outer(direction, direction))[:, :2] * abs(direction[2])).T
+            columns = np.append(np.arange(8), 8 + np.flatnonzero(evidence.images() == image))
+            nominal = float(evidence.placement.shifts_mm[evidence.placement.image == image][0])
+            travel = nominal * (1.0 + parameters.value(shared, "stage_scale")) + float(own[columns[8:]].sum())
         return cls(
             rotation=rotation, rotation_by=by.reshape(3, 3, 3), shift=own[3:6], direction=direction,
-            direction_by=by_tilt, travel=travel, nominal=nominal, column=column, own=len(own),
+            direction_by=by_tilt, travel=travel, nominal=nominal, own=columns, image=int(image),
         )  # fmt: skip
 
     def into_target(self, points: np.ndarray) -> np.ndarray:
         """Points (3, N) of the camera frame in the target's frame at the first image."""
-        return self.rotation.T @ (points - self.shift[:, None]) + self.direction[:, None] * self.travel
+        return self.rotation.T @ (points - self.shift[:, None]) + (self.direction * self.travel)[:, None]
 
     def by_scale(self) -> np.ndarray:
-        """Derivative (3, N) of `into_target` by the stage's scale."""
-        return self.direction[:, None] * self.nominal
+        """Derivative (3,) of `into_target` by the stage's scale."""
+        return self.direction * self.nominal
 
     def by_own(self, points: np.ndarray) -> np.ndarray:
-        """Derivatives (b, 3, N) of `into_target` by the own parameters."""
-        away = points - self.shift[:, None]
-        result = np.zeros((self.own, 3, points.shape[1]))
-        result[:3] = np.einsum("kji,jn->kin", self.rotation_by, away)
+        """Derivatives (c, 3, N) of `into_target` by the own parameters."""
+        result = np.empty((len(self.own), 3, points.shape[1]))
+        result[:3] = self.rotation_by.transpose(0, 2, 1) @ (points - self.shift[:, None])
         result[3:6] = -self.rotation[:, :, None]
-        if self.own > 6:
+        if len(self.own) > 6:
             result[6:8] = self.direction_by[:, :, None] * self.travel
-            moved = np.flatnonzero(self.column >= 0)
-            result[8 + self.column[moved], :, moved] = self.direction
+            result[8:] = self.direction[:, None]
         return result
 
 
@@ -249,6 +289,8 @@ class StepProfileEvidence:
         Name of the shared parameter.
     image : int
         Number of the image among all of steps.
+    predicted : (N, 2), optional
+        Pixels near those predicted, where rays are taken; as found unless given.
     """
 
     view: View
@@ -259,6 +301,7 @@ class StepProfileEvidence:
     across: int
     height: str
     image: int
+    predicted: np.ndarray | None = None
 
     def own_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
         """Nothing is known of the line before."""
@@ -266,7 +309,8 @@ class StepProfileEvidence:
 
     def residuals(self, parameters: Parameters, shared: np.ndarray, own: np.ndarray) -> list[Residuals] | None:
         """One for every pixel; None where a ray misses the sheet."""
-        points = parameters.on_sheet(shared, self.view, self.pixels)
+        at_px = self.pixels if self.predicted is None else self.predicted
+        points = parameters.on_sheet(shared, self.view, at_px)
         if points is None:
             return None
         raw = self.upward + own[0] * self.along
@@ -282,9 +326,16 @@ class StepProfileEvidence:
         return [
             Residuals(
                 kind=STEP,
-                values=off / per_px,
+                values=(self.pixels - at_px)[:, self.across] + off / per_px,
                 by_shared=by_shared / per_px[:, None],
                 by_own=by_own / per_px[:, None],
-                image=np.full(len(off), self.image),
+                own=np.arange(2),
+                image=self.image,
             )
         ]
+
+    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> "StepProfileEvidence":
+        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
+        predicted = self.pixels.copy()
+        predicted[:, self.across] -= np.where(used[0], residuals[0].values, 0.0)
+        return replace(self, predicted=predicted)

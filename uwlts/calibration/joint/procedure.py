@@ -7,14 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.evidence import Progress, StepEvidence, air_evidence, step_evidence
+from uwlts.calibration.evidence import Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.joint.account import evidence_figures
+from uwlts.calibration.joint.contradictions import findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.figures import joint_figures
 from uwlts.calibration.joint.observations import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
 from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
+from uwlts.calibration.joint.sphere_scans import SLOPES, SphereScanEvidence
+from uwlts.calibration.joint.sphere_start import SphereStripes, sphere_evidence, sphere_stripes
 from uwlts.calibration.joint.start import Series, series_start, sheet_start
-from uwlts.calibration.model import Calibration, KnownMedium, WindowModel
+from uwlts.calibration.model import Calibration, KnownMedium, KnownStage, WindowModel
 from uwlts.calibration.procedure import CalibrationOptions, common_sensor, nominal_window, sources_of, step_image
 from uwlts.calibration.sheet import object_frame
 from uwlts.camera import project_through_window
@@ -55,6 +59,7 @@ class Gathered:
     series : list of Series
         Target images, by what they were seen through.
     steps : list of (StepEvidence, View)
+    spheres : list of SphereStripes
     provenance : dict
     warnings : list of str
     """
@@ -63,6 +68,7 @@ class Gathered:
     media: dict[str, Medium]
     series: list[Series]
     steps: list[tuple[StepEvidence, View]]
+    spheres: list[SphereStripes]
     provenance: dict[str, Any]
     warnings: list[str]
 
@@ -70,6 +76,7 @@ class Gathered:
 def calibrate_jointly(
     targets: Sequence[Capture],
     steps: Sequence[Capture] = (),
+    spheres: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
     progress: Progress | None = None,
@@ -84,6 +91,8 @@ def calibrate_jointly(
         sheet too.
     steps : sequence of Capture
         A step standard in a medium.
+    spheres : sequence of Capture
+        Scans of spheres that stand still while the stage moves the sensor.
     options : CalibrationOptions
         Its ``refractions`` do not count: windows are plates as described.
     progress : callable, optional
@@ -96,15 +105,15 @@ def calibrate_jointly(
         A capture does not describe its target or its step standard.
     """
     options = CalibrationOptions() if options is None else options
-    return solve_jointly(gather_jointly(targets, steps, options=options, progress=progress), options=options)
+    return solve_jointly(gather_jointly(targets, steps, spheres, options=options, progress=progress), options=options)
 
 
 def gather_jointly(
-    targets: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions,
-    progress: Progress | None = None,
+    targets: Sequence[Capture], steps: Sequence[Capture], spheres: Sequence[Capture] = (), *,
+    options: CalibrationOptions, progress: Progress | None = None,
 ) -> Gathered:  # fmt: skip
-    """Find the target, the stripes on it and those on the step standard in all images."""
-    sensor = common_sensor([*targets, *steps])
+    """Find the target, the stripes on it and those on steps and spheres in all images."""
+    sensor = common_sensor([*targets, *steps, *spheres])
     media: dict[str, Medium] = {}
     views: dict[View, list[Capture]] = {}
     for capture in targets:
@@ -113,10 +122,7 @@ def gather_jointly(
     for view, captures in views.items():
         found = air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
-        if found.images:
-            series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
-    if not series:
-        raise CalibrationError(f"the target was found in no image; {'; '.join(warnings[:3])}")
+        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
     on_steps = []
     for capture in steps:
         view = _view(capture, media)
@@ -125,17 +131,24 @@ def gather_jointly(
         )
         on_steps += [(step, view) for step in found_steps]
         warnings += left_out
-    windowed = [c for c in [*steps, *targets] if c.header.sensor.camera.window.mounted]
+    if steps and not on_steps:
+        raise CalibrationError(no_stripe_in(steps))
+    on_spheres = []
+    for capture in spheres:
+        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the spheres"
+        on_spheres.append(sphere_stripes(capture, _view(capture, media, name), stripe=options.stripe))
+    windowed = [c for c in [*steps, *targets, *spheres] if c.header.sensor.camera.window.mounted]
     return Gathered(
         sensor=windowed[0].header.sensor if windowed else sensor, media=media, series=series, steps=on_steps,
-        provenance=sources_of(targets, steps), warnings=warnings,
+        spheres=on_spheres, provenance=sources_of(targets, steps, spheres), warnings=warnings,
     )  # fmt: skip
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
     sensor, warnings = gathered.sensor, list(gathered.warnings)
-    seen_through = [s.view for s in gathered.series] + [view for _, view in gathered.steps]
+    seen_through = [s.view for s in [*gathered.series, *gathered.spheres]] + [view for _, view in gathered.steps]
+    _refuse_two_lenses(seen_through, gathered)
     window = None
     if any(view.window for view in seen_through):
         window = nominal_window(sensor.camera.window, sensor, refractions=2)
@@ -147,34 +160,79 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     )  # fmt: skip
     found = sheet_start(start, sensor, window, indices)
     if found is None:
-        raise CalibrationError("no stripe was found on the target: take images with the laser on at the same places")
+        reasons = [each.found.no_stripe for each in gathered.series if each.found.no_stripe]
+        raise CalibrationError(
+            "; ".join(reasons) or "no stripe was found on the target: check its description and the stage positions"
+        )
     sheet, turns = found
     first = sheet.model(np.append(turns, (0.0, 0.0)))
-    steps, left_out = _steps(gathered, start.calibration(sensor, window, first), window, options)
-    warnings += left_out
+    first_calibration = start.calibration(sensor, window, first)
+    steps, left_out = _steps(gathered, first_calibration, window, options)
+    scans, missed = _spheres(gathered, first_calibration, indices, options)
+    warnings += [*left_out, *missed]
     heights = {e.height: known for e, known in steps}
     priors = _priors(sensor, gathered, window, indices, turns, heights, options)
     parameters = Parameters(start.intrinsics, sheet, window, media, priors)
-    evidence: list[Evidence] = [*start.evidence, *(e for e, _ in steps)]
+    evidence: list[Evidence] = [*start.evidence, *(e for e, _ in steps), *(e for e, _ in scans)]
     shared = parameters.start(start.lens)
-    own = [*start.own, *(_step_start(e, parameters, shared) for e, _ in steps)]
+    own = [*start.own, *(_step_start(e, parameters, shared) for e, _ in steps), *(own for _, own in scans)]
     target = gathered.series[0].found.target
     circles = options.correct_circles and isinstance(target, CircleTarget)
     result = estimate(
         parameters, evidence, shared, own, uncertainty=sensor.uncertainty,
         correct=partial(_centred, parameters, target.diameter_mm) if circles else None,
     )  # fmt: skip
+    sources = _sources(gathered.series, free=options.poses == "free")
+    sources += [{e.image: gathered.steps[e.image][0].source} for e, _ in steps]
+    sources += [e.sources() for e, _ in scans]
+    against = findings(result, evidence, sources, sensor=sensor)
+    if against.contradictions:
+        raise CalibrationError(against.refusal())
+    warnings += against.doubts
     provenance = gathered.provenance | {"poses": options.poses, "medium_index": options.medium_index}
-    calibration = _calibration(gathered, result, provenance | {"warnings": warnings})
+    provenance |= {"known_before": sensor.uncertainty.model_dump(), "target": target.model_dump(mode="json")}
+    frame = object_frame(parameters.sheet_model(result.values), laser_axis=laser_pose(sensor).axis)
+    kept = evidence_figures(result, evidence, sources, frame)
+    stages = [
+        KnownStage(
+            described=stripes.stage_direction.tolist(),
+            direction=(scan.moved_direction(parameters, result.values) @ frame[:3, :3]).tolist(),
+        )
+        for stripes, (scan, _) in zip(gathered.spheres, scans, strict=False)
+    ]
+    calibration = _calibration(gathered, result, frame, stages[:1], kept, provenance | {"warnings": warnings})
     return JointResult(calibration, result, warnings)
 
 
-def _view(capture: Capture, media: dict[str, Medium]) -> View:
+def _refuse_two_lenses(views: Sequence[View], gathered: Gathered) -> None:
+    """CalibrationError where a lens that looks straight into a medium would have to be the one seen otherwise."""
+    wet = next((view for view in views if view.medium is not None and not view.window), None)
+    if wet is not None and any(view != wet for view in views):
+        raise CalibrationError(
+            f"some captures in {list(gathered.media)[wet.medium]} were taken without a window and others were not: a "
+            "lens that touches the medium is another lens; calibrate it by itself, or set window.mounted"
+        )
+
+
+def _sources(series: Sequence[Series], *, free: bool) -> list[dict[int, str]]:
+    """Capture and frame of every image of every placement, in the order of `series_start`."""
+    return [
+        {
+            int(image): f"{part.names[part.found.frames[image][0]]}, frame {part.found.frames[image][1]}"
+            for image in np.unique(placement.image)
+        }
+        for part in series
+        for placement in part.placements(free=free)
+    ]
+
+
+def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> View:
+    """Through what a capture was taken; ``name`` is the medium's own unless given."""
     header = capture.header
     window = header.sensor.camera.window.mounted
     if header.medium.kind == "air":
         return View(window, None)
-    name = header.medium_name
+    name = name or header.medium_name
     if media.setdefault(name, header.medium) != header.medium:
         raise CalibrationError(f"the captures mean different media by '{name}': {media[name]} and {header.medium}")
     return View(window, list(media).index(name))
@@ -206,14 +264,18 @@ def _priors(
             "glass_thickness": Prior(window.thickness_mm, known.glass_thickness_mm),
             "glass_index": Prior(window.glass_index, known.glass_index),
         }
-        for (name, medium), index in zip(gathered.media.items(), indices, strict=True):
-            std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
-            priors[f"index of {name}"] = Prior(index, known.index if options.medium_index else std)
+    for (name, medium), index in zip(gathered.media.items(), indices, strict=True):
+        std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
+        priors[f"index of {name}"] = Prior(index, known.index if options.medium_index else std)
     priors |= {name: Prior(float(value), np.inf) for name, value in zip(SHEET[:3], turns, strict=True)}
-    priors["sheet_bow"] = Prior(0.0, float(np.radians(known.bow_deg)))
-    if gathered.media:
-        priors["laser_window_turn"] = Prior(0.0, float(np.radians(known.laser_window_tilt_deg)))
-    if options.poses != "free":
+    bow, turn = np.radians([known.bow_deg, known.laser_window_tilt_deg])
+    priors["sheet_bow"] = Prior(float(np.radians(sensor.laser.bow_deg)), float(bow))
+    if gathered.media and sensor.laser.window.mounted:
+        priors["laser_window_turn"] = Prior(float(np.arcsin(sensor.laser.window.normal()[0])), float(turn))
+    if gathered.spheres:
+        lean = float(np.tan(np.radians(known.stage_alignment_deg)))
+        priors |= dict.fromkeys(SLOPES, Prior(0.0, lean))
+    if options.poses != "free" or gathered.spheres:
         priors["stage_scale"] = Prior(0.0, known.stage_scale)
     priors["target_bow"] = Prior(0.0, known.target_bow_mm)
     return priors | heights
@@ -240,6 +302,25 @@ def _steps(
             height=f"height of the {height:g} mm step", image=number,
         )  # fmt: skip
         found.append((evidence, Prior(height, stated / 2 if stated else usual)))
+    return found, warnings
+
+
+def _spheres(
+    gathered: Gathered, start: Calibration, indices: list[float], options: CalibrationOptions
+) -> tuple[list[tuple[SphereScanEvidence, np.ndarray]], list[str]]:
+    found, warnings, image = [], [], 0
+    for stripes in gathered.spheres:
+        index = 1.0 if stripes.view.medium is None else indices[stripes.view.medium]
+        through = start if stripes.view.window else start.model_copy(update={"window": None})
+        try:
+            evidence, own = sphere_evidence(
+                stripes, through, medium_index=index, sizes_known=options.sizes_known, image=image
+            )
+        except EvaluationError as error:
+            warnings.append(f"{stripes.source}: left out, {error}")
+            continue
+        found.append((evidence, own))
+        image += len(evidence.stage_mm)
     return found, warnings
 
 
@@ -285,23 +366,29 @@ def _with_centres(
     return replace(evidence, placement=replace(placement, pixels=pixels))
 
 
-def _calibration(gathered: Gathered, result: Estimate, provenance: dict[str, Any]) -> Calibration:
+def _calibration(
+    gathered: Gathered, result: Estimate, frame: np.ndarray, stages: list[KnownStage], evidence: dict[str, Any],
+    provenance: dict[str, Any],
+) -> Calibration:  # fmt: skip
     sensor, parameters, values = gathered.sensor, result.parameters, result.values
+    figures = joint_figures(result)
+    figures["joint"] |= evidence
     sheet = parameters.sheet_model(values)
+    wet = parameters.window is None and gathered.media
     return Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
         wavelength_nm=sensor.laser.wavelength_nm,
+        medium_kind=next(iter(gathered.media.values())).kind if wet else "air",
         camera=parameters.camera(values),
         window=parameters.window_model(values),
         sheet=sheet,
-        camera_from_object=tuple(map(tuple, object_frame(sheet, laser_axis=laser_pose(sensor).axis).tolist())),
+        camera_from_object=tuple(map(tuple, frame.tolist())),
+        stages=tuple(stages),
         media=tuple(
             KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
             for number, medium in enumerate(gathered.media.values())
-        )
-        if parameters.window is not None
-        else (),
-        residuals=joint_figures(result),
+        ),
+        residuals=figures,
         provenance=provenance,
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from uwlts.calibration.joint.rays import RayJets
 from uwlts.calibration.model import FanModel, SheetModel
-from uwlts.sheet_surface import bulge_reach_mm, sheet_surface
+from uwlts.sheet_surface import behind_window_mm, fan_distances, sheet_surface
 
 PARAMETERS = ("sheet_turn_fan", "sheet_turn_axis", "sheet_offset", "sheet_bow", "laser_window_turn")
 """Turns of the normal in rad towards the axis and towards the fan's direction, shift in mm, numbers of `FanModel`."""
@@ -58,19 +58,28 @@ class DescribedSheet:
         cosine, sine = np.cos(angle), np.sin(angle)
 
         def across(n: np.ndarray, m: np.ndarray) -> np.ndarray:
-            return np.cross(np.cross(self.axis, n), m)
+            """Vector (axis x n) x m."""
+            return n * (self.axis @ m) - self.axis * (n @ m)
 
         from_middle, from_pivot = points - self.middle_mm[:, None], points - self.pivot_mm[:, None]
         by = np.empty((6, points.shape[1]))
         for row, n in enumerate(normal_by):
             turned = (cosine - 1.0) * n + sine * (across(n, normal) + across(normal, n))
             by[row] = n @ from_middle + turned @ from_pivot
-        reach = bulge_reach_mm(points, self.model(values).fan)
+        fan = self.model(values).fan
+        at, behind = fan_distances(points, fan, medium_index=index), behind_window_mm(fan)
+        of_bow, of_turn = at.bulges()
+        # The fan seems to begin farther away as the index grows.
+        air_by = (index * (at.along**2 - at.all**2) + at.along * behind) / at.in_air
+        wet_by = -behind / at.along * at.wet
+        of_bow_by = behind * at.along / at.all - air_by
+        of_turn_by = at.wet * (behind - air_by) + wet_by * (at.along - at.in_air)
         by_angle = (cosine * across(normal, normal) - sine * normal) @ from_pivot
         by[2] = -1.0
-        by[3] = -reach * index
-        by[4] = by_angle * (1.0 - 1.0 / index) - reach * (index - 1.0 / index)
-        by[5] = by_angle * turn / index**2 - reach * (bow + turn * (1.0 + index**-2))
+        by[3] = -of_bow / index
+        by[4] = by_angle * (1.0 - 1.0 / index) - of_turn / index
+        by[5] = by_angle * turn / index**2
+        by[5] += (bow * of_bow + turn * of_turn) / index**2 - (bow * of_bow_by + turn * of_turn_by) / index
         return by
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from uwlts.calibration.camera_poses import solve_camera
+from uwlts.calibration.camera_poses import CameraSolution, solve_camera
 from uwlts.calibration.camera_start import placement_pose
 from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
@@ -23,6 +23,12 @@ from uwlts.errors import CalibrationError
 from uwlts.placement import camera_from_object, laser_pose
 from uwlts.refraction import trace_window
 from uwlts.sensor import Sensor
+
+_LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3
+"""Pixels, or a share of the focal length: what the stage's errors leave in the images that a start is found from."""
+
+# As robust as a median can be; what is left out here is judged again with the final sheet.
+_LARGEST_REJECTED = 0.45
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +92,10 @@ def series_start(
     seen = solve_camera(
         base.found.images, width_px=image.width_px, height_px=image.height_px,
         poses="stage-normal" if staged else "free", approaching=bool(base.approaching), options=options,
-    ).model  # fmt: skip
-    lens = intrinsics.from_model(seen)
+    )  # fmt: skip
+    if not base.view.window and base.view.medium is None:
+        _refuse_misfits(base, seen)
+    lens = intrinsics.from_model(seen.model)
     index = _index(base.view, indices)
     for place, name in enumerate(intrinsics.names):
         lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
@@ -131,7 +139,7 @@ def sheet_start(
             points.append((at - piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))) @ rotation.T
                           + own[3:6])  # fmt: skip
     pose, plate = laser_pose(sensor), sensor.laser.window
-    sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal).model
+    sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
     normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
     middle = camera_from_object(sensor)[:3, 3]
     outer = plate.distance_mm + plate.thickness_mm if plate.mounted else 0.0
@@ -140,8 +148,22 @@ def sheet_start(
     return described, np.array([*turns, sheet.offset_mm - normal @ middle])
 
 
+def _refuse_misfits(series: Series, seen: CameraSolution) -> None:
+    """CalibrationError where a camera without a window in air does not explain the images by and large."""
+    rms = seen.image_rms_px()
+    if np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px):
+        return
+    capture, frame = series.found.frames[int(np.argmax(rms))]
+    raise CalibrationError(
+        f"no camera explains the target images in air: {np.median(rms):.1f} px (rms) are left in most of them, and "
+        f"{rms.max():.1f} px in {series.names[capture]}, frame {frame}: check the target's spacing, the stage's "
+        "positions, and that all captures come from the same camera and medium"
+    )
+
+
 def _index(view: View, indices: Sequence[float]) -> float:
-    return 1.0 if view.medium is None else indices[view.medium]
+    """Index behind the window; without one the lens itself looks into the medium, whatever it is."""
+    return indices[view.medium] if view.window and view.medium is not None else 1.0
 
 
 def _pose(camera: CameraModel, placement: Placement, window: WindowModel | None, index: float) -> np.ndarray:

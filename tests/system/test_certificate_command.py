@@ -1,0 +1,95 @@
+"""The command that writes and checks certificates, on a calibration of views made by Fermat's principle."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.unit.calibration_views import built_sensor
+from tests.unit.joint_views import Noise, gathered, target_series
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.model import write_calibration
+from uwlts.calibration.procedure import CalibrationOptions
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(*arguments, folder: Path) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "uwlts.cli", *map(str, arguments)], cwd=folder, capture_output=True, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False, timeout=60,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def calibration(thesis, tmp_path_factory) -> Path:
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(
+        built_sensor(), medium=0, positions=np.arange(5) * 40.0 - 110.0, noise=noise, columns=15
+    )  # fmt: skip
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    path = tmp_path_factory.mktemp("certificates") / "calibration.json"
+    write_calibration(path, solve_jointly(gathered(thesis, [series]), options=options).calibration)
+    return path
+
+
+@pytest.fixture
+def folder(calibration, tmp_path) -> Path:
+    shutil.copy(calibration, tmp_path)
+    return tmp_path
+
+
+def test_a_certificate_is_written_and_checked(folder: Path):
+    done = run("certificate", "calibration.json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "expanded uncertainty (k = 2)" in done.stdout
+    assert "next: an image of the target in water" in done.stdout
+    page = (folder / "calibration.certificate.html").read_text(encoding="utf-8")
+    content = json.loads((folder / "calibration.certificate.json").read_text(encoding="utf-8"))
+    assert content["sha256"] in page
+    assert content["lengths"] and content["cannot_tell"] and content["next_shots"]
+    checked = run("certificate", "calibration.json", "--check", "calibration.certificate.json", folder=folder)
+    assert (checked.returncode, checked.stderr) == (0, "")
+    assert "is as it was issued, and is about calibration.json" in checked.stdout
+
+
+def test_changes_are_found(folder: Path):
+    assert run("certificate", "calibration.json", folder=folder).returncode == 0
+    path = folder / "calibration.json"
+    path.write_text(path.read_text(encoding="utf-8").replace('"thesis"', '"theses"', 1), encoding="utf-8")
+    checked = run("certificate", "calibration.json", "--check", "calibration.certificate.json", folder=folder)
+    assert checked.returncode == 1
+    assert "is not the calibration that calibration.certificate.json is about" in checked.stdout
+
+
+def test_nothing_is_replaced_unasked_nor_the_calibration_at_all(folder: Path):
+    before = (folder / "calibration.json").read_bytes()
+    own = run("certificate", "calibration.json", "--out", "calibration.html", "--overwrite", folder=folder)
+    assert own.returncode == 2
+    assert "would replace the calibration" in own.stderr
+    (folder / "cert.json").write_text("{}", encoding="utf-8")
+    there = run("certificate", "calibration.json", "--out", "cert.html", folder=folder)
+    assert there.returncode == 2
+    assert "cert.json exists already" in there.stderr
+    assert not (folder / "cert.html").exists()
+    assert (folder / "calibration.json").read_bytes() == before
+
+
+def test_beside_another_calibration_and_without_a_joint_estimate(folder: Path):
+    assert run("nominal", "thesis", "--medium", "water", "--out", "nominal.json", folder=folder).returncode == 0
+    done = run(
+        "certificate", "calibration.json", "--before", "nominal.json", "--out", "cert.html", folder=folder
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Against nominal.json" in (folder / "cert.html").read_text(encoding="utf-8")
+    plain = run("certificate", "nominal.json", folder=folder)
+    assert plain.returncode == 0, plain.stderr
+    assert "what lengths measured by it are worth is not known" in plain.stdout
+    wrong = run("certificate", "nominal.json", "--check", "nominal.json", folder=folder)
+    assert wrong.returncode == 2
+    assert "is JSON but not a certificate" in wrong.stderr

@@ -1,0 +1,193 @@
+"""What clouds say of their points' uncertainty, against Monte Carlo through the reconstruction itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.unit.calibration_views import built_sensor
+from tests.unit.joint_views import MEDIUM, Noise, gathered, target_series
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.joint.stored import stored_estimate
+from uwlts.calibration.model import KnownMedium
+from uwlts.calibration.procedure import CalibrationOptions
+from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.errors import CalibrationError
+from uwlts.metrology.artefacts import PlaneStandard, evaluate_cloud
+from uwlts.reconstruction import reconstruct_pixels
+from uwlts.sensor import Medium
+from uwlts.uncertainty.figures import figure_uncertainties, noise_mm
+from uwlts.uncertainty.points import PAIRS
+from uwlts.uncertainty.propagation import point_uncertainty, stripe_noise_px
+
+BUILT = built_sensor()
+DRAWS = 400
+LINES = np.arange(100, 1180, 12)
+
+
+@pytest.fixture(scope="module")
+def calibration(thesis):
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    return solve_jointly(gathered(thesis, [series]), options=options).calibration
+
+
+def capture_of(folder, sensor, medium, frames=2) -> Capture:
+    header = CaptureHeader(
+        name="scan", sensor=sensor, medium_name="water", medium=medium, stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+    )  # fmt: skip
+    path = folder / "scan.h5"
+    image = np.zeros((sensor.camera.height_px, sensor.camera.width_px), np.uint8)
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        for number in range(frames):
+            writer.append(Frame(image, float(number), True, 1.0, float(number)))
+    return Capture(path)
+
+
+@pytest.fixture(scope="module")
+def stripes():
+    """Stripes (frame, line, centre) of two images: near and far, with 0.1 px and 0.3 px of noise."""
+    rng = np.random.default_rng(7)
+    line = np.tile(np.arange(100, 1180), 2)
+    frame = np.repeat([0, 1], len(line) // 2)
+    smooth = np.where(frame == 0, 300.0, 700.0) + 20 * np.sin(line / 200)
+    return frame, line, smooth + rng.normal(0, np.where(frame == 0, 0.1, 0.3))
+
+
+def full(matrix6):
+    result = np.zeros((len(matrix6), 3, 3))
+    for column, (i, j) in enumerate(PAIRS):
+        result[:, i, j] = result[:, j, i] = matrix6[:, column]
+    return result
+
+
+def test_the_stripes_noise_is_that_of_its_image(stripes):
+    """The median of 1078 differences is right to 2 % (one standard deviation); a step between treads does not count."""
+    frame, line, centre = stripes
+    centre = centre + 40.0 * ((line > 500) & (line < 700))
+    noise = stripe_noise_px(frame, line, centre)
+    assert noise[frame == 0] == pytest.approx(0.1, rel=0.08)
+    assert noise[frame == 1] == pytest.approx(0.3, rel=0.08)
+
+
+def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_path):
+    """By drawing parameters from the estimate's covariance and reconstructing with each calibration."""
+    frame, line, centre = stripes
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame, line, centre)
+        stored = stored_estimate(calibration, thesis, MEDIUM)
+        stage = capture.stage_mm[frame]
+    pick = np.arange(0, len(line), 120)
+    rng = np.random.default_rng(3)
+    drawn = rng.multivariate_normal(stored.values, stored.covariance, DRAWS, method="svd")
+    pixels = np.column_stack([line, centre])[pick]
+    points = []
+    for values in drawn:
+        changed = calibration.model_copy(
+            update={
+                "camera": stored.parameters.camera(values), "window": stored.parameters.window_model(values),
+                "sheet": stored.parameters.sheet_model(values),
+                "media": (KnownMedium(medium=MEDIUM, index=stored.parameters.medium_index(values, stored.view)),),
+            }
+        )  # fmt: skip
+        points.append(
+            reconstruct_pixels(changed, pixels, medium_index=changed.index_of(MEDIUM), stage_mm=stage[pick],
+                               stage_direction=np.array([1.0, 0, 0])).points_mm
+        )  # fmt: skip
+    points = np.array(points)
+    # Correlations between different points included: of the differences to the first point.
+    for seen, patterns in (
+        (points, known.patterns_mm[:, pick]),
+        (points[:, 1:] - points[:, :1], known.patterns_mm[:, pick[1:]] - known.patterns_mm[:, pick[:1]]),
+    ):
+        by_draws = np.std(seen, axis=0)
+        by_patterns = np.sqrt(np.sum(patterns.astype(float) ** 2, axis=0))
+        # A standard deviation of 400 draws is right to 3.5 % (one sigma): 5 sigma, and 0.1 um for what is left out.
+        np.testing.assert_allclose(by_patterns, by_draws, rtol=0.18, atol=1e-4)
+    systematic = full(known.systematic_mm2()[pick])
+    cov = np.einsum("dni,dnj->nij", points - points.mean(0), points - points.mean(0)) / (DRAWS - 1)
+    size = np.sqrt(np.einsum("nii->n", systematic))[:, None, None] ** 2
+    assert (np.abs(systematic - cov) / size).max() < 0.3
+
+
+def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame, line, centre)
+
+    def points(shift):
+        pixels = np.column_stack([line, centre + shift])
+        return reconstruct_pixels(calibration, pixels, medium_index=calibration.index_of(MEDIUM), stage_mm=0.0,
+                                  stage_direction=np.array([1.0, 0, 0])).points_mm  # fmt: skip
+
+    shared = np.sqrt(calibration.residuals["joint"]["shared_variance"]["stripe on the target"])
+    expected = (points(0.5) - points(-0.5)) * (stripe_noise_px(frame, line, centre) * shared)[:, None]
+    np.testing.assert_allclose(
+        full(known.random_mm2), np.einsum("ni,nj->nij", expected, expected), rtol=1e-3, atol=1e-3 * np.max(expected**2)
+    )
+    along = noise_mm(known)
+    assert np.allclose(np.abs(along), np.abs(expected), rtol=1e-2, atol=1e-5)
+
+
+def test_another_water_is_known_by_its_temperature_only(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    other = Medium(kind="fresh", temperature_c=12.0)
+    stored = stored_estimate(calibration, thesis, other)
+    assert stored.parameters.names[-1] == "index of the scan"
+    std = other.index_uncertainty(calibration.wavelength_nm, thesis.uncertainty)
+    assert np.sqrt(stored.covariance[-1, -1]) == pytest.approx(std)
+    assert not stored.covariance[-1, :-1].any()
+    warm = thesis.model_copy(update={"uncertainty": thesis.uncertainty.model_copy(update={"temperature_k": 20.0})})
+    sizes = []
+    for number, sensor in enumerate((thesis, warm)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with capture_of(folder, sensor, other) as capture:
+            known = point_uncertainty(capture, calibration, frame, line, centre)
+            width = known.patterns_mm[:, 1079, 1] - known.patterns_mm[:, 0, 1]
+            sizes.append(np.linalg.norm(width))
+    # 20 K change the index by some 1e-3, and widths as much.
+    assert 1.5 * sizes[0] < sizes[1] < 0.3
+
+
+def test_a_cloud_keeps_it_in_its_file(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame, line, centre)
+    cloud = PointCloud(np.zeros((len(line), 3)), np.ones(len(line)), frame, line, uncertainty=known)
+    write_cloud(tmp_path / "a.ply", cloud)
+    again = read_cloud(tmp_path / "a.ply").uncertainty
+    np.testing.assert_array_equal(again.random_mm2, known.random_mm2)
+    np.testing.assert_array_equal(again.patterns_mm, known.patterns_mm)
+    assert again.std_mm().shape == (len(line), 3)
+
+
+def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesis, tmp_path):
+    """A plane's flatness figures by patterns and draws, against 200 draws of both together."""
+    frame, line, centre = stripes
+    near = frame == 0
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame[near], line[near], centre[near])
+    rng = np.random.default_rng(0)
+    grid = np.column_stack([rng.uniform(-20, 20, near.sum()), np.linspace(-60, 60, near.sum()), np.zeros(near.sum())])
+    cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
+    artefact = PlaneStandard(kind="plane")
+    found = figure_uncertainties(cloud, artefact)
+    along, patterns = noise_mm(known), known.patterns_mm.astype(float)
+    spread = []
+    for _ in range(200):
+        moved = grid + rng.standard_normal((len(grid), 1)) * along
+        moved = moved + np.einsum("m,mni->ni", rng.standard_normal(len(patterns)), patterns)
+        spread.append(evaluate_cloud(replace(cloud, points_mm=moved), artefact).figures_mm["STD"])
+    total = np.hypot(found["STD"].random_mm, found["STD"].systematic_mm)
+    # STD adds squares, so that it is not linear in the patterns: the same size is what can be asked.
+    assert 0.3 * np.std(spread) < total < 3 * np.std(spread)
+
+
+def test_a_calibration_by_turns_tells_none(calibration, thesis):
+    without = calibration.model_copy(update={"residuals": {}})
+    with pytest.raises(CalibrationError, match="calibrate jointly"):
+        stored_estimate(without, thesis, MEDIUM)

@@ -1,0 +1,246 @@
+"""Whether evidence, prior knowledge and noise of a joint estimate agree; which images and which figures do not.
+
+What least squares returns can be wrong although its stated uncertainty is small: a target of other spacing, a stage
+that slips, an image of another lens. Such things show in residuals larger than images are noisy, in images that fit
+worse than the others, and in parameters far from what was known before.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
+from uwlts.calibration.joint.noise import strays
+from uwlts.calibration.joint.observations import TARGET, Residuals, TargetEvidence
+from uwlts.calibration.joint.prior_words import off_as_words
+from uwlts.sensor import Sensor, Uncertainty
+
+_TO_STD = 1.4826
+_LARGEST_TARGET_PX, _LARGEST_STRIPE_PX = 0.5, 1.0
+"""Scatter beyond which target points or stripes were misdetected or contradict each other, whatever the image."""
+_FEWEST_VALUES = 20
+
+_OVER_OTHERS, _OVER_OTHERS_PX = 3.0, 0.15
+_OVER_NOISE = 2.5
+_WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
+"""Lines that err together; the filter that finds the stripe, and speckle, join two to four."""
+
+_STRAY_SHARE = 0.2
+_DOUBTFUL, _WRONG = 4.0, 6.0
+"""Standard uncertainties from what was known before. Those of drawings are guesses, so few are but doubtful."""
+
+_FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
+"""Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
+
+_POSITIONS_WRONG = 3.0
+_FEWEST_POSITIONS = 4
+_MOST_NAMED, _MOST_SAID = 4, 6
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What speaks against an estimate, in words: contradictions, which make it useless, and doubts."""
+
+    contradictions: list[str]
+    doubts: list[str]
+
+    def refusal(self) -> str:
+        """The gravest contradictions as a message."""
+        more = len(self.contradictions) - _MOST_SAID
+        said = "; ".join(self.contradictions[:_MOST_SAID])
+        return f"the evidence contradicts itself: {said}" + (f"; and {more} more contradictions" if more > 0 else "")
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Robust scatter of one kind of residual in one image, and that of its fine structure, which no parameter moves."""
+
+    source: str
+    kind: str
+    peers: tuple[str, object]
+    scatter_px: float
+    noise_px: float
+
+    def largest_px(self) -> float:
+        """Scatter that is too large for its kind, whatever the noise."""
+        return _LARGEST_TARGET_PX if self.kind == TARGET else _LARGEST_STRIPE_PX
+
+
+def findings(
+    result: Estimate, evidence: Sequence[Evidence], sources: Sequence[Mapping[int, str]], *, sensor: Sensor
+) -> Findings:
+    """What speaks against an estimate.
+
+    Parameters
+    ----------
+    result : Estimate
+    evidence : sequence
+        What it was made from.
+    sources : sequence of mapping
+        For every piece of evidence the names of its images by their numbers: capture and frame.
+    sensor : Sensor
+        As described.
+    """
+    images = [
+        _image(residuals, piece, names[residuals.image])
+        for piece, parts, names in zip(evidence, result.residuals, sources, strict=True)
+        for residuals in parts
+        if len(residuals.values) >= _FEWEST_VALUES
+    ]
+    contradictions, doubts = _of_priors(result)
+    contradictions += _of_stage(result, evidence, sources, sensor.uncertainty)
+    unlike, unusual = _of_lens(result, sensor)
+    contradictions += unlike
+    worse, doubtful = _of_images(images)
+    contradictions += worse
+    contradictions += _of_kinds(images)
+    waves, slight_waves = _of_shapes(result)
+    contradictions += waves
+    doubts += unusual + doubtful + slight_waves + _of_strays(result)
+    if result.stopped == UNSETTLED:
+        doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
+    return Findings(contradictions, doubts)
+
+
+def _image(residuals: Residuals, evidence: Evidence, source: str) -> _Image:
+    values = residuals.values
+    scatter = _TO_STD * float(np.median(np.abs(values)))
+    # Residuals of neighbouring points or lines share what a wrong model does to them.
+    steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
+    noise = _TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
+    return _Image(source, residuals.kind, (residuals.kind, evidence.view), scatter, noise)
+
+
+def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
+    """Parameters far from what was known before."""
+    parameters = result.parameters
+    mean, before = parameters.prior_mean(), parameters.prior_std()
+    wrong, doubtful = [], []
+    for name, value, known, std, after in zip(
+        parameters.names, result.values, mean, before, np.sqrt(np.diag(result.covariance)), strict=True
+    ):
+        if not np.isfinite(std):
+            continue
+        # The estimate contains the prior: this is the variance of their difference where both are right.
+        share = float(np.sqrt(max(std**2 - after**2, (0.1 * std) ** 2)))
+        sigmas = abs(value - known) / share
+        if sigmas > _DOUBTFUL:
+            (wrong if sigmas > _WRONG else doubtful).append((sigmas, off_as_words(name, value, known, std)))
+    return [words for _, words in sorted(wrong, reverse=True)], [words for _, words in sorted(doubtful, reverse=True)]
+
+
+def _of_lens(result: Estimate, sensor: Sensor) -> tuple[list[str], list[str]]:
+    """A focal length far from the lens's: spacing, medium and stage can be wrong together and fit nevertheless."""
+    camera, described = result.parameters.camera(result.values), sensor.camera.focal_length_px()
+    off = abs(camera.fx_px / described - 1)
+    if off <= _FOCAL_DOUBTFUL:
+        return [], []
+    words = (
+        f"the focal length is {camera.fx_px:.1f} px, by the description {described:.1f} px: check the target's "
+        "spacing, the medium in the captures, and the lens"
+    )
+    return ([words], []) if off > _FOCAL_WRONG else ([], [words])
+
+
+def _of_stage(
+    result: Estimate, evidence: Sequence[Evidence], sources: Sequence[Mapping[int, str]], uncertainty: Uncertainty
+) -> list[str]:
+    """Directions and positions of the stage far from what its description says."""
+    found = []
+    std = uncertainty.stage_position_mm
+    for piece, own, names in zip(evidence, result.own, sources, strict=True):
+        if not (isinstance(piece, TargetEvidence) and piece.staged):
+            continue
+        tilt = float(np.degrees(np.arctan(np.hypot(*own[6:8]))))
+        if tilt > _WRONG * uncertainty.stage_alignment_deg:
+            found.append(
+                f"{_capture(names)}: the stage moves {tilt:.2g} deg off the target's normal, described as within "
+                f"{uncertainty.stage_alignment_deg:g} deg (uncertainty.stage_alignment_deg)"
+            )
+        errors, images = own[8:], piece.images()
+        # The first position has no error of its own, so all others share its.
+        errors = errors - np.median(np.append(errors, 0.0))
+        # One that is far off bends the camera and so moves the others too.
+        usual = max(std, _TO_STD * float(np.median(np.abs(errors)))) if len(errors) else std
+        wrong = np.abs(errors) > _WRONG * usual
+        rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+        if 0 < wrong.sum() <= max(1, len(errors) // 4):
+            found += _some(
+                [
+                    f"{names[image]}: the stage stood {error:+.3f} mm from where it said, stated uncertainty {std:g} mm"
+                    for image, error in zip(images[wrong], errors[wrong], strict=True)
+                ]
+            )
+        elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
+            found.append(
+                f"{_capture(names)}: the stage's positions scatter by {rms:.3f} mm, stated uncertainty {std:g} mm "
+                "(uncertainty.stage_position_mm)"
+            )
+    return found
+
+
+def _of_images(images: Sequence[_Image]) -> tuple[list[str], list[str]]:
+    """Images that fit far worse than their like: contradictions where not by their own noise, else doubts."""
+    wrong, doubtful = [], []
+    for image in images:
+        others = [other.scatter_px for other in images if other.peers == image.peers and other is not image]
+        usual = float(np.median(others)) if others else image.noise_px
+        if image.scatter_px <= max(_OVER_OTHERS * usual, usual + _OVER_OTHERS_PX):
+            continue
+        shaped = image.scatter_px > _OVER_NOISE * image.noise_px
+        (wrong if shaped or image.scatter_px > image.largest_px() else doubtful).append(
+            f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), "
+            + (f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px")
+        )
+    return _some(wrong), _some(doubtful)
+
+
+def _of_kinds(images: Sequence[_Image]) -> list[str]:
+    """Kinds of residuals that scatter more than images are noisy."""
+    found = []
+    for kind in dict.fromkeys(image.kind for image in images):
+        of_kind = [image for image in images if image.kind == kind]
+        scatter = float(np.median([image.scatter_px for image in of_kind]))
+        noise = float(np.median([image.noise_px for image in of_kind]))
+        if scatter > of_kind[0].largest_px() or scatter > max(_OVER_NOISE * noise, noise + _OVER_OTHERS_PX):
+            worst = max(of_kind, key=lambda image: image.scatter_px)
+            found.append(
+                f"the {kind} is {scatter:.2f} px off (rms) in most images, noise accounts for {noise:.2f} px; worst is "
+                f"{worst.source} with {worst.scatter_px:.2f} px"
+            )
+    return found
+
+
+def _of_shapes(result: Estimate) -> tuple[list[str], list[str]]:
+    """Stripes whose residuals run together over many lines, as those of a wrong height or window do."""
+    wrong, doubtful = [], []
+    for kind, noise in result.noise.items():
+        if kind == TARGET or noise.together <= _WAVES_DOUBTFUL:
+            continue
+        (wrong if noise.together > _WAVES_WRONG else doubtful).append(
+            f"the {kind} is off in waves along itself rather than by noise ({noise.sigma_px:.2f} px rms, as good as "
+            f"one independent value in {noise.together:.0f} lines): check heights, media and what else was described"
+        )
+    return wrong, doubtful
+
+
+def _of_strays(result: Estimate) -> list[str]:
+    """Kinds of which much was left out."""
+    found = []
+    for kind, noise in result.noise.items():
+        parts = [part for parts in result.residuals for part in parts if part.kind == kind]
+        share = np.concatenate([strays(part, noise) for part in parts]).mean()
+        if share > _STRAY_SHARE:
+            found.append(f"{100 * share:.0f} % of the {kind} was left out as strays: look at the images")
+    return found
+
+
+def _capture(names: Mapping[int, str]) -> str:
+    return next(iter(names.values())).split(", frame ")[0]
+
+
+def _some(lines: list[str]) -> list[str]:
+    if len(lines) <= _MOST_NAMED:
+        return lines
+    return [*lines[:_MOST_NAMED], f"and {len(lines) - _MOST_NAMED} more images"]

@@ -1,0 +1,210 @@
+"""Evidence as further shots would give it, without noise: target, step and spheres where a joint estimate has them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from uwlts.calibration.joint.observations import Residuals, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.parameters import Prior
+from uwlts.calibration.joint.sphere_scans import SLOPES, SphereScanEvidence
+from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.volume import pixels_at
+from uwlts.calibration.model import Calibration
+from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
+from uwlts.calibration.target_placement import Placement
+from uwlts.camera import project_through_window
+from uwlts.sensor import Uncertainty
+from uwlts.sheet_surface import sheet_surface
+from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
+
+_FEWEST_POINTS, _FEWEST_LINES = 20, 20
+_SAMPLES = 400
+STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
+SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 30.0, 60.0, 29
+_SEEN = np.radians(60)
+"""A sphere is seen this far round from the side that faces the sensor."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What a shot would say: the estimate, perhaps with parameters that it adds, residuals, and priors of its own.
+
+    ``own_std`` (b,) is what is known before of the shot's own parameters, infinite for those that it has to find.
+    """
+
+    known: StoredEstimate
+    residuals: list[Residuals]
+    own_std: np.ndarray
+
+
+def target_points(target: Target) -> np.ndarray:
+    """Points (N, 3) of a target in mm, target frame."""
+    match target:
+        case CircleTarget():
+            spacing, first = (target.spacing_x_mm, target.spacing_y_mm), np.negative(target.origin)
+        case ChessboardTarget():
+            spacing, first = (target.square_mm,) * 2, np.zeros(2)
+        case CharucoTarget():
+            spacing, first = (target.square_mm,) * 2, np.ones(2)
+    inner = 1 if isinstance(target, CharucoTarget) else 0
+    columns, rows = np.meshgrid(np.arange(target.columns - inner), np.arange(target.rows - inner))
+    at = (np.stack([columns.ravel(), rows.ravel()], axis=1) + first) * spacing
+    return np.column_stack([at, np.zeros(len(at))])
+
+
+def target_shot(calibration: Calibration, known: StoredEstimate, target: Target, pose: np.ndarray) -> Shot | None:
+    """An image of the target with the stripe on it, at ``T_camera_target`` (4, 4); None where too little is in view."""
+    points = target_points(target)
+    pixels = _seen(known, points @ pose[:3, :3].T + pose[:3, 3])
+    inside = np.isfinite(pixels).all(axis=1)
+    lit = _lit(calibration, known, target, pose)
+    if inside.sum() < _FEWEST_POINTS or len(lit) < _FEWEST_LINES:
+        return None
+    extent = plate_extent(target)
+    middle = extent.mean(axis=0)
+    count = int(inside.sum())
+    evidence = TargetEvidence(
+        view=known.view,
+        placement=Placement(points[inside], np.zeros(count), pixels[inside], np.zeros(count, dtype=int), 1.0),
+        stripe_pixels=lit, stripe_image=np.zeros(len(lit), dtype=int), stripe_shifts_mm=np.zeros(len(lit)),
+        across=_across(calibration), staged=False, radius_mm=float(np.linalg.norm(extent - middle, axis=1).max()),
+        middle_mm=middle,
+    )  # fmt: skip
+    own = np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])
+    parts = evidence.residuals(known.parameters, known.values, own)
+    return None if parts is None else Shot(known, parts, np.full(6, np.inf))
+
+
+def step_shot(
+    calibration: Calibration, known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty
+) -> Shot | None:
+    """An image of a step standard whose lower tread lies at a depth Z, the evidence's own where it has one.
+
+    None where too little of it is in view.
+    """
+    height = next((name for name in known.parameters.names if name.startswith("height of ")), None)
+    if height is None:
+        height = f"height of the {STEP_MM:g} mm step"
+        known = extended(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
+    y = np.linspace(-_STEP_REACH_MM, _STEP_REACH_MM, _SAMPLES)
+    upper = np.abs(y) < _STEP_HALF_MM
+    raised = known.parameters.value(known.values, height)
+    kept, labels = [], []
+    for tread, z in ((~upper & (y < 0), depth_mm), (upper, depth_mm - raised), (~upper & (y > 0), depth_mm)):
+        pixels = _on_lines(calibration, known, np.column_stack([y[tread], np.full(tread.sum(), z)]))
+        kept.append(pixels)
+        labels.append(np.full(len(pixels), z != depth_mm))
+    if min(map(len, kept)) < _FEWEST_LINES:
+        return None
+    frame = calibration.object_transform()
+    evidence = StepProfileEvidence(
+        view=known.view, pixels=np.vstack(kept), upper=np.concatenate(labels), upward=-frame[:3, 2],
+        along=frame[:3, 1], across=_across(calibration), height=height, image=0,
+    )  # fmt: skip
+    own = np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
+    parts = evidence.residuals(known.parameters, known.values, own)
+    return None if parts is None else Shot(known, parts, np.full(2, np.inf))
+
+
+def sphere_shot(
+    calibration: Calibration, known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty
+) -> Shot | None:
+    """A scan along X of two spheres of unknown size, their centres at a depth Z; None where they are not in view."""
+    lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
+    known = extended(
+        known, dict.fromkeys(SLOPES, Prior(0.0, lean)) | {"stage_scale": Prior(0.0, uncertainty.stage_scale)}
+    )
+    frame, radius = calibration.object_transform(), SPHERE_MM / 2
+    stage = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
+    centres = np.array([(0.0, side * _SPHERES_APART_MM / 2, depth_mm) for side in (-1, 1)])
+    turn = np.linspace(-_SEEN, _SEEN, _SAMPLES)
+    pixels, sphere, image = [], [], []
+    for number, at in enumerate(stage):
+        chord = np.sqrt(radius**2 - at**2)
+        for which, centre in enumerate(centres):
+            found = _on_lines(calibration, known, centre[1:] + chord * np.column_stack([np.sin(turn), -np.cos(turn)]))
+            pixels.append(found)
+            sphere.append(np.full(len(found), which))
+            image.append(np.full(len(found), number))
+    if min(map(len, pixels)) < _FEWEST_LINES:
+        return None
+    evidence = SphereScanEvidence(
+        view=known.view, pixels=np.vstack(pixels), sphere=np.concatenate(sphere), frame=np.concatenate(image),
+        stage_mm=stage, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T, diameters_mm=np.full(2, SPHERE_MM),
+        diameter_std_mm=np.full(2, np.inf), across=_across(calibration), image=0, source="",
+    )  # fmt: skip
+    own = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(2 + len(stage))])
+    parts = evidence.residuals(known.parameters, known.values, own)
+    std = evidence.own_std(alignment=lean, position_mm=uncertainty.stage_position_mm)
+    return None if parts is None else Shot(known, parts, std)
+
+
+def extended(known: StoredEstimate, priors: Mapping[str, Prior]) -> StoredEstimate:
+    """The estimate with those of these parameters that it has not, behind its own."""
+    added = {name: prior for name, prior in priors.items() if name not in known.parameters.names}
+    count = len(known.values)
+    covariance = np.zeros((count + len(added),) * 2)
+    covariance[:count, :count] = known.covariance
+    covariance[range(count, len(covariance)), range(count, len(covariance))] = [p.std**2 for p in added.values()]
+    return replace(
+        known, parameters=replace(known.parameters, priors=known.parameters.priors | added),
+        values=np.append(known.values, [prior.mean for prior in added.values()]), covariance=covariance,
+    )  # fmt: skip
+
+
+def _lit(calibration: Calibration, known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
+    """Stripe pixels on the target, one for each profile line, by the plane that is nearest to the sheet."""
+    index = known.parameters.medium_index(known.values, known.view)
+    sheet = sheet_surface(known.parameters.sheet_model(known.values), medium_index=index)
+    facing, along = pose[:3, 2], np.cross(sheet.normal, pose[:3, 2])
+    if np.linalg.norm(along) < 1e-3:
+        return np.empty((0, 2))
+    along /= np.linalg.norm(along)
+    middle = np.append(plate_extent(target).mean(axis=0), 0.0)
+    rows = np.stack([sheet.normal, facing, along])
+    centre = pose[:3, :3] @ middle + pose[:3, 3]
+    start = np.linalg.solve(rows, [sheet.offset_mm, facing @ centre, along @ centre])
+    extent, margin = plate_extent(target), lattice_spacing(target) / 2
+    reach = float(np.ptp(extent, axis=0).sum())
+    points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
+    at = (points - pose[:3, 3]) @ pose[:3, :3]
+    on_plate = ((at[:, :2] >= extent.min(axis=0) - margin) & (at[:, :2] <= extent.max(axis=0) + margin)).all(axis=1)
+    return _lines_through(calibration, _seen(known, points[on_plate]))
+
+
+def _on_lines(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
+    pixels = pixels_at(calibration, known, at_mm)
+    return _lines_through(calibration, np.where(_in_image(known, pixels)[:, None], pixels, np.nan))
+
+
+def _lines_through(calibration: Calibration, pixels: np.ndarray) -> np.ndarray:
+    across = _across(calibration)
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    if len(seen) < 2:
+        return np.empty((0, 2))
+    seen = seen[np.argsort(seen[:, 1 - across])]
+    lines = np.arange(np.ceil(seen[0, 1 - across]), np.floor(seen[-1, 1 - across]) + 1)
+    centres = np.interp(lines, seen[:, 1 - across], seen[:, across])
+    return np.column_stack([lines, centres] if across else [centres, lines])
+
+
+def _seen(known: StoredEstimate, points: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of points (N, 3) in the camera frame; NaN outside the image."""
+    parameters = known.parameters
+    window = parameters.window_model(known.values) if known.view.window else None
+    index = parameters.medium_index(known.values, known.view)
+    pixels = project_through_window(parameters.camera(known.values), window, points, medium_index=index)
+    return np.where(_in_image(known, pixels)[:, None], pixels, np.nan)
+
+
+def _in_image(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
+    camera = known.parameters.camera(known.values)
+    return ((pixels >= 0) & (pixels <= [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
+
+
+def _across(calibration: Calibration) -> int:
+    """The coordinate of the pixel that runs across the stripe."""
+    return 1 if calibration.stripe_along == "width" else 0

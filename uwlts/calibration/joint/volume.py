@@ -1,0 +1,197 @@
+"""What a joint estimate's uncertainty does to points and lengths over the volume that its evidence covers.
+
+The volume is the region of the sheet in which stripes lay on targets and steps, as an outline in the plane of the OCS's
+Y and Z: what is measured elsewhere is extrapolated. Lengths between two of its points do not change when all of it
+moves rigidly, so that what only moves the sensor's frame does not count.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.rays import COLUMNS
+from uwlts.calibration.joint.stored import StoredEstimate, found_estimate
+from uwlts.calibration.model import Calibration
+from uwlts.camera import project_through_window
+from uwlts.errors import CalibrationError
+from uwlts.sensor import Medium
+
+_ROWS, _COLUMNS = 7, 9
+_INSET = 0.02
+"""Share of the depth left out at either end, where an outline may come to a point."""
+_LEAST_MM = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A region of the sheet that evidence covers.
+
+    Attributes
+    ----------
+    name : str
+        Of the medium.
+    medium : Medium
+    view : View
+        Through what it was seen.
+    outline_mm : (K, 2)
+        Convex, Y and Z in the OCS.
+    camera_depth_mm : (2,)
+        Nearest and farthest depth along the camera's axis, from its entrance pupil.
+    points : int
+        Stripe pixels in it.
+    """
+
+    name: str
+    medium: Medium
+    view: View
+    outline_mm: np.ndarray
+    camera_depth_mm: np.ndarray
+    points: int
+
+    def has_area(self) -> bool:
+        """Whether it extends by more than a millimetre in Y and in Z."""
+        return bool(len(self.outline_mm) > 2 and np.ptp(self.outline_mm, axis=0).min() > _LEAST_MM)
+
+    def width_at(self, depth_mm: float) -> tuple[float, float]:
+        """Least and largest Y at a depth Z within it."""
+        start, end = self.outline_mm, np.roll(self.outline_mm, -1, axis=0)
+        low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
+        crossed = (low <= depth_mm) & (depth_mm <= high) & (high > low)
+        a, b = start[crossed], end[crossed]
+        across = a[:, 0] + (b[:, 0] - a[:, 0]) * (depth_mm - a[:, 1]) / (b[:, 1] - a[:, 1])
+        return float(across.min()), float(across.max())
+
+    def mesh(self, rows: int = _ROWS, columns: int = _COLUMNS) -> np.ndarray:
+        """Points (rows, columns, 2), Y and Z in mm: each row at one depth, from one side to the other."""
+        low, high = self.outline_mm[:, 1].min(), self.outline_mm[:, 1].max()
+        inset = _INSET * (high - low)
+        depths = np.linspace(low + inset, high - inset, rows)
+        return np.stack(
+            [np.column_stack([np.linspace(*self.width_at(z), columns), np.full(columns, z)]) for z in depths]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SheetPoints:
+    """Points of the sheet and how they move, OCS, mm.
+
+    Attributes
+    ----------
+    at_mm : (N, 2)
+        Y and Z.
+    by_parameters : (N, 3, P)
+    by_px : (N, 3)
+        For one pixel across the stripe.
+    """
+
+    at_mm: np.ndarray
+    by_parameters: np.ndarray
+    by_px: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Lengths:
+    """Lengths between points of the sheet.
+
+    Attributes
+    ----------
+    ends_mm : (M, 2, 2)
+        Y and Z of both ends.
+    length_mm : (M,)
+    by_parameters : (M, P)
+    by_px : (M,)
+        For a pixel's noise at each end, independent of the other's.
+    """
+
+    ends_mm: np.ndarray
+    length_mm: np.ndarray
+    by_parameters: np.ndarray
+    by_px: np.ndarray
+
+    def std_mm(self, covariance: np.ndarray, *, noise_px: float = 0.0) -> np.ndarray:
+        """Standard uncertainty (M,) in mm for a covariance (P, P) of the parameters and noise of each stripe centre."""
+        variance = np.einsum("mp,pq,mq->m", self.by_parameters, covariance, self.by_parameters, optimize=True)
+        return np.sqrt(np.maximum(variance, 0.0) + (noise_px * self.by_px) ** 2)
+
+
+def regions(calibration: Calibration) -> list[Region]:
+    """The regions that a joint calibration's evidence covers, that of its use first; CalibrationError if damaged."""
+    try:
+        found = [_region(calibration, entry) for entry in calibration.residuals["joint"].get("covered", [])]
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise CalibrationError(f"the calibration's covered volume is damaged: {error!r}") from error
+    return sorted(found, key=lambda region: (region.view.medium is None, -region.points))
+
+
+def _region(calibration: Calibration, entry: dict[str, Any]) -> Region:
+    number = entry["medium"]
+    return Region(
+        name=entry["name"],
+        medium=Medium(kind="air") if number is None else calibration.media[number].medium,
+        view=View(bool(entry["window"]), number),
+        outline_mm=np.array(entry["outline_mm"], dtype=np.float64).reshape(-1, 2),
+        camera_depth_mm=np.array(entry["camera_depth_mm"], dtype=np.float64),
+        points=int(entry["points"]),
+    )
+
+
+def estimate_in(calibration: Calibration, region: Region) -> StoredEstimate:
+    """The joint estimate as found, for what is seen as a region was; CalibrationError as `found_estimate`."""
+    return replace(found_estimate(calibration, region.medium), view=region.view)
+
+
+def points_at(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray) -> SheetPoints:
+    """Points of the sheet at Y and Z (N, 2) of the OCS, with their derivatives.
+
+    Raises
+    ------
+    CalibrationError
+        The camera does not see one of them.
+    """
+    transform = calibration.object_transform()
+    pixels = pixels_at(calibration, known, at_mm)
+    points = known.parameters.on_sheet(known.values, known.view, pixels) if np.isfinite(pixels).all() else None
+    if points is None:
+        raise CalibrationError("the calibration's covered volume lies outside the camera's view: calibrate again")
+    by = np.stack(
+        [
+            known.parameters.by_shared(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    across = COLUMNS.index("v" if calibration.stripe_along == "width" else "u")
+    into_object = transform[:3, :3].T
+    return SheetPoints(at_mm, np.einsum("ij,njp->nip", into_object, by), points.by_rays[across].T @ into_object.T)
+
+
+def pixels_at(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
+    """Where the camera sees points at Y and Z (N, 2) of the OCS: (N, 2), NaN where it does not."""
+    transform, parameters = calibration.object_transform(), known.parameters
+    in_camera = at_mm @ transform[:3, 1:3].T + transform[:3, 3]
+    window = parameters.window_model(known.values) if known.view.window else None
+    index = parameters.medium_index(known.values, known.view)
+    return project_through_window(parameters.camera(known.values), window, in_camera, medium_index=index)
+
+
+def lengths_between(points: SheetPoints, start: np.ndarray, end: np.ndarray) -> Lengths:
+    """Lengths from points to others by their numbers (M,)."""
+    apart = points.at_mm[end] - points.at_mm[start]
+    length = np.linalg.norm(apart, axis=1)
+    unit = apart / length[:, None]
+    moved = points.by_parameters[end, 1:] - points.by_parameters[start, 1:]
+    by_px = [np.einsum("mi,mi->m", unit, points.by_px[side, 1:]) for side in (start, end)]
+    return Lengths(
+        ends_mm=np.stack([points.at_mm[start], points.at_mm[end]], axis=1),
+        length_mm=length,
+        by_parameters=np.einsum("mi,mip->mp", unit, moved),
+        by_px=np.hypot(*by_px),
+    )
+
+
+def lengths_over(calibration: Calibration, known: StoredEstimate, region: Region) -> Lengths:
+    """Lengths between all pairs of points of a region's mesh."""
+    at = region.mesh().reshape(-1, 2)
+    return lengths_between(points_at(calibration, known, at), *np.triu_indices(len(at), k=1))

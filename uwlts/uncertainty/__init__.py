@@ -1,0 +1,1 @@
+"""How well points and what is measured of them are known."""

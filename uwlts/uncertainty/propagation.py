@@ -1,0 +1,116 @@
+"""How well measured points are known: by the stripe's own noise, and by the calibration that all of them share.
+
+GUM (JCGM 100:2008), section 5: the law of propagation, linear in the stripe's centre and in the calibration's
+parameters. What the calibration leaves open moves all points together. It is kept as patterns: each moves every point
+by one standard deviation of something that is independent of all other patterns, so that a figure's uncertainty
+follows, correlations included, from calculating it again with each pattern added.
+"""
+
+import numpy as np
+
+from uwlts.calibration.joint.rays import COLUMNS
+from uwlts.calibration.joint.stored import StoredEstimate, stored_estimate
+from uwlts.calibration.model import Calibration
+from uwlts.capture import Capture
+from uwlts.errors import CalibrationError
+from uwlts.uncertainty.points import PAIRS, PointUncertainty
+
+_TO_STD = 1.4826
+_BLOCK = 20000
+# Patterns that together move the points by no more than this (root mean square) are not worth their room.
+_NEGLIGIBLE_MM = 5e-5
+_FEWEST_NEIGHBOURS = 10
+
+
+def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+    """Standard deviation (N,) of stripe centres, from how they scatter about their neighbours in the same image.
+
+    The centre of a line less the mean of its two neighbours has 3/2 of the variance of one, where the surface is
+    smooth; edges and strays do not count, as half the lines would have to hold some. Images with few lines take the
+    value of all.
+    """
+    order = np.lexsort((line, frame))
+    f, at, c = frame[order], line[order], centre_px[order].astype(np.float64)
+    beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
+    off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
+    if len(off) < _FEWEST_NEIGHBOURS:
+        raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: their noise cannot be told")
+    scale = _TO_STD / np.sqrt(1.5)
+    noise = np.full(int(frame.max()) + 1, scale * np.median(off))
+    starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1]])
+    for number, values in zip(image[starts], np.split(off, starts[1:]), strict=True):
+        if len(values) >= _FEWEST_NEIGHBOURS:
+            noise[number] = scale * np.median(values)
+    return noise[frame]
+
+
+def point_uncertainty(
+    capture: Capture, calibration: Calibration, frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray
+) -> PointUncertainty:
+    """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
+
+    In the OCS, or in the scene where the frames carry poses; what stage or poses add is not in it.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration holds no joint estimate, or the points cannot be reconstructed by it.
+    """
+    header = capture.header
+    known = stored_estimate(calibration, header.sensor, header.medium)
+    across = 1 if calibration.stripe_along == "width" else 0
+    pixels = np.stack((line, centre_px) if across else (centre_px, line), axis=1).astype(np.float64)
+    noise = stripe_noise_px(frame, line, centre_px) * _shared_by_neighbours(calibration)
+    pose = capture.pose[:, :3, :3]
+    posed = np.isfinite(capture.pose).all(axis=(1, 2))[:, None, None]
+    into_scene = np.where(posed, pose, np.eye(3)) @ calibration.object_transform()[:3, :3].T
+    root = _root(known.covariance)
+    random, moved = [], []
+    for start in range(0, len(pixels), _BLOCK):
+        here = slice(start, start + _BLOCK)
+        by_pixel, by_root = _derivatives(known, pixels[here], COLUMNS.index("uv"[across]), root)
+        turned = into_scene[frame[here]]
+        by_pixel, by_root = np.einsum("nij,nj->ni", turned, by_pixel), np.einsum("nij,rnj->rni", turned, by_root)
+        step = by_pixel * noise[here, None]
+        random.append(np.stack([step[:, i] * step[:, j] for i, j in PAIRS], axis=1))
+        moved.append(by_root)
+    return PointUncertainty(np.vstack(random).astype(np.float32), _patterns(np.concatenate(moved, axis=1)))
+
+
+def _shared_by_neighbours(calibration: Calibration) -> float:
+    """How much larger the noise is than neighbours tell, as those err together."""
+    shared = calibration.residuals["joint"].get("shared_variance", {})
+    return float(np.sqrt(shared.get("stripe on the target", 1.0)))
+
+
+def _derivatives(
+    known: StoredEstimate, pixels: np.ndarray, column: int, root: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of points in the camera frame: (N, 3) by the pixel across the stripe, (R, N, 3) by independent parts of all."""
+    points = known.parameters.on_sheet(known.values, known.view, pixels)
+    if points is None:
+        raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
+    by_shared = np.stack(
+        [known.parameters.by_shared(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) for axis in range(3)]
+    )
+    return points.by_rays[column].T, np.einsum("anp,pr->rna", by_shared, root, optimize=True)
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """A matrix (P, R) whose product with its transpose is the covariance."""
+    scale = np.sqrt(np.diag(covariance))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > 0
+    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+
+
+def _patterns(moved: np.ndarray) -> np.ndarray:
+    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
+    flat = moved.reshape(len(moved), -1)
+    values, vectors = np.linalg.eigh(flat @ flat.T)
+    order = np.argsort(values)[::-1]
+    values, vectors = np.maximum(values[order], 0.0), vectors[:, order]
+    left = np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / moved.shape[1]
+    count = 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))
+    return (vectors[:, :count].T @ flat).reshape(count, *moved.shape[1:]).astype(np.float32)
