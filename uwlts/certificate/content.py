@@ -19,7 +19,7 @@ from uwlts.certificate.lengths import InUse, in_use, index_name, worth_of_length
 from uwlts.certificate.seal import FORMAT, VERSION, sealed
 from uwlts.scan import calibration_digest
 
-_MOST_SHOTS = 5
+_BEST_SHOTS = 3
 NOT_JOINT = "the calibration was not estimated jointly: what lengths measured by it are worth is not known"
 
 
@@ -155,8 +155,16 @@ def _joint(calibration: Calibration) -> dict[str, Any]:
 def _shots(outlooks: Sequence[Outlook]) -> list[dict[str, Any]]:
     return [
         {"words": o.words.rstrip(","), "before_mm": o.before_mm, "after_mm": o.after_mm, "advice": o.advice()}
-        for o in outlooks[:_MOST_SHOTS]
+        for o in _worth_telling(outlooks)
     ]
+
+
+def _worth_telling(outlooks: Sequence[Outlook]) -> list[Outlook]:
+    """The best shots, and the best of each kind, in their order."""
+    kinds: dict[str, Outlook] = {}
+    for outlook in outlooks:
+        kinds.setdefault(outlook.words.split(",")[0], outlook)
+    return [o for place, o in enumerate(outlooks) if place < _BEST_SHOTS or o in kinds.values()]
 
 
 def _validity(use: InUse) -> dict[str, Any]:

@@ -104,7 +104,7 @@ def _pictures(
     joint = calibration.residuals["joint"]
     drawn["correlation"] = Markup(correlation_picture(joint["parameters"], np.array(joint["covariance"])))
     if content["images"]:
-        drawn["residuals"] = Markup(image_residuals(content["images"]))
+        drawn["residuals"] = [Markup(picture) for picture in image_residuals(content["images"])]
         drawn["worst"] = sorted(
             (image for image in content["images"] if image["rms_px"] is not None),
             key=lambda image: -image["rms_px"] / content["scatter_px"][image["kind"]],

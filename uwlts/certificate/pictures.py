@@ -37,10 +37,13 @@ def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool 
         parts.append(f'<polygon points="{points}" fill="{colour}" stroke="{colour}" stroke-width="0.7"/>')
     for y in ticks(low[0], high[0], count=4):
         at = _LEFT + (y - low[0]) * scale
-        parts += [_line(at, height - _BOTTOM, at, height - _BOTTOM + 5), _text(f"{y:g}", at, height - _BOTTOM + 18)]
+        parts += [
+            _line(at, height - _BOTTOM, at, height - _BOTTOM + 5),
+            _text(typographic(f"{y:g}"), at, height - _BOTTOM + 18),
+        ]
     for z in ticks(low[1], high[1], count=5):
         at = _TOP + (z - low[1]) * scale
-        parts += [_line(_LEFT - 5, at, _LEFT, at), _text(f"{z:g}", _LEFT - 8, at + 4, "end")]
+        parts += [_line(_LEFT - 5, at, _LEFT, at), _text(typographic(f"{z:g}"), _LEFT - 8, at + 4, "end")]
     right = _LEFT + scale * (high[0] - low[0])
     parts += [
         _text(title, 6, 18, "start", bold=True), _text("Y / mm", (_LEFT + right) / 2, height - 6),
@@ -77,8 +80,8 @@ def correlation_picture(names: Sequence[str], covariance: np.ndarray) -> str:
     return _picture(left + len(words) * _CELL + 6, top + len(words) * _CELL + 6, parts, "Correlation of the parameters")
 
 
-def image_residuals(images: Sequence[dict[str, Any]]) -> str:
-    """Root mean square residual of every image, a panel for each kind."""
+def image_residuals(images: Sequence[dict[str, Any]]) -> list[str]:
+    """Root mean square residual of every image, a panel for each kind and two of them in a picture."""
     kinds = dict.fromkeys(image["kind"] for image in images)
     panels = []
     for number, kind in enumerate(kinds):
@@ -90,7 +93,7 @@ def image_residuals(images: Sequence[dict[str, Any]]) -> str:
                 curves=[Curve(kind, list(range(1, len(values) + 1)), values, COLOURS[number], joined=False)],
             )
         )  # fmt: skip
-    return svg(panels)
+    return [svg(panels[start : start + 2]) for start in range(0, len(panels), 2)]
 
 
 def length_chart(lengths: Sequence[Worth]) -> str:

@@ -116,7 +116,7 @@ def estimate(
         steady = all(abs(known[k].effective_px() / before[k].effective_px() - 1) < _SETTLED for k in known)
         if moved <= _SETTLED_PX and not first and (steady or last):
             return Estimate(
-                parameters=parameters, values=shared, covariance=fit.covariance, own=own, noise=known,
+                parameters=parameters, values=shared, covariance=fit.covariance / fit.sigma**2, own=own, noise=known,
                 residuals=residuals, strays=sum(int(mask.sum()) for parts in left_out for mask in parts),
                 rounds=rounds, stopped=fit.stopped if steady else UNSETTLED,
             )  # fmt: skip

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET
+from uwlts.calibration.joint.noise import Noise, with_slope_bias
+from uwlts.calibration.joint.observations import TARGET
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.shots import Shot, sphere_shot, step_shot, target_shot
+from uwlts.calibration.joint.shots import SPHERE_MM, SPHERES, Shot, sphere_shot, step_shot, target_shot
 from uwlts.calibration.joint.sphere_scans import SPHERE
 from uwlts.calibration.joint.stored import StoredEstimate
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_over, regions
@@ -94,23 +95,29 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
 
 def information(calibration: Calibration, shot: Shot) -> np.ndarray:
     """What a shot adds (P, P) to the inverse of the covariance."""
-    joint = calibration.residuals["joint"]
-    count, own = len(shot.known.values), len(shot.own_std)
+    count, own, noise = len(shot.known.values), len(shot.own_std), _noise_of(calibration, shot)
     total = np.zeros((count + own,) * 2)
     for part in shot.residuals:
-        weight = 1.0 / (_of_kind(joint["scatter_px"], part.kind) ** 2 * _of_kind(joint["shared_variance"], part.kind))
+        weight = noise[part.kind].effective_px() ** -2
         rows = np.hstack([part.by_shared, part.by_own])
         at = np.r_[0:count, count + part.own]
-        total[np.ix_(at, at)] += weight * rows.T @ rows
+        total[np.ix_(at, at)] += weight * np.einsum("ni,nj->ij", rows, rows)
     border, block = total[:count, count:], total[count:, count:] + np.diag(shot.own_std**-2.0)
     scale = 1.0 / np.sqrt(np.diag(block))
     border, block = border * scale, block * np.outer(scale, scale)
     return total[:count, :count] - border @ np.linalg.solve(block, border.T)
 
 
-def _of_kind(figures: dict[str, float], kind: str) -> float:
-    """A figure of a kind of residual; that of another stripe where the evidence has none of its kind."""
-    return next(figures[name] for name in (kind, STRIPE, STEP, SPHERE, TARGET) if name in figures)
+def _noise_of(calibration: Calibration, shot: Shot) -> dict[str, Noise]:
+    """Noise of every kind of a shot's residuals; that of the noisiest other stripe for a kind new to the evidence."""
+    joint = calibration.residuals["joint"]
+    known = {name: Noise(sigma, joint["shared_variance"][name]) for name, sigma in joint["scatter_px"].items()}
+    stripe = max((noise for name, noise in known.items() if name != TARGET), key=Noise.effective_px)
+    found = {kind: known.get(kind, stripe) for kind in {part.kind for part in shot.residuals}}
+    if SPHERE in found:
+        each = sum(len(part.values) for part in shot.residuals) / SPHERES
+        found[SPHERE] = with_slope_bias(found[SPHERE], points_per_sphere=each)
+    return found
 
 
 def _outlook(calibration: Calibration, candidate: _Candidate, lengths: Lengths, known: StoredEstimate) -> Outlook:
@@ -142,15 +149,16 @@ def _candidates(calibration: Calibration, known: StoredEstimate, region: Region)
     target = parse_target(provenance["target"]) if "target" in provenance else None
     if target is not None:
         yield from _targets(calibration, known, region.name, target, depths)
-        # A lens that touches the medium is another one in air.
-        if region.view.medium is not None and region.view.window:
-            in_air = [other.view for other in regions(calibration) if other.view.medium is None]
-            seen = replace(known, view=next(iter(in_air), View(True, None)))
-            yield from _targets(calibration, seen, "air", target, depths)
+        # One image in air is of use beside others taken so, whose series tells the camera.
+        in_air = [other.view for other in regions(calibration) if other.view.medium is None]
+        if region.view.medium is not None and in_air:
+            yield from _targets(calibration, replace(known, view=in_air[0]), "air", target, depths)
     for words, depth in depths.items():
         place = f"in {region.name}, {words} (Z {depth:+.0f} mm),"
         yield _Candidate(f"an image of a step {place}", step_shot(calibration, known, depth, uncertainty))
-        yield _Candidate(f"a scan of two spheres {place}", sphere_shot(calibration, known, depth, uncertainty))
+        yield _Candidate(
+            f"a scan of two spheres of {SPHERE_MM:g} mm {place}", sphere_shot(calibration, known, depth, uncertainty)
+        )
 
 
 def _targets(

@@ -36,6 +36,8 @@ _QUANTITIES = {
     "sheet_bow": Quantity("bow of the sheet", "°", _DEG),
     "laser_window_turn": Quantity("turn of the laser's window", "°", _DEG),
     "stage_scale": Quantity("scale of the stage", "µm/m", 1e6),
+    "scan_slope_1": Quantity("lean of the scan's direction, first across", "°", _DEG),
+    "scan_slope_2": Quantity("lean of the scan's direction, second across", "°", _DEG),
     "target_bow": Quantity("bend of the target", "µm", 1e3),
 }
 

@@ -22,7 +22,7 @@ from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
 _FEWEST_POINTS, _FEWEST_LINES = 20, 20
 _SAMPLES = 400
 STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
-SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 30.0, 60.0, 29
+SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
 _SEEN = np.radians(60)
 """A sphere is seen this far round from the side that faces the sensor."""
 
@@ -132,10 +132,10 @@ def sphere_shot(
         return None
     evidence = SphereScanEvidence(
         view=known.view, pixels=np.vstack(pixels), sphere=np.concatenate(sphere), frame=np.concatenate(image),
-        stage_mm=stage, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T, diameters_mm=np.full(2, SPHERE_MM),
-        diameter_std_mm=np.full(2, np.inf), across=_across(calibration), image=0, source="",
+        stage_mm=stage, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T, diameters_mm=np.full(SPHERES, SPHERE_MM),
+        diameter_std_mm=np.full(SPHERES, np.inf), across=_across(calibration), image=0, source="",
     )  # fmt: skip
-    own = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(2 + len(stage))])
+    own = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(SPHERES + len(stage))])
     parts = evidence.residuals(known.parameters, known.values, own)
     std = evidence.own_std(alignment=lean, position_mm=uncertainty.stage_position_mm)
     return None if parts is None else Shot(known, parts, std)

@@ -112,7 +112,7 @@ class Lengths:
 
     def std_mm(self, covariance: np.ndarray, *, noise_px: float = 0.0) -> np.ndarray:
         """Standard uncertainty (M,) in mm for a covariance (P, P) of the parameters and noise of each stripe centre."""
-        variance = np.einsum("mp,pq,mq->m", self.by_parameters, covariance, self.by_parameters, optimize=True)
+        variance = np.sum((self.by_parameters @ covariance) * self.by_parameters, axis=1)
         return np.sqrt(np.maximum(variance, 0.0) + (noise_px * self.by_px) ** 2)
 
 
