@@ -211,8 +211,9 @@ def _built(as_built: str | None, nominal: Sensor, name: str) -> Sensor | None:
 
 @app.command
 def reproduce(
-    campaign: str = "thesis",
+    campaign: str | None = None,
     *,
+    joint: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
     campaigns: int = 2,
     first: int = 0,
@@ -233,7 +234,9 @@ def reproduce(
     Parameters
     ----------
     campaign
-        Name or path of the campaign's description.
+        Name or path of the campaign's description; "thesis" unless given, or "joint" with --joint.
+    joint
+        Compare the joint calibration with the thesis's two ways on the same images; writes OUT/summary.json.
     out
         Folder for campaigns and report; runs/CAMPAIGN unless given.
     campaigns
@@ -262,6 +265,7 @@ def reproduce(
         raise DescriptionError(f"first is {first}; a seed must not be negative")
     if trials != 0 and trials < 20:
         raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
+    campaign = campaign or ("joint" if joint else "thesis")
     description = load_campaign(campaign)
     folder = out or Path("runs") / Path(campaign).stem
     with progress_bar(f"rendering {description.title}") as progress:
@@ -271,6 +275,7 @@ def reproduce(
         )  # fmt: skip
     # The sensor's software is a program of its own, which knows nothing of the twin.
     command = [sys.executable, "-m", "uwlts.cli", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
+    command += ["--joint"] if joint else []
     command += ["--again"] if overwrite else []
     command += ["--workers", str(workers)] if workers else []
     if code := subprocess.run(command, check=False).returncode:

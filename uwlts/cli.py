@@ -4,7 +4,7 @@ import sys
 import threading
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -12,6 +12,9 @@ import uwlts
 from uwlts.console import progress_bar, run
 from uwlts.errors import CaptureError, DescriptionError, OutputError, RangeError
 from uwlts.files import refuse_unsuitable
+
+if TYPE_CHECKING:
+    from uwlts.thesis.folder import CampaignFolder
 
 app = App(
     name="uwlts",
@@ -715,6 +718,7 @@ def thesis(
     published: str = "thesis-tables",
     trials: int = 100,
     workers: int | None = None,
+    joint: Flag = False,
     again: Flag = False,
     overwrite: Flag = False,
 ) -> None:
@@ -735,6 +739,8 @@ def thesis(
         Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
     workers
         Scans measured at a time; as many as there are processors unless given.
+    joint
+        Compare the joint calibration with the thesis's two ways instead; writes summary.json.
     again
         Evaluate campaigns anew that have results already.
     overwrite
@@ -750,6 +756,9 @@ def thesis(
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     tables, campaigns = load_published(published), campaign_folders(folder)
+    if joint:
+        _compare_jointly(folder, campaigns, overwrite=overwrite)
+        return
     refuse_unsuitable(folder / "report.html", overwrite=overwrite)
     results = []
     for campaign in campaigns:
@@ -827,6 +836,19 @@ def _led_through(
     step = () if recording.step is None else (recording.step,)
     target = (recording.target,)
     return (target, (), step, plan.poses) if plan.target_in_air() else ((), target, step, plan.poses)
+
+
+def _compare_jointly(folder: Path, campaigns: "list[CampaignFolder]", *, overwrite: bool) -> None:
+    """Compare the joint calibration with the thesis's ways on all campaigns of a folder."""
+    from uwlts.thesis.joint_comparison import compare_campaign, summary_lines, write_joint_summary
+
+    refuse_unsuitable(folder / "summary.json", overwrite=overwrite)
+    results = []
+    for campaign in campaigns:
+        with progress_bar(f"comparing {campaign.path.name}") as progress:
+            results.append(compare_campaign(campaign, progress=progress))
+    print("\n".join(summary_lines(write_joint_summary(folder, results, overwrite=overwrite))))
+    print(f"wrote {folder / 'summary.json'}")
 
 
 def _warn(text: str) -> None:

@@ -16,8 +16,8 @@ from tests.unit.calibration_views import (
     turn,
 )
 from uwlts.calibration.evidence import AirEvidence, StepEvidence
+from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.procedure import Gathered
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.target_image import TargetImage
 from uwlts.metrology.artefact_descriptions import StepStandard

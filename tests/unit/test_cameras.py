@@ -4,6 +4,7 @@
 but without exposure, gain and trigger.
 """
 
+import signal
 import sys
 import time
 from pathlib import Path
@@ -228,6 +229,7 @@ def test_calls_in_the_wrong_order_are_refused(tmp_path):
 
 def test_a_camera_by_a_gentl_producer():
     with open_camera(f"genicam:{PRODUCER}:1") as camera:
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert (camera.info.name, camera.info.serial) == ("Machine Vision Games Ltd. Viky", "1")
         assert (camera.info.width_px, camera.info.height_px, camera.info.bits) == (800, 800, 8)
         settings = camera.configure(region=Region(0, 0, 320, 200), frame_rate_hz=100)

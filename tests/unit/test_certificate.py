@@ -94,7 +94,7 @@ def test_the_calibration_itself_is_never_replaced(path):
         refuse_unsuitable_page(path.with_suffix(".html"), path, overwrite=True)
 
 
-def test_it_says_where_it_holds(calibration, content):
+def test_it_says_where_it_holds(calibration, content, thesis):
     """Stripes lie on the plate of 235 mm and in the image, over the travel of 180 mm less where they miss it."""
     validity = content["validity"][0]
     assert validity["name"] == "water"
@@ -109,7 +109,7 @@ def test_it_says_where_it_holds(calibration, content):
     assert content["made_from"]["target"]["kind"] == "circles"
     tilt = next(row for row in content["parameters"] if row["name"] == "window_slope_x")
     assert tilt["unit"] == "°"
-    assert tilt["std_before"] == pytest.approx(0.5, rel=1e-3)
+    assert tilt["std_before"] == pytest.approx(thesis.uncertainty.window_tilt_deg, rel=1e-3)
 
 
 def points(calibration, known, values, pixels):
@@ -145,10 +145,13 @@ def test_lengths_are_worth_what_draws_say(calibration, use):
     assert compared == 4
 
 
-def test_along_x_the_stage_counts(use):
-    """Two positions of 5 µm and a scale of 1e-4: 2 sqrt(2 * 5^2 + 10^2) µm for 100 mm."""
+def test_along_x_the_stage_counts(use, thesis):
+    """Two positions and the scale of 100 mm, twice: k = 2."""
+    known = thesis.uncertainty
     worth = next(w for w in worth_of_lengths(use) if w.axis == "X" and w.length_mm == 100.0)
-    assert worth.calibration_mm == pytest.approx(2e-3 * np.sqrt(2 * 5.0**2 + 10.0**2))
+    assert worth.calibration_mm == pytest.approx(
+        2 * np.sqrt(2 * known.stage_position_mm**2 + (100 * known.stage_scale) ** 2)
+    )
 
 
 def test_drift_of_the_water_counts(calibration):

@@ -12,10 +12,16 @@ from uwlts.calibration.joint.prior_words import off_as_words
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.errors import CalibrationError
-from uwlts.sensor import Medium
+from uwlts.sensor import Medium, Uncertainty
 
 BUILT = built_sensor()
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+
+
+@pytest.fixture(scope="module")
+def thesis(thesis):
+    """The drawings, with what is usually known of such."""
+    return thesis.model_copy(update={"uncertainty": Uncertainty()})
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,11 @@
 XIMEA's producer for the thesis's camera is among them, and so are those of Basler, Allied Vision, FLIR, IDS and others.
 """
 
+import signal
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -64,7 +68,8 @@ class GenicamCamera(Camera):
                     f"{len(fitting)} of the cameras at {self._producer} fit {self.address}, expected one. "
                     f"Found:{listed or ' none; check power, cable, and that the file is a producer for this machine'}"
                 )
-            self._acquirer = self._harvester.create(found.index(fitting[0]))
+            with _own_interrupt():
+                self._acquirer = self._harvester.create(found.index(fitting[0]))
             self._acquirer.num_buffers = _BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
             bits = _BITS.get(self._node("PixelFormat").value, 8)
@@ -230,6 +235,15 @@ class GenicamCamera(Camera):
             f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "
             "whether another program uses it"
         )
+
+
+@contextmanager
+def _own_interrupt() -> Iterator[None]:
+    """Keep what Ctrl-C does: harvesters takes the signal for itself, and then it would end no scan."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    if before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, before)
 
 
 def _libraries() -> tuple[ModuleType, ModuleType, ModuleType]:

@@ -1,5 +1,6 @@
 """Stripes on spheres as evidence: which sphere each point lies on, and where the estimate starts."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.sphere_scans import SphereScanEvidence
 from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
-from uwlts.errors import DescriptionError, EvaluationError
+from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.evaluate import parse_artefact
 from uwlts.metrology.artefact_descriptions import SphereStandard
 from uwlts.metrology.sphere_evaluation import evaluate_spheres
@@ -103,6 +104,32 @@ def sphere_evidence(
         [(centres @ rotation.T + transform[:3, 3]).ravel(), diameters - nominal, np.zeros(len(frames))]
     )
     return evidence, own
+
+
+def sphere_scans(
+    scans: Sequence[SphereStripes], start: Calibration, indices: Sequence[float], *, sizes_known: bool
+) -> tuple[list[tuple[SphereScanEvidence, np.ndarray]], list[str]]:
+    """Evidence of every scan with the start of its own parameters, and warnings about scans left out.
+
+    Raises
+    ------
+    CalibrationError
+        The scans move along different directions.
+    """
+    found, warnings, image = [], [], 0
+    if any(not np.allclose(scan.stage_direction, scans[0].stage_direction) for scan in scans):
+        raise CalibrationError("the scans of spheres move along different directions: calibrate with one of them")
+    for stripes in scans:
+        index = 1.0 if stripes.view.medium is None else indices[stripes.view.medium]
+        through = start if stripes.view.window else start.model_copy(update={"window": None})
+        try:
+            evidence, own = sphere_evidence(stripes, through, medium_index=index, sizes_known=sizes_known, image=image)
+        except EvaluationError as error:
+            warnings.append(f"{stripes.source}: left out, {error}")
+            continue
+        found.append((evidence, own))
+        image += len(evidence.stage_mm)
+    return found, warnings
 
 
 def _across(direction: np.ndarray) -> np.ndarray:

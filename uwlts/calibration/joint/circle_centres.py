@@ -1,0 +1,43 @@
+"""The images of circles' centres, in place of the centres of their images, as seen through the window."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from uwlts.calibration.joint.estimate import Evidence
+from uwlts.calibration.joint.observations import TargetEvidence
+from uwlts.calibration.joint.parameters import Parameters
+from uwlts.camera import project_through_window
+from uwlts.targets import circle_centre_bias
+
+
+def centred(
+    parameters: Parameters, diameter_mm: float, found: Sequence[Evidence], shared: np.ndarray,
+    own: Sequence[np.ndarray],
+) -> list[Evidence]:  # fmt: skip
+    """The evidence with the images of the circles' centres instead of the centres of the circles' images."""
+    return [
+        _with_centres(e, parameters, shared, o, diameter_mm) if isinstance(e, TargetEvidence) else e
+        for e, o in zip(found, own, strict=True)
+    ]
+
+
+def _with_centres(
+    evidence: TargetEvidence, parameters: Parameters, shared: np.ndarray, own: np.ndarray, diameter_mm: float
+) -> TargetEvidence:
+    view, placement = evidence.view, evidence.placement
+    camera, index = parameters.camera(shared), parameters.medium_index(shared, view)
+    window = parameters.window_model(shared) if view.window else None
+    pixels = placement.pixels.copy()
+    for image in np.unique(placement.image):
+        pose, here = evidence.pose(parameters, shared, own, image), placement.image == image
+
+        def project(points: np.ndarray, pose: np.ndarray = pose) -> np.ndarray:
+            seen = points @ pose[:3, :3].T + pose[:3, 3]
+            return project_through_window(camera, window, seen, medium_index=index)
+
+        pixels[here] -= circle_centre_bias(
+            project, placement.points_mm[here], diameter_mm=diameter_mm, axis_u=np.eye(3)[0], axis_v=np.eye(3)[1]
+        )
+    return replace(evidence, placement=replace(placement, pixels=pixels))

@@ -1,0 +1,123 @@
+"""What captures show of all evidence, and through what they were taken."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uwlts.calibration.evidence import Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.sphere_start import SphereStripes, sphere_stripes
+from uwlts.calibration.joint.start import Series
+from uwlts.calibration.procedure import CalibrationOptions, common_sensor, sources_of
+from uwlts.capture import Capture
+from uwlts.errors import CalibrationError
+from uwlts.sensor import Medium, Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """All that the captures show.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        As the first capture describes it, with the window as mounted in the medium of use.
+    media : dict
+        Media other than air by their names.
+    series : list of Series
+        Target images, by what they were seen through.
+    steps : list of (StepEvidence, View)
+    spheres : list of SphereStripes
+    provenance : dict
+    warnings : list of str
+    """
+
+    sensor: Sensor
+    media: dict[str, Medium]
+    series: list[Series]
+    steps: list[tuple[StepEvidence, View]]
+    spheres: list[SphereStripes]
+    provenance: dict[str, Any]
+    warnings: list[str]
+
+    def views(self) -> list[View]:
+        """Through what each series of target images, each step image and each scan was seen."""
+        return [s.view for s in [*self.series, *self.spheres]] + [view for _, view in self.steps]
+
+    def sources(self, *, free: bool) -> list[dict[int, str]]:
+        """Capture and frame of every target image of every placement, in the order of `series_start`."""
+        return [
+            {
+                int(image): f"{part.names[part.found.frames[image][0]]}, frame {part.found.frames[image][1]}"
+                for image in np.unique(placement.image)
+            }
+            for part in self.series
+            for placement in part.placements(free=free)
+        ]
+
+
+def gather_jointly(
+    targets: Sequence[Capture], steps: Sequence[Capture], spheres: Sequence[Capture] = (), *,
+    options: CalibrationOptions, progress: Progress | None = None,
+) -> Gathered:  # fmt: skip
+    """Find the target, the stripes on it and those on steps and spheres in all images."""
+    sensor = common_sensor([*targets, *steps, *spheres])
+    media: dict[str, Medium] = {}
+    views: dict[View, list[Capture]] = {}
+    for capture in targets:
+        views.setdefault(_view(capture, media), []).append(capture)
+    series, warnings = [], []
+    for view, captures in views.items():
+        found = air_evidence(captures, stripe=options.stripe, progress=progress)
+        warnings += found.warnings
+        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
+    on_steps = []
+    for capture in steps:
+        view = _view(capture, media)
+        found_steps, left_out = step_evidence(
+            [capture], medium_index=options.medium_index, stripe=options.stripe, progress=progress
+        )
+        on_steps += [(step, view) for step in found_steps]
+        warnings += left_out
+    if steps and not on_steps:
+        raise CalibrationError(no_stripe_in(steps))
+    on_spheres = []
+    for capture in spheres:
+        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the spheres"
+        on_spheres.append(sphere_stripes(capture, _view(capture, media, name), stripe=options.stripe))
+    windowed = [c for c in [*steps, *targets, *spheres] if c.header.sensor.camera.window.mounted]
+    return Gathered(
+        sensor=windowed[0].header.sensor if windowed else sensor, media=media, series=series, steps=on_steps,
+        spheres=on_spheres, provenance=sources_of(targets, steps, spheres), warnings=warnings,
+    )  # fmt: skip
+
+
+def refuse_two_lenses(gathered: Gathered) -> None:
+    """CalibrationError where a lens that looks straight into a medium would have to be the one seen otherwise."""
+    views = gathered.views()
+    wet = next((view for view in views if view.medium is not None and not view.window), None)
+    if wet is not None and any(view != wet for view in views):
+        raise CalibrationError(
+            f"some captures in {list(gathered.media)[wet.medium]} were taken without a window and others were not: a "
+            "lens that touches the medium is another lens; calibrate it by itself, or set window.mounted"
+        )
+
+
+def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> View:
+    """Through what a capture was taken; ``name`` is the medium's own unless given."""
+    header = capture.header
+    window = header.sensor.camera.window.mounted
+    if header.medium.kind == "air":
+        return View(window, None)
+    name = name or header.medium_name
+    if media.setdefault(name, header.medium) != header.medium:
+        raise CalibrationError(f"the captures mean different media by '{name}': {media[name]} and {header.medium}")
+    return View(window, list(media).index(name))
+
+
+def _approaching(captures: Sequence[Capture]) -> bool | None:
+    """Whether the stage moves the sensor towards the target; None where it does not move along the OCS's Z."""
+    along = {float(capture.header.stage_direction[2]) for capture in captures}
+    return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None

@@ -1,0 +1,155 @@
+"""The joint calibration against the thesis's two ways, on the same images of its campaign."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwlts.calibration.joint.gathering import gather_jointly
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.model import Calibration, write_calibration
+from uwlts.calibration.procedure import CalibrationOptions
+from uwlts.capture import Capture
+from uwlts.design import speckle_limit_um
+from uwlts.design_table import nominal_setup
+from uwlts.evaluate import parse_artefact
+from uwlts.files import written_aside
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.scan import find_stripes, reconstruct_stripes
+from uwlts.thesis.folder import CampaignFolder, ScanFile
+from uwlts.thesis.methods import PROPOSED, TWO, calibrations
+from uwlts.uncertainty.figures import figure_uncertainties
+
+ONE_REFRACTION, TWO_REFRACTIONS, JOINT = "one_refraction", "two_refractions", "joint"
+_COVERAGE = 1.96
+_SPACING, _DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
+Progress = Callable[[int, int], None]
+
+
+def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
+    """The joint calibration from all targets and steps of a campaign, kept with the others; the time to solve it in s.
+
+    Raises
+    ------
+    CaptureError
+        A recording is missing or damaged.
+    CalibrationError
+        The recordings do not determine a calibration, or contradict each other.
+    """
+    options = CalibrationOptions(poses="stage")
+    with ExitStack() as stack:
+        targets = [stack.enter_context(Capture(folder.target(kind))) for kind in ("bare", "air", "water")]
+        steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
+        gathered = gather_jointly(targets, steps, options=options)
+    start = time.perf_counter()
+    calibration = solve_jointly(gathered, options=options).calibration
+    taken_s = time.perf_counter() - start
+    write_calibration(folder.path / "calibrations" / "joint.json", calibration, overwrite=True)
+    return calibration, taken_s
+
+
+def compare_campaign(folder: CampaignFolder, *, progress: Progress = lambda done, total: None) -> dict[str, Any]:
+    """Errors of every scan of spheres and planes by the three ways, with the joint one's uncertainties, as plain JSON.
+
+    Raises
+    ------
+    CaptureError, CalibrationError, EvaluationError
+        A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
+    """
+    by_turns = calibrations(folder)
+    joint, solve_s = joint_calibration(folder)
+    scans = [scan for scan in folder.scans() if scan.thing in ("spheres", "plane")]
+    spheres, planes = [], []
+    for number, scan in enumerate(scans):
+        progress(number, len(scans))
+        known = {JOINT: joint, ONE_REFRACTION: by_turns[PROPOSED, scan.medium]}
+        if (TWO, scan.medium) in by_turns:
+            known[TWO_REFRACTIONS] = by_turns[TWO, scan.medium]
+        if scan.thing == "spheres":
+            spheres.append(_of_spheres(scan, known))
+        else:
+            planes.append(_of_plane(scan, joint))
+    progress(len(scans), len(scans))
+    return {"campaign": folder.path.name, "solve_s": solve_s, "spheres": spheres, "planes": planes}
+
+
+def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]:
+    with Capture(scan.path) as capture:
+        artefact, stripes = parse_artefact(capture.header.artefact), find_stripes(capture)
+        found: dict[str, Any] = {"placement": scan.placement, "medium": scan.medium}
+        for way, calibration in known.items():
+            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=way == JOINT).cloud
+            figures = evaluate_cloud(cloud, artefact).figures_mm
+            found[way] = {name: figures[name] for name in (_SPACING, *_DIAMETERS)}
+            if way == JOINT:
+                std = figure_uncertainties(cloud, artefact)
+                found["std"] = {name: std[name].expanded_mm / 2 for name in found[way]}
+    return found
+
+
+def _of_plane(scan: ScanFile, joint: Calibration) -> dict[str, Any]:
+    """Scatter of a plane about its fit, over the speckle limit along the laser's axis at its distance."""
+    with Capture(scan.path) as capture:
+        header = capture.header
+        cloud = reconstruct_stripes(capture, find_stripes(capture), joint).cloud
+        std_mm = evaluate_cloud(cloud, parse_artefact(header.artefact)).figures_mm["STD"]
+        setup, leaning = nominal_setup(header.sensor, header.medium)
+        frame = joint.object_transform()
+        depth = float(np.mean(cloud.points_mm @ frame[2, :3]) + frame[2, 3])
+        camera = header.sensor.camera
+        window = setup.window if joint.window is None else replace(setup.window, distance_mm=joint.window.distance_mm)
+        across = 1e-3 * speckle_limit_um(
+            wavelength_nm=joint.wavelength_nm, focal_length_mm=camera.focal_length_mm, f_number=camera.f_number,
+            distance_mm=float(window.reach_mm(depth)),
+        )  # fmt: skip
+    limit = across * leaning / np.tan(setup.triangulation_angle_rad)
+    return {"placement": scan.placement, "medium": scan.medium, "std_mm": std_mm, "over_limit": std_mm / limit}
+
+
+def joint_summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of all campaigns: errors of all scans, share of the intervals that hold the truth, time to solve."""
+    summary: dict[str, Any] = {"campaigns": len(results)}
+    for medium in ("water", "air"):
+        spheres = [s for result in results for s in result["spheres"] if s["medium"] == medium]
+        ways = [way for way in (ONE_REFRACTION, TWO_REFRACTIONS, JOINT) if spheres and way in spheres[0]]
+        planes = [p["over_limit"] for result in results for p in result["planes"] if p["medium"] == medium]
+        inside = [abs(s[JOINT][n]) <= _COVERAGE * s["std"][n] for s in spheres for n in (_SPACING, *_DIAMETERS)]
+        summary[medium] = {
+            "spacing_error_mm": {way: [s[way][_SPACING] for s in spheres] for way in ways},
+            "diameter_error_mm": {way: [s[way][n] for s in spheres for n in _DIAMETERS] for way in ways},
+            "plane_std_over_speckle_limit": planes,
+            "coverage_95": float(np.mean(inside)) if inside else None,
+        }
+    return summary["water"] | {"solve_s": [result["solve_s"] for result in results]} | summary
+
+
+def write_joint_summary(folder: Path, results: Sequence[dict[str, Any]], *, overwrite: bool = False) -> dict[str, Any]:
+    """Write summary.json into a folder, whole or not at all; OutputError where that fails."""
+    summary = joint_summary(results)
+    with written_aside(folder / "summary.json", overwrite=overwrite) as aside:
+        aside.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return summary
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """The summary in words."""
+    lines = []
+    for medium in ("water", "air"):
+        part = summary[medium]
+        for what, name in (("sphere spacing", "spacing_error_mm"), ("sphere diameter", "diameter_error_mm")):
+            means = ", ".join(
+                f"{way.replace('_', ' ')} {np.mean(np.abs(errors)):.4f} mm (largest {np.max(np.abs(errors)):.4f})"
+                for way, errors in part[name].items()
+            )
+            if means:
+                lines.append(f"{medium}, error of the {what}, mean of the absolute values: {means}")
+        if part["coverage_95"] is not None:
+            lines.append(f"{medium}, truth within the stated 95 % intervals: {100 * part['coverage_95']:.0f} %")
+        if over := part["plane_std_over_speckle_limit"]:
+            lines.append(f"{medium}, scatter of planes over the speckle limit: {np.mean(over):.2f} on average")
+    return [*lines, f"joint estimate solved in {', '.join(f'{s:.1f}' for s in summary['solve_s'])} s"]
