@@ -8,16 +8,80 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from uwlts.errors import SetupError
 
 COMMAND_SECONDS = 900
 
+Library = TypeVar("Library")
 Report = Callable[[str], object]
+Choose = Callable[[Sequence[str]], Sequence[str]]
+"""With the options of apt-get to the packages wanted, the library's own first; SetupError where none is offered."""
 
 
-def install_packages(packages: Sequence[str], *, what: str, report: Report) -> None:
+def obtain(
+    find: Callable[[Sequence[Path]], Library],
+    *,
+    what: str,
+    choose: Choose,
+    wheel: str,
+    target: Path | None,
+    folders: Sequence[Path],
+    choice: str,
+    report: Report,
+) -> Library:
+    """Find a library; else obtain it with apt-get as root, or unpacked from Debian packages or from a wheel.
+
+    Parameters
+    ----------
+    find
+        Finds it, also in folders that were unpacked into, or raises a SetupError that says where it looked.
+    what
+        Name of the library.
+    choose, wheel
+        Debian's packages, and the requirement that pip downloads.
+    target, folders
+        Folder to unpack into; the first of ``folders`` that can be written to unless given.
+    choice
+        Environment variable by which the user chooses a library.
+    report
+        Called with a line of text for each step.
+
+    Raises
+    ------
+    SetupError
+        The user's choice does not serve, or no way led to a library; the message gives the reason of each.
+    """
+    try:
+        return find([])
+    except SetupError as error:
+        # The user's own choice is never replaced, and replacing it would not be noticed.
+        if os.environ.get(choice):
+            raise
+        nothing_found = error
+    target = target or writable_folder(folders)
+    refusals = []
+    for way in (
+        partial(install_packages, choose),
+        partial(unpack_packages, choose, target),
+        partial(unpack_wheel, wheel, target),
+    ):
+        try:
+            way(what=what, report=report)
+        except SetupError as error:
+            refusals.append(f"\n  {error}")
+            continue
+        try:
+            return find([target])
+        except SetupError as error:
+            nothing_found = error
+    raise SetupError(f"{nothing_found}\nTried without success to obtain it:{''.join(refusals)}") from nothing_found
+
+
+def install_packages(choose: Choose, *, what: str, report: Report) -> None:
     """As root on Debian, Ubuntu and their relatives: install packages of the distribution.
 
     Raises
@@ -27,17 +91,22 @@ def install_packages(packages: Sequence[str], *, what: str, report: Report) -> N
     """
     if shutil.which("apt-get") is None or os.geteuid() != 0:
         raise SetupError("apt-get install: not possible, needs root and apt-get")
-    report(f"{what}: installing {' '.join(packages)} (apt-get install)")
-    install = ["apt-get", "install", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120", *packages]
+
+    def install() -> None:
+        packages = choose([])
+        report(f"{what}: installing {' '.join(packages)} (apt-get install)")
+        run_command(["apt-get", "install", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120", *packages])
+
     try:
-        run_command(install)
+        install()
     except SetupError:
         # Lists that are missing, or older than the archive, name files that are not there.
+        report(f"{what}: reading the package lists (apt-get update)")
         run_command(["apt-get", "update"])
-        run_command(install)
+        install()
 
 
-def unpack_packages(packages: Sequence[str], target: Path, *, what: str, report: Report) -> None:
+def unpack_packages(choose: Choose, target: Path, *, what: str, report: Report) -> None:
     """Without root: unpack the libraries of packages, and of those they need that the system lacks, into a folder.
 
     Raises
@@ -49,7 +118,7 @@ def unpack_packages(packages: Sequence[str], target: Path, *, what: str, report:
         raise SetupError("apt-get download: not possible, needs apt-get")
     with tempfile.TemporaryDirectory() as scratch:
         try:
-            _download_and_unpack(packages, Path(scratch), target, [], what=what, report=report)
+            _download_and_unpack(choose, Path(scratch), target, [], what=what, report=report)
         except SetupError:
             # The system's lists are missing or old. An ordinary user cannot renew them but can keep lists of his own.
             options = [f"Dir::State::Lists={scratch}/lists", f"Dir::Cache={scratch}/cache", "APT::Sandbox::User="]
@@ -58,16 +127,17 @@ def unpack_packages(packages: Sequence[str], target: Path, *, what: str, report:
             options = [word for option in options for word in ("-o", option)]
             report(f"{what}: reading the package lists into a temporary folder (apt-get update)")
             run_command(["apt-get", *options, "update"])
-            _download_and_unpack(packages, Path(scratch), target, options, what=what, report=report)
+            _download_and_unpack(choose, Path(scratch), target, options, what=what, report=report)
 
 
 def _download_and_unpack(
-    packages: Sequence[str], scratch: Path, target: Path, options: Sequence[str], *, what: str, report: Report
+    choose: Choose, scratch: Path, target: Path, options: Sequence[str], *, what: str, report: Report
 ) -> None:
+    packages = choose(options)
     # The simulation names exactly the packages that the system lacks, dependencies of dependencies included.
     simulate = ["apt-get", *options, "--simulate", "--no-install-recommends", "install", *packages]
     missing = re.findall(r"^Inst (\S+)", run_command(simulate), flags=re.MULTILINE)
-    wanted = list(dict.fromkeys([*missing, *packages]))
+    wanted = list(dict.fromkeys([*missing, packages[0]]))
     report(f"{what}: unpacking {' '.join(wanted)} into {target}")
     run_command(["apt-get", *options, "download", *wanted], folder=scratch)
     for archive in scratch.glob("*.deb"):

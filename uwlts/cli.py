@@ -4,7 +4,7 @@ import sys
 import threading
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -12,9 +12,6 @@ import uwlts
 from uwlts.console import progress_bar, run
 from uwlts.errors import CaptureError, DescriptionError, OutputError, RangeError
 from uwlts.files import refuse_unsuitable
-
-if TYPE_CHECKING:
-    from uwlts.thesis.folder import CampaignFolder
 
 app = App(
     name="uwlts",
@@ -755,10 +752,10 @@ def thesis(
         raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
-    tables, campaigns = load_published(published), campaign_folders(folder)
     if joint:
-        _compare_jointly(folder, campaigns, overwrite=overwrite)
+        _compare_jointly(folder, overwrite=overwrite)
         return
+    tables, campaigns = load_published(published), campaign_folders(folder)
     refuse_unsuitable(folder / "report.html", overwrite=overwrite)
     results = []
     for campaign in campaigns:
@@ -838,13 +835,14 @@ def _led_through(
     return (target, (), step, plan.poses) if plan.target_in_air() else ((), target, step, plan.poses)
 
 
-def _compare_jointly(folder: Path, campaigns: "list[CampaignFolder]", *, overwrite: bool) -> None:
+def _compare_jointly(folder: Path, *, overwrite: bool) -> None:
     """Compare the joint calibration with the thesis's ways on all campaigns of a folder."""
+    from uwlts.thesis.folder import campaign_folders
     from uwlts.thesis.joint_comparison import compare_campaign, summary_lines, write_joint_summary
 
     refuse_unsuitable(folder / "summary.json", overwrite=overwrite)
     results = []
-    for campaign in campaigns:
+    for campaign in campaign_folders(folder):
         with progress_bar(f"comparing {campaign.path.name}") as progress:
             results.append(compare_campaign(campaign, progress=progress))
     print("\n".join(summary_lines(write_joint_summary(folder, results, overwrite=overwrite))))

@@ -88,7 +88,8 @@ def verify(capture: Capture, calibration: AnyCalibration, *, limit_mm: float | N
         raise EvaluationError(f"{capture.path.name} does not say what it shows: its header needs an artefact")
     artefact = parse_artefact(capture.header.artefact)
     cloud = reconstruct_capture(capture, calibration, with_uncertainty=joint).cloud
-    figures, known = evaluate_cloud(cloud, artefact).figures_mm, figure_uncertainties(cloud, artefact)
+    figures = evaluate_cloud(cloud, artefact).figures_mm
+    known = figure_uncertainties(cloud, artefact, figures)
     verdicts = []
     for figure, error in figures.items():
         quantity = calibrated_quantity(figure, artefact)

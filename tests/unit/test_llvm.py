@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from twin import llvm_install, llvm_search
+from twin import llvm_install, llvm_search, packages
 from twin.llvm import LlvmLibrary, find_llvm, install_llvm, main
 from twin.llvm_search import Unsuitable, examine, judge, list_candidates, named_version
 from uwlts.errors import SetupError
@@ -219,7 +219,7 @@ def test_missing_runtime_library_of_drjit_is_reported(monkeypatch, machine_libra
 
 
 def test_install_leaves_a_suitable_library_alone(machine_library, tmp_path, monkeypatch):
-    monkeypatch.setattr(llvm_install, "_run", lambda command, folder=None: pytest.fail(f"ran {command}"))
+    monkeypatch.setattr(packages, "run_command", lambda command, folder=None: pytest.fail(f"ran {command}"))
     steps = []
     assert install_llvm(target=tmp_path / "unused", report=steps.append) == machine_library
     assert steps == [] and not (tmp_path / "unused").exists()
@@ -241,9 +241,9 @@ def test_debian_package_offered_by_the_lists_is_taken(monkeypatch):
         "libllvm18:\n  Installed: (none)\n  Candidate: 1:18.1.8-1\n  Version table:\n"
         "libllvm17:\n  Installed: 1:17.0.6-1\n  Candidate: 1:17.0.6-1\n  Version table:\n"
     )
-    monkeypatch.setattr(llvm_install, "_run", lambda command: policy)
+    monkeypatch.setattr(packages, "run_command", lambda command: policy)
     assert llvm_install._debian_package([]) == "libllvm18"
-    monkeypatch.setattr(llvm_install, "_run", lambda command: "")
+    monkeypatch.setattr(packages, "run_command", lambda command: "")
     assert llvm_install._debian_package([]) is None
 
 

@@ -175,7 +175,7 @@ def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesi
     grid = np.column_stack([rng.uniform(-20, 20, near.sum()), np.linspace(-60, 60, near.sum()), np.zeros(near.sum())])
     cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
     artefact = PlaneStandard(kind="plane")
-    found = figure_uncertainties(cloud, artefact)
+    found = figure_uncertainties(cloud, artefact, evaluate_cloud(cloud, artefact).figures_mm)
     along, patterns = noise_mm(known), known.patterns_mm.astype(float)
     spread = []
     for _ in range(200):

@@ -5,19 +5,17 @@ apt-get as root, else unpacked from Debian's package or a wheel into a folder of
 there is none.
 """
 
-import os
 import sys
 from functools import partial
 from pathlib import Path
 
-from twin.packages import Report, install_packages, unpack_packages, unpack_wheel, writable_folder
+from twin.packages import Report, obtain
 from uwlts.aravis_library import VARIABLE, load_aravis, own_folders
 from uwlts.errors import SetupError
 
 DEBIAN_PACKAGE = "libaravis-0.8-0"
 # Built by a third party for x86-64; GLib, libxml2 and libusb have to be there.
 WHEEL = "aravis-python==0.8.31.post1"
-_WHAT = "Aravis"
 
 
 def install_aravis(*, target: Path | None = None, report: Report = lambda line: None) -> str:
@@ -35,27 +33,10 @@ def install_aravis(*, target: Path | None = None, report: Report = lambda line: 
     SetupError
         None of the ways led to a library; the message gives the reason of each.
     """
-    try:
-        return load_aravis()._name
-    except SetupError as error:
-        # The user's own choice is never replaced, and replacing it would not be noticed.
-        if os.environ.get(VARIABLE):
-            raise
-        nothing_found = error
-    target = target or writable_folder(own_folders())
-    ways = (
-        partial(install_packages, [DEBIAN_PACKAGE]),
-        partial(unpack_packages, [DEBIAN_PACKAGE], target),
-        partial(unpack_wheel, WHEEL, target),
-    )
-    refusals = []
-    for way in ways:
-        try:
-            way(what=_WHAT, report=report)
-            return load_aravis()._name
-        except SetupError as error:
-            refusals.append(f"\n  {error}")
-    raise SetupError(f"{nothing_found}\nTried without success to obtain it:{''.join(refusals)}") from nothing_found
+    return obtain(
+        lambda unpacked: load_aravis()._name, what="Aravis", choose=lambda options: [DEBIAN_PACKAGE], wheel=WHEEL,
+        target=target, folders=own_folders(), choice=VARIABLE, report=report,
+    )  # fmt: skip
 
 
 def main() -> int:

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 from uwlts.capture import CaptureHeader
 from uwlts.errors import DescriptionError, DesignError, RangeError
 from uwlts.evaluate import parse_artefact
-from uwlts.library import find, read_table, validated
+from uwlts.library import load_sensor, read_table, validated
 from uwlts.placement import check_design
 from uwlts.sensor import Description, NotNegative, Positive, Sensor, Vector
 from uwlts.targets import parse_target
@@ -72,8 +72,7 @@ class ScanPlan(Description):
 
     def described_sensor(self) -> Sensor:
         """The sensor of the plan; DescriptionError where it is unknown or not valid."""
-        path = find(self.sensor, "sensors")
-        return validated(Sensor, read_table(path, "sensors"), path)
+        return load_sensor(self.sensor)
 
     def header(self, name: str, *, provenance: dict[str, Any]) -> CaptureHeader:
         """Header of the capture.
@@ -109,13 +108,18 @@ def load_plan(path: Path) -> ScanPlan:
     DescriptionError
         The file is missing, no TOML, or holds an unknown or wrong key.
     """
+    return validated(ScanPlan, plan_table(path, wanted="sensor, medium and stage (docs/scan.md)"), path)
+
+
+def plan_table(path: Path, *, wanted: str) -> dict[str, Any]:
+    """A plan's TOML with the path of a sensor that lies beside it; DescriptionError where it is missing or no TOML."""
     if not path.is_file():
-        raise DescriptionError(f"no plan at {path}: write one that tells sensor, medium and stage (docs/scan.md)")
+        raise DescriptionError(f"no plan at {path}: write one that tells {wanted}")
     table = read_table(path)
     beside = path.parent / str(table.get("sensor", ""))
     if beside.suffix == ".toml" and beside.is_file():
         table["sensor"] = str(beside)
-    return validated(ScanPlan, table, path)
+    return table
 
 
 def check_plan(plan: ScanPlan, *, limits_mm: tuple[float, float], fastest_mm_per_min: float) -> None:

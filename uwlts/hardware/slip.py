@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.stripe import Stripe, StripeStatus
 
 LARGEST_MM = 0.05
@@ -99,5 +100,5 @@ def _relief(before: Place, here: Place, after: Place) -> Relief | None:
 
 def _standard_error(scatter_px: np.ndarray, way_px_per_mm: np.ndarray) -> float:
     """Of the slip that lines tell together, in mm."""
-    spread = 1.4826 * np.median(np.abs(scatter_px - np.median(scatter_px)))
+    spread = MAD_TO_STD * np.median(np.abs(scatter_px - np.median(scatter_px)))
     return float(_GRAIN * spread / np.sqrt(np.sum(way_px_per_mm**2)))

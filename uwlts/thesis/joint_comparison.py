@@ -87,7 +87,7 @@ def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]
             figures = evaluate_cloud(cloud, artefact).figures_mm
             found[way] = {name: figures[name] for name in (_SPACING, *_DIAMETERS)}
             if way == JOINT:
-                std = figure_uncertainties(cloud, artefact)
+                std = figure_uncertainties(cloud, artefact, figures)
                 found["std"] = {name: std[name].expanded_mm / 2 for name in found[way]}
     return found
 

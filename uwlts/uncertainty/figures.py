@@ -25,8 +25,10 @@ class FigureUncertainty:
         return 2.0 * float(np.hypot(self.random_mm, self.systematic_mm))
 
 
-def figure_uncertainties(cloud: PointCloud, artefact: Artefact) -> dict[str, FigureUncertainty]:
-    """Uncertainty of every figure of an artefact, by name; nothing where the cloud's points have none.
+def figure_uncertainties(
+    cloud: PointCloud, artefact: Artefact, plain: dict[str, float]
+) -> dict[str, FigureUncertainty]:
+    """Uncertainty of the figures of an artefact, ``plain`` in mm by name; nothing where the cloud's points have none.
 
     Figures are calculated again with each pattern of the calibration added to the points; the squares of their changes
     add up (GUM, section 5.1, with independent inputs). For the noise they are calculated with noise drawn anew
@@ -39,7 +41,6 @@ def figure_uncertainties(cloud: PointCloud, artefact: Artefact) -> dict[str, Fig
     """
     if cloud.uncertainty is None:
         return {}
-    plain = evaluate_cloud(cloud, artefact).figures_mm
 
     def moved(by: np.ndarray) -> np.ndarray:
         figures = evaluate_cloud(replace(cloud, points_mm=cloud.points_mm + by), artefact).figures_mm

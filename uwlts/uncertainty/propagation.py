@@ -13,9 +13,9 @@ from uwlts.calibration.joint.stored import StoredEstimate, stored_estimate
 from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
+from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.uncertainty.points import PAIRS, PointUncertainty
 
-_TO_STD = 1.4826
 _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are not worth their room.
 _NEGLIGIBLE_MM = 5e-5
@@ -35,7 +35,7 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
     if len(off) < _FEWEST_NEIGHBOURS:
         raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: their noise cannot be told")
-    scale = _TO_STD / np.sqrt(1.5)
+    scale = MAD_TO_STD / np.sqrt(1.5)
     noise = np.full(int(frame.max()) + 1, scale * np.median(off))
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1]])
     for number, values in zip(image[starts], np.split(off, starts[1:]), strict=True):

@@ -14,9 +14,9 @@ from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
 from uwlts.calibration.joint.noise import strays
 from uwlts.calibration.joint.observations import TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.prior_words import off_as_words
+from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor, Uncertainty
 
-_TO_STD = 1.4826
 _LARGEST_TARGET_PX, _LARGEST_STRIPE_PX = 0.5, 1.0
 """Scatter beyond which target points or stripes were misdetected or contradict each other, whatever the image."""
 _FEWEST_VALUES = 20
@@ -105,10 +105,10 @@ def findings(
 
 def _image(residuals: Residuals, evidence: Evidence, source: str) -> _Image:
     values = residuals.values
-    scatter = _TO_STD * float(np.median(np.abs(values)))
+    scatter = MAD_TO_STD * float(np.median(np.abs(values)))
     # Residuals of neighbouring points or lines share what a wrong model does to them.
     steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
-    noise = _TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
+    noise = MAD_TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
     return _Image(source, residuals.kind, (residuals.kind, evidence.view), scatter, noise)
 
 
@@ -162,7 +162,7 @@ def _of_stage(
         # The first position has no error of its own, so all others share its.
         errors = errors - np.median(np.append(errors, 0.0))
         # One that is far off bends the camera and so moves the others too.
-        usual = max(std, _TO_STD * float(np.median(np.abs(errors)))) if len(errors) else std
+        usual = max(std, MAD_TO_STD * float(np.median(np.abs(errors)))) if len(errors) else std
         wrong = np.abs(errors) > _WRONG * usual
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
         if 0 < wrong.sum() <= max(1, len(errors) // 4):

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.observations import TARGET, Residuals
+from uwlts.metrology.robust_fit import MAD_TO_STD
 
 _STRAY = 5.0
-_TO_STD = 1.4826
 _LAGS = 100
 _SHARED_LAG = 0.05
 _SLOPE_BIAS_PX = 0.03
@@ -53,7 +53,7 @@ def strays(residuals: Residuals, noise: Noise) -> np.ndarray:
 def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
     """Scatter of all residuals of a kind; ``points`` (N, 3) are the target's, for residuals of that kind."""
     values = np.concatenate([r.values for r in residuals])
-    spread = _TO_STD * float(np.median(np.abs(values)))
+    spread = MAD_TO_STD * float(np.median(np.abs(values)))
     kept = np.abs(values) <= _STRAY * spread
     sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else spread
     if sigma < _FINEST_PX:

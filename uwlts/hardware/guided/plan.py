@@ -12,8 +12,8 @@ from uwlts.calibration.guidance.solution import Setting, without_window
 from uwlts.calibration.guidance.wishes import Wanted
 from uwlts.capture import CaptureHeader
 from uwlts.errors import DescriptionError, RangeError
-from uwlts.hardware.scan_plan import ScanPlan, StagePlan
-from uwlts.library import find, read_table, validated
+from uwlts.hardware.scan_plan import ScanPlan, StagePlan, plan_table
+from uwlts.library import load_sensor, validated
 from uwlts.metrology.artefact_descriptions import StepStandard
 from uwlts.sensor import Description, NotNegative, Positive, Sensor, Vector
 from uwlts.targets import parse_target
@@ -139,8 +139,7 @@ class GuidedPlan(Description):
 
     def described_sensor(self) -> Sensor:
         """The sensor of the plan, with its window; DescriptionError where it is unknown or not valid."""
-        path = find(self.sensor, "sensors")
-        return validated(Sensor, read_table(path, "sensors"), path)
+        return load_sensor(self.sensor)
 
     def setting(self) -> Setting:
         """How the target is seen.
@@ -204,13 +203,7 @@ def load_guided_plan(path: Path) -> GuidedPlan:
     DescriptionError
         The file is missing, no TOML, or holds an unknown or wrong key; sensor, medium or target are not valid.
     """
-    if not path.is_file():
-        raise DescriptionError(f"no plan at {path}: write one that tells sensor and target (docs/calibrate-live.md)")
-    table = read_table(path)
-    beside = path.parent / str(table.get("sensor", ""))
-    if beside.suffix == ".toml" and beside.is_file():
-        table["sensor"] = str(beside)
-    plan = validated(GuidedPlan, table, path)
+    plan = validated(GuidedPlan, plan_table(path, wanted="sensor and target (docs/calibrate-live.md)"), path)
     plan.setting()
     if plan.step is not None:
         plan.described_sensor().medium(plan.step.medium)
