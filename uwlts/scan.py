@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uwlts.brightness import MOST_BLUR_PX, beside_sheet, moved_by_blur_px
+from uwlts.calibration.joint.stored import is_joint
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.polynomial_model import PolynomialCalibration
 from uwlts.capture import Capture
@@ -120,8 +122,8 @@ class FoundStripes:
     ----------
     frame, line : (N,) int
         Image and profile line of each centre.
-    centre_px, amplitude : (N,)
-        Place on the line and height in grey levels.
+    centre_px, amplitude, width_px : (N,)
+        Place on the line, height in grey levels and full width at half maximum.
     lines_by_status : dict
         What became of the profile lines of all images.
     """
@@ -130,7 +132,13 @@ class FoundStripes:
     line: np.ndarray
     centre_px: np.ndarray
     amplitude: np.ndarray
+    width_px: np.ndarray
     lines_by_status: dict[str, int]
+
+    def __getitem__(self, some: np.ndarray) -> "FoundStripes":
+        """Those that an index array or mask chooses."""
+        chosen = (self.frame[some], self.line[some], self.centre_px[some], self.amplitude[some], self.width_px[some])
+        return FoundStripes(*chosen, self.lines_by_status)
 
 
 def find_stripes(
@@ -147,7 +155,7 @@ def find_stripes(
         The capture holds no laser image, or none of them shows a stripe.
     """
     header = capture.header
-    frames, lines, centres, amplitudes = [], [], [], []
+    frames, lines, centres, amplitudes, widths = [], [], [], [], []
     statuses = np.zeros(len(StripeStatus), int)
     for number, image in capture.frames(laser_on=True):
         stripe = extract_stripe(
@@ -159,6 +167,7 @@ def find_stripes(
         lines.append(good)
         frames.append(np.full(len(good), number))
         amplitudes.append(stripe.amplitude[good])
+        widths.append(stripe.width_px[good])
         progress(number + 1, len(capture))
     if not centres:
         raise CaptureError(
@@ -169,7 +178,7 @@ def find_stripes(
         lit = (image for _, image in capture.frames(laser_on=True))
         reason = why_no_stripe(lit, stripe_along=header.sensor.camera.stripe_along, full_dn=header.saturation_dn)
         raise CaptureError(f"no stripe in any of the {len(centres)} laser images of {capture.path.name}: {reason}")
-    return FoundStripes(*(np.concatenate(parts) for parts in (frames, lines, centres, amplitudes)), by_status)
+    return FoundStripes(*(np.concatenate(parts) for parts in (frames, lines, centres, amplitudes, widths)), by_status)
 
 
 def reconstruct_capture(
@@ -202,6 +211,10 @@ def reconstruct_stripes(
     the calibration's window is left out. Points that a calibration by polynomials does not reach are left out and
     counted in ``rays_by_status``.
 
+    By a joint calibration points are taken where the light comes from, beside the sheet's middle where the surface
+    shines brighter there (`uwlts.brightness`), and lines are left out, counted as ``blurred``, where blur may move the
+    stripe's centre more than noise does.
+
     Raises
     ------
     CalibrationError
@@ -216,36 +229,61 @@ def reconstruct_stripes(
         )
     index = medium_index(capture, calibration) if index is None else index
     require_index(index)
-    header, frame = capture.header, stripes.frame
-    found = _points(capture, calibration, stripes.line, stripes.centre_px, frame, index)
-    points = _posed(found.points_mm, capture, frame)
+    lines = stripes.lines_by_status
+    sharp = np.arange(len(stripes.line))
+    exact = isinstance(calibration, Calibration) and is_joint(calibration)
+    if exact:
+        sharp = np.flatnonzero(np.abs(_moved_by_blur_px(stripes)) < MOST_BLUR_PX)
+        blurred = len(stripes.line) - len(sharp)
+        lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
+        stripes = stripes[sharp]
+    found = _points(capture, calibration, stripes, index)
+    points = found.points_mm
+    if exact:
+        points = points + _beside(capture, calibration, stripes, index)
+    points = _posed(points, capture, stripes.frame)
     good = np.flatnonzero(found.status == RayStatus.OK)
+    kept = stripes[good]
     cloud = PointCloud(
-        points_mm=points[good], intensity=stripes.amplitude[good], frame=frame[good], line=stripes.line[good],
+        points_mm=points[good], intensity=kept.amplitude, frame=kept.frame, line=kept.line,
         metadata={
-            "capture": capture.path.name, "sensor": calibration.sensor_name, "medium": header.medium_name,
-            "medium_index": index, "artefact": header.artefact, "calibration": calibration_digest(calibration),
+            "capture": capture.path.name, "sensor": calibration.sensor_name, "medium": capture.header.medium_name,
+            "medium_index": index, "artefact": capture.header.artefact, "calibration": calibration_digest(calibration),
         },
     )  # fmt: skip
     if with_uncertainty:
-        known = point_uncertainty(capture, calibration, frame[good], stripes.line[good], stripes.centre_px[good])
+        known = point_uncertainty(capture, calibration, kept.frame, kept.line, kept.centre_px)
         cloud = replace(cloud, uncertainty=known)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     by_status = {status.name.lower(): int(rays[status]) for status in RayStatus}
-    return Scan(cloud, good, stripes.lines_by_status, by_status)
+    return Scan(cloud, sharp[good], lines, by_status)
 
 
-def _points(
-    capture: Capture, calibration: AnyCalibration, line: np.ndarray, centre: np.ndarray, frame: np.ndarray, index: float
-) -> ObjectPoints:
+def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes, index: float) -> ObjectPoints:
     """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
-    stage, direction = capture.stage_mm[frame], np.array(capture.header.stage_direction)
+    stage, direction = capture.stage_mm[stripes.frame], np.array(capture.header.stage_direction)
+    line, centre = stripes.line, stripes.centre_px
     if isinstance(calibration, PolynomialCalibration):
         return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
     direction = np.array(calibration.stage_direction_of(capture.header.stage_direction))
     if not capture.header.sensor.camera.window.mounted:
         calibration = calibration.model_copy(update={"window": None})
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
+
+
+def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:
+    if np.isfinite(capture.pose).any():
+        return np.zeros((len(stripes.line), 3))
+    return beside_sheet(
+        calibration, capture.header.sensor, stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude,
+        medium_index=index, stage_mm=capture.stage_mm[:], stage_direction=capture.header.stage_direction,
+    )  # fmt: skip
+
+
+def _moved_by_blur_px(stripes: FoundStripes) -> np.ndarray:
+    if len(stripes.line) == 0:
+        return np.empty(0)
+    return moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
 
 
 def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:

@@ -78,7 +78,14 @@ def capture(path, images, *, stripe_along):
 def found(centres):
     """Stripes of images at centres (F, LINES), on every line."""
     frames, lines = np.indices(centres.shape)
-    return FoundStripes(frames.ravel(), lines.ravel(), centres.ravel(), np.ones(centres.size), {"ok": centres.size})
+    return FoundStripes(
+        frames.ravel(),
+        lines.ravel(),
+        centres.ravel(),
+        np.ones(centres.size),
+        np.full(centres.size, 4.0),
+        {"ok": centres.size},
+    )
 
 
 def parabolas(vertices, *, height=60000, curvature=640):

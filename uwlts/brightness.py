@@ -1,0 +1,169 @@
+"""What brightness that varies over a surface does to a stripe's centre.
+
+The sheet has a thickness. Where the surface under it shines brighter on one side, most of the light that is seen comes
+from there and not from the sheet's middle: for a sheet of Gaussian profile with the standard deviation s, from s^2
+times the slope of the brightness's logarithm beside it. The slope shows when the stage moves the sheet over the
+surface.
+
+The image is blurred, too. Where a stripe leans or bends in the image and fades along itself, as at the rim of a sphere,
+blur moves light from one line to the next and with it the centre that is seen there.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from uwlts.calibration.model import Calibration
+from uwlts.placement import laser_pose
+from uwlts.reconstruction import reconstruct_profile
+from uwlts.sensor import Laser, Sensor
+from uwlts.stripe.result import FWHM_PER_SIGMA
+
+MOST_BLUR_PX = 0.1
+"""Where blur may move a centre by more, which is as much as speckle does, it is not worth using."""
+
+_REACH_MM = 2.0
+"""Images taken within this way of the stage tell of the brightness at a point."""
+
+_LINES = 12
+_BEND_LINES = 6
+_LEAST_SHARE = 0.2
+
+_LEAST_ACROSS = 0.3
+"""Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
+
+_MOVED_MM = 0.05
+"""So far the sheet is moved to find along which way the points of its light lie."""
+
+
+def beside_sheet(
+    calibration: Calibration, sensor: Sensor, frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray,
+    amplitude: np.ndarray, *, medium_index: float, stage_mm: np.ndarray, stage_direction: Sequence[float],
+) -> np.ndarray:  # fmt: skip
+    """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    sensor : Sensor
+        As described: how thick the sheet is.
+    frame, line, centre_px, amplitude : (N,)
+        The stripes of a scan; see `uwlts.scan.FoundStripes`.
+    medium_index : float
+    stage_mm : (F,)
+        Position of every image.
+    stage_direction : (3,)
+        As the capture describes it.
+    """
+    direction = np.array(calibration.stage_direction_of(tuple(stage_direction)))
+    frame_of = calibration.object_transform()
+    across = float(np.array(calibration.sheet.normal) @ frame_of[:3, :3] @ direction)
+    if abs(across) < _LEAST_ACROSS or len(frame) == 0:
+        return np.zeros((len(frame), 3))
+    if not sensor.camera.window.mounted:
+        calibration = calibration.model_copy(update={"window": None})
+    sheet = calibration.sheet
+
+    def points(offset_mm: float) -> np.ndarray:
+        moved = calibration.model_copy(update={"sheet": sheet.model_copy(update={"offset_mm": offset_mm})})
+        found = reconstruct_profile(
+            moved, line, centre_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
+        )
+        return found.points_mm
+
+    on_sheet = points(sheet.offset_mm)
+    per_mm = (points(sheet.offset_mm + _MOVED_MM) - on_sheet) / _MOVED_MM
+    in_camera = on_sheet @ frame_of[:3, :3].T + frame_of[:3, 3]
+    away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
+    slopes = slopes_of_brightness(frame, line, amplitude, stage_mm) / across
+    return per_mm * (slopes * sheet_sigma_mm(sensor.laser, away, medium_index=medium_index) ** 2)[:, None]
+
+
+def slopes_of_brightness(
+    frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray
+) -> np.ndarray:
+    """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where neighbours do not tell it.
+
+    A plane is fitted to the logarithms of all neighbours, so that noise and speckle of the single ones hardly count.
+
+    Parameters
+    ----------
+    frame, line : (N,) int
+    amplitude : (N,)
+        Positive.
+    stage_mm : (F,)
+        Position of every image.
+    """
+    order = np.argsort(stage_mm, kind="stable")
+    rank = np.empty(len(order), np.intp)
+    rank[order] = np.arange(len(order))
+    used = np.unique(rank[frame])
+    row = np.searchsorted(used, rank[frame])
+    position = stage_mm[order][used]
+    step = float(np.median(np.diff(position))) if len(position) > 1 else np.inf
+    reach = int(_REACH_MM / step) if step > 0 else 0
+    if reach < 1:
+        return np.zeros(len(frame))
+    by_stage, _ = _slopes(row, line, np.log(amplitude), position, rows=reach, columns=_LINES)
+    return by_stage
+
+
+def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float) -> np.ndarray:
+    """Standard deviation of the sheet's profile, mm, so far from the laser in a medium, as described.
+
+    Half the 1/e2 radius w, with w^2 = w0^2 (1 + ((z - z0) / zR)^2), zR = pi w0^2 n / (M2 lambda) (Siegman, Lasers, Eqs.
+    17.5 and 17.6, with the beam quality M2).
+    """
+    waist = laser.waist_radius_mm
+    rayleigh = math.pi * waist**2 * medium_index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
+    return 0.5 * waist * np.sqrt(1.0 + ((distance_mm - laser.waist_distance_mm) / rayleigh) ** 2)
+
+
+def moved_by_blur_px(
+    frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, width_px: np.ndarray
+) -> np.ndarray:
+    """How far blur may move stripe centres (N,), px, by their neighbours in the same image.
+
+    A stripe y(x), blurred by the standard deviation b in all directions, is seen at E[y(x - e) A(x - e)] / E[A(x - e)]
+    with e of that deviation: beside y(x) by b^2 (y' (ln A)' + y'' / 2) to second order. The stripe's width squared,
+    less what it owes to leaning, stands for b^2, of which it is the largest possible value.
+    """
+    row = np.unique(frame, return_inverse=True)[1]
+    rows = np.arange(row.max() + 1.0)
+    _, lean = _slopes(row, line, centre_px, rows, rows=0, columns=_BEND_LINES)
+    _, bend = _slopes(row, line, lean, rows, rows=0, columns=_BEND_LINES)
+    _, fading = _slopes(row, line, np.log(amplitude), rows, rows=0, columns=_LINES)
+    variance = (width_px / FWHM_PER_SIGMA) ** 2 / (1.0 + lean**2)
+    return variance * (lean * fading + 0.5 * bend)
+
+
+def _slopes(
+    row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int, columns: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes (N,) by position and by column of planes fitted to the values within so many rows and columns."""
+    first = column.min()
+    shape = len(position), int(column.max() - first) + 1
+    there, z = np.zeros(shape), np.zeros(shape)
+    there[row, column - first] = 1.0
+    z[row, column - first] = values - values.mean()
+    size = 2 * rows + 1, 2 * columns + 1
+    s = np.broadcast_to((position - position.mean())[:, None], shape)
+    x = np.broadcast_to(np.arange(shape[1]) - 0.5 * shape[1], shape)
+
+    def mean(of: np.ndarray) -> np.ndarray:
+        return uniform_filter(there * of, size, mode="constant") / share
+
+    share = np.maximum(uniform_filter(there, size, mode="constant"), 0.5 / (size[0] * size[1]))
+    ms, mx, mz = mean(s), mean(x), mean(z)
+    ss, xx, sx = mean(s * s) - ms * ms, mean(x * x) - mx * mx, mean(s * x) - ms * mx
+    sz, xz = mean(s * z) - ms * mz, mean(x * z) - mx * mz
+    wide = (share > _LEAST_SHARE) & (xx > 1.0)
+    # Neighbours in a row, or in the same images only, tell nothing of the slope across it.
+    steps = np.median(np.diff(position)) if len(position) > 1 else 1.0
+    deep = wide & (ss > 0.15 * steps**2) & (ss * xx - sx * sx > 1e-3 * ss * xx)
+    by_position, by_column = np.zeros(shape), np.zeros(shape)
+    np.divide(sz * xx - xz * sx, ss * xx - sx * sx, out=by_position, where=deep)
+    np.divide(xz, xx, out=by_column, where=wide)
+    return by_position[row, column - first], by_column[row, column - first]
