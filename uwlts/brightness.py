@@ -39,8 +39,8 @@ _MOVED_MM = 0.05
 
 
 def beside_sheet(
-    calibration: Calibration, sensor: Sensor, frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray,
-    amplitude: np.ndarray, *, medium_index: float, stage_mm: np.ndarray, stage_direction: Sequence[float],
+    calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, slopes: np.ndarray, *,
+    medium_index: float, stage_direction: Sequence[float],
 ) -> np.ndarray:  # fmt: skip
     """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
 
@@ -49,25 +49,26 @@ def beside_sheet(
     calibration : Calibration
     sensor : Sensor
         As described: how thick the sheet is.
-    frame, line, centre_px, amplitude : (N,)
-        The stripes of a scan; see `uwlts.scan.FoundStripes`.
+    line, centre_px : (N,)
+        Stripe centres.
+    slopes : (N,)
+        Of the brightness; see `slopes_of_brightness`.
     medium_index : float
-    stage_mm : (F,)
-        Position of every image.
     stage_direction : (3,)
         As the capture describes it.
     """
     direction = np.array(calibration.stage_direction_of(tuple(stage_direction)))
-    frame_of = calibration.object_transform()
-    across = float(np.array(calibration.sheet.normal) @ frame_of[:3, :3] @ direction)
-    if abs(across) < _LEAST_ACROSS or len(frame) == 0:
-        return np.zeros((len(frame), 3))
-    if not sensor.camera.window.mounted:
-        calibration = calibration.model_copy(update={"window": None})
+    frame = calibration.object_transform()
+    across = float(np.array(calibration.sheet.normal) @ frame[:3, :3] @ direction)
+    if abs(across) < _LEAST_ACROSS or not slopes.any():
+        return np.zeros((len(slopes), 3))
     sheet = calibration.sheet
+    window = calibration.window if sensor.camera.window.mounted else None
 
     def points(offset_mm: float) -> np.ndarray:
-        moved = calibration.model_copy(update={"sheet": sheet.model_copy(update={"offset_mm": offset_mm})})
+        moved = calibration.model_copy(
+            update={"sheet": sheet.model_copy(update={"offset_mm": offset_mm}), "window": window}
+        )
         found = reconstruct_profile(
             moved, line, centre_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
         )
@@ -75,10 +76,10 @@ def beside_sheet(
 
     on_sheet = points(sheet.offset_mm)
     per_mm = (points(sheet.offset_mm + _MOVED_MM) - on_sheet) / _MOVED_MM
-    in_camera = on_sheet @ frame_of[:3, :3].T + frame_of[:3, 3]
+    in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
     away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
-    slopes = slopes_of_brightness(frame, line, amplitude, stage_mm) / across
-    return per_mm * (slopes * sheet_sigma_mm(sensor.laser, away, medium_index=medium_index) ** 2)[:, None]
+    sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
+    return per_mm * (slopes / across * sigma**2)[:, None]
 
 
 def slopes_of_brightness(

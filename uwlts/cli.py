@@ -79,19 +79,20 @@ def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", ove
     Parameters
     ----------
     file
-        Capture (.h5) or cloud (.ply).
+        Capture (.h5) or cloud (.ply or .h5).
     out
-        New folder for a capture; for a cloud a file whose ending names the format: .ply, .xyz (text), .laz or .e57.
+        New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
+        .e57.
     images
         Format of a capture's images; both keep all bits.
     overwrite
         Replace an existing cloud.
     """
     from uwlts.capture import Capture
-    from uwlts.cloud import read_cloud
+    from uwlts.cloud import is_cloud, read_cloud
     from uwlts.exporting import export_capture, export_cloud
 
-    if file.suffix.lower() == ".ply":
+    if is_cloud(file):
         cloud = read_cloud(file)
         export_cloud(cloud, out, overwrite=overwrite)
         print(f"wrote {out} with {len(cloud)} points")
@@ -233,8 +234,9 @@ def calibrate(
     air: Files = (),
     water: Files = (),
     step: Files = (),
-    spheres: Files = (),
+    scan: Files = (),
     new_water: Flag = False,
+    unknown_sizes: Flag = False,
     joint: Flag = False,
     live: Path | None = None,
     out: Path,
@@ -267,10 +269,13 @@ def calibrate(
         The same in the medium of use, seen through the window, whose distance is found with all else.
     step
         Captures of the step standard in the medium of use; without any in it the calibration is for air only.
-    spheres
-        Scans of a sphere standard: they tell the stage's direction and, by the spheres' sizes, the water's index.
+    scan
+        Scans of spheres, a plane or a pipe that stand still: what is round tells the stage's direction and the water's
+        index, the better where its size is known; a plane tells what bends it.
     new_water
-        The spheres were scanned in other water than the target, or on another day: find its index for itself.
+        The scans were taken in other water than the target, or on another day: find its index for itself.
+    unknown_sizes
+        Take diameters and spacings of what was scanned for unknown, whatever uncertainty its description states.
     joint
         Estimate all together; what is known before and how well is the sensor's description's.
     live
@@ -319,7 +324,7 @@ def calibrate(
         require_index(index)
     refuse_unsuitable(out, overwrite=overwrite)
     if live is not None:
-        if air or water or step or spheres:
+        if air or water or step or scan:
             raise DescriptionError("--live records its own captures: give either it, or --air, --water and --step")
         air, water, step, poses = _led_through(
             live, out, camera=camera, stage=stage, port=port, resume=resume, overwrite=overwrite and not resume,
@@ -327,24 +332,27 @@ def calibrate(
         )  # fmt: skip
     elif not (air or water):
         raise DescriptionError("nothing to calibrate from: give --air or --water with captures of a target, or --live")
+    if (new_water or unknown_sizes) and not scan:
+        raise DescriptionError("--new-water and --unknown-sizes tell of scans: give these with --scan")
     options = CalibrationOptions(
         refractions=refractions, poses=poses, camera=CameraOptions(distortion=distortion), medium_index=index,
-        same_water=not new_water, stripe=StripeOptions(method=method) if method else StripeOptions(),
+        same_water=not new_water, sizes_known=not unknown_sizes,
+        stripe=StripeOptions(method=method) if method else StripeOptions(),
     )  # fmt: skip
     with ExitStack() as stack, progress_bar("calibrating") as progress:
         air_captures = [stack.enter_context(Capture(path)) for path in air]
         step_captures = [stack.enter_context(Capture(path)) for path in step]
         water_captures = [stack.enter_context(Capture(path)) for path in water]
-        sphere_captures = [stack.enter_context(Capture(path)) for path in spheres]
+        scan_captures = [stack.enter_context(Capture(path)) for path in scan]
 
         def report(stage: str, done: int, total: int) -> None:
             progress(done, total)
 
         result = (
             calibrate_jointly(
-                [*air_captures, *water_captures], step_captures, sphere_captures, options=options, progress=report
+                [*air_captures, *water_captures], step_captures, scan_captures, options=options, progress=report
             )
-            if water or joint or spheres
+            if water or joint or scan
             else solve(air_captures, step_captures, options=options, progress=report)
         )
     write_calibration(out, result.calibration, overwrite=overwrite)
@@ -354,6 +362,155 @@ def calibrate(
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(f"wrote {out}")
+
+
+@app.command
+def refresh(
+    calibration: Path,
+    *,
+    step: Files,
+    out: Path | None = None,
+    index: float | None = None,
+    index_std: float | None = None,
+    method: Method | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Carry a joint calibration over to new water, or water of another temperature, by images of a step in it.
+
+    All that the calibration found, correlations included, is what is known before; the new water's index is found
+    besides. The images of the calibration are not needed.
+
+    Example: uwlts refresh calibration.json --step step-today.h5 --out today.json
+
+    Parameters
+    ----------
+    calibration
+        Joint calibration of the sensor.
+    step
+        Captures of the step standard in the new water.
+    out
+        Calibration to write; CALIBRATION.refreshed.json unless given.
+    index
+        Refractive index of the new water as far as it is known, in place of the one that follows from the captures.
+    index_std
+        How well that index is known before (standard uncertainty), in place of what follows from the sensor's
+        description; 0.001 where hardly anything is known of the water.
+    method
+        How the stripe's centre is found.
+    overwrite
+        Replace an existing file.
+    """
+    from contextlib import ExitStack
+
+    from uwlts.calibration.joint.advice import advice_lines
+    from uwlts.calibration.joint.refresh import refresh as refreshed
+    from uwlts.calibration.model import read_calibration, write_calibration
+    from uwlts.calibration.procedure import CalibrationOptions
+    from uwlts.capture import Capture
+    from uwlts.scan import require_index
+    from uwlts.stripe import StripeOptions
+
+    if index is not None:
+        require_index(index)
+    path = out or calibration.with_name(f"{calibration.stem}.refreshed.json")
+    refuse_unsuitable(path, overwrite=overwrite)
+    known = read_calibration(calibration)
+    options = CalibrationOptions(medium_index=index, stripe=StripeOptions(method=method) if method else StripeOptions())
+    with ExitStack() as stack, progress_bar("refreshing") as progress:
+        captures = [stack.enter_context(Capture(each)) for each in step]
+        result = refreshed(
+            known, captures, options=options, index_std=index_std,
+            progress=lambda stage, done, total: progress(done, total),
+        )  # fmt: skip
+    write_calibration(path, result.calibration, overwrite=overwrite)
+    print("\n".join(line for change in result.changes for line in change.lines()))
+    print("\n".join(advice_lines(result.calibration)))
+    for warning in result.warnings:
+        _warn(warning)
+    print(f"wrote {path}")
+
+
+@app.command
+def models(
+    *,
+    air: Files = (),
+    water: Files = (),
+    step: Files = (),
+    out: Path | None = None,
+    poses: Literal["stage", "free"] = "stage",
+    index: float | None = None,
+    method: Method | None = None,
+    workers: int | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Compare models of the sensor by how well each predicts images that its calibration has not seen.
+
+    One refraction or two, window tilted or not, sheet with bow or turned by the laser's window or not, distortion:
+    each model is calibrated without every fourth image, and without the nearest and the farthest ones.
+
+    Example: uwlts models --air target-air.h5 --water target-water.h5 --step step-*.h5 --out models.html
+
+    Parameters
+    ----------
+    air
+        Captures of the target in air, as for uwlts calibrate.
+    water
+        The same in the medium of use.
+    step
+        Captures of the step standard in the medium of use.
+    out
+        Page to write, with the figures as JSON beside it.
+    poses
+        stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
+    index
+        Refractive index of the medium, in place of the one that follows from the captures.
+    method
+        How the stripe's centre is found.
+    workers
+        Models calibrated at a time; as many as there are processors unless given.
+    overwrite
+        Replace existing files.
+    """
+    from contextlib import ExitStack
+
+    from uwlts.calibration.model_choice import (
+        compare_models,
+        content_of,
+        lines_of,
+        refuse_unsuitable_outputs,
+        write_models,
+    )
+    from uwlts.calibration.procedure import CalibrationOptions
+    from uwlts.capture import Capture
+    from uwlts.scan import require_index
+    from uwlts.stripe import StripeOptions
+
+    if index is not None:
+        require_index(index)
+    if workers is not None and workers < 1:
+        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    if not (air or water):
+        raise DescriptionError("nothing to compare models by: give --air or --water with captures of a target")
+    if out is not None:
+        refuse_unsuitable_outputs(out, overwrite=overwrite)
+    options = CalibrationOptions(
+        poses=poses, medium_index=index, stripe=StripeOptions(method=method) if method else StripeOptions()
+    )
+    with ExitStack() as stack:
+        targets = [stack.enter_context(Capture(path)) for path in (*air, *water)]
+        steps = [stack.enter_context(Capture(path)) for path in step]
+        progress = stack.enter_context(progress_bar("comparing models"))
+        comparison = compare_models(
+            targets, steps, options=options, workers=workers, progress=progress,
+            searched=lambda stage, done, total: progress(done, total),
+        )  # fmt: skip
+    content = content_of(comparison)
+    print("\n".join(lines_of(content)))
+    for warning in comparison.warnings:
+        _warn(warning)
+    if out is not None:
+        write_models(out, content, overwrite=overwrite)
+        print(f"wrote {out} and {out.with_suffix('.json').name}")
 
 
 @app.command
@@ -533,7 +690,8 @@ def reconstruct(
     calibration
         Calibration of the sensor, or one by polynomials.
     out
-        Cloud to write (PLY with intensity, frame and line of every point, and by a joint calibration its uncertainty).
+        Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and by a joint
+        calibration its uncertainty.
     index
         Refractive index of the medium, in place of the one that follows from the capture.
     method
@@ -586,7 +744,7 @@ def evaluate(
     Parameters
     ----------
     cloud
-        Point cloud.
+        Point cloud (.ply or .h5).
     out
         Evaluation to write (JSON).
     artefact
@@ -666,7 +824,8 @@ def report(
 ) -> None:
     """Gather a campaign's files into one page with pictures, a summary and a table on the terminal.
 
-    The folder holds captures NAME.h5, coloured clouds NAME.ply, evaluations NAME.evaluation.json and calibrations.
+    The folder holds captures NAME.h5, coloured clouds NAME.ply (or .h5), evaluations NAME.evaluation.json and
+    calibrations.
 
     Example: uwlts report runs/demo --reference thesis
 

@@ -1,17 +1,19 @@
-"""A measured point cloud, and its file: binary PLY that CloudCompare and MeshLab open with all scalar fields."""
+"""A measured point cloud, and its file: HDF5, or binary PLY that CloudCompare and MeshLab open with all its fields."""
 
 import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from uwlts.cloud_hdf5 import FORMAT, read_arrays, write_arrays
 from uwlts.errors import CaptureError
+from uwlts.file_label import format_of
 from uwlts.files import written_aside
 from uwlts.uncertainty.points import PAIRS, PointUncertainty
 
@@ -19,6 +21,7 @@ NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
 
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
+_PER_POINT = ("points_mm", "intensity", "frame", "line")
 _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
@@ -87,18 +90,22 @@ class PointCloud:
 
 
 def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
-    """Write a cloud as binary little-endian PLY, whole or not at all.
+    """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
 
-    The vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). Where the uncertainty
-    is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to systematic_zz, and
-    pattern0_x, pattern0_y and so on in mm (`PointUncertainty`). The metadata is JSON in numbered comments, short enough
-    for every reader.
+    In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by their names, with systematic_mm2 (N, 6)
+    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). Where
+    the uncertainty is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to
+    systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on (`PointUncertainty`). The
+    metadata is JSON in numbered comments, short enough for every reader.
 
     Raises
     ------
     OutputError
         The file exists and `overwrite` is not set, the folder is missing, the disk is full.
     """
+    if _in_hdf5(path):
+        write_arrays(path, _arrays(cloud), cloud.metadata, overwrite=overwrite)
+        return
     vertices = np.empty(
         len(cloud),
         dtype=[
@@ -121,7 +128,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
-    """Read a cloud from PLY, its own or another program's (x, y, z are enough).
+    """Read a cloud from HDF5 where the path ends with ``.h5``, else from PLY, also another program's (x, y, z suffice).
 
     Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
     missing frame and line are -1, a deviation that is missing or NaN throughout is None.
@@ -129,9 +136,11 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     Raises
     ------
     CaptureError
-        The file is missing, not a PLY file, truncated, without vertices' x, y, z, or its metadata is damaged.
+        The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
     """
     path = Path(path)
+    if _in_hdf5(path):
+        return _from_hdf5(path)
     vertices, comments = _read_ply(path)
     names = vertices.dtype.names or ()
     missing = [axis for axis in "xyz" if axis not in names]
@@ -159,29 +168,68 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
+def is_cloud(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
+    return format_of(path) == FORMAT if _in_hdf5(path) else Path(path).suffix.lower() == ".ply"
+
+
+def _in_hdf5(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".h5"
+
+
+def _arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
+    arrays = {name: getattr(cloud, name) for name in _PER_POINT}
+    if cloud.deviation_mm is not None:
+        arrays["deviation_mm"] = cloud.deviation_mm
+    if cloud.uncertainty is not None:
+        arrays |= {part.name: getattr(cloud.uncertainty, part.name) for part in fields(PointUncertainty)}
+        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
+    return arrays
+
+
+def _from_hdf5(path: Path) -> PointCloud:
+    arrays, metadata = read_arrays(path)
+    names = [part.name for part in fields(PointUncertainty)]
+    wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
+    known = PointUncertainty(**{name: arrays[name] for name in names}) if names[0] in arrays else None
+    try:
+        return PointCloud(
+            **{name: arrays[name] for name in _PER_POINT}, deviation_mm=arrays.get("deviation_mm"), uncertainty=known,
+            metadata=metadata,
+        )  # fmt: skip
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
 def _uncertainty_names(uncertainty: PointUncertainty | None) -> list[str]:
     if uncertainty is None:
         return []
     covariances = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
-    return covariances + [f"pattern{m}_{axis}" for m in range(len(uncertainty.patterns_mm)) for axis in "xyz"]
+    return covariances + _move_names(len(uncertainty.patterns_mm))
+
+
+def _move_names(patterns: int) -> list[str]:
+    return [f"{move}_{axis}" for move in ("position", *(f"pattern{m}" for m in range(patterns))) for axis in "xyz"]
 
 
 def _columns(uncertainty: PointUncertainty) -> np.ndarray:
-    """Columns (12 + 3 M, N) in the order of their names."""
+    """Columns (15 + 3 M, N) in the order of their names."""
     patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
-    return np.vstack([uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, patterns])
+    return np.vstack([uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns])
 
 
 def _uncertainty(names: Sequence[str], column: Callable[[str, float, type], np.ndarray]) -> PointUncertainty | None:
     known = {name.removeprefix("scalar_") for name in names}
     count = sum(f"pattern{m}_x" in known for m in range(len(known)))
-    wanted = [f"random_{pair}" for pair in _PAIR_NAMES]
-    wanted += [f"pattern{m}_{axis}" for m in range(count) for axis in "xyz"]
+    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
     if count == 0 or not known.issuperset(wanted):
         return None
     columns = np.stack([column(name, np.nan, np.float32) for name in wanted])
-    patterns = columns[6:].reshape(count, 3, -1)
-    return PointUncertainty(columns[:6].T.copy(), np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
+    position, patterns = columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
+    return PointUncertainty(columns[:6].T.copy(), position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
 
 
 def _read_only(values: Any, kind: type) -> np.ndarray:

@@ -64,7 +64,7 @@ def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, 
         content |= {"artefact": artefact.model_dump(mode="json"), "evaluation": evaluation.as_dict()}
         content["uncertainty"] = {
             name: {"random_mm": known.random_mm, "systematic_mm": known.systematic_mm, "expanded_mm": known.expanded_mm}
-            for name, known in figure_uncertainties(cloud, artefact, evaluation.figures_mm).items()
+            for name, known in figure_uncertainties(cloud, artefact, evaluation).items()
         }
         deviation = evaluation.deviation_mm
     return Judgement(content, replace(cloud, deviation_mm=deviation))

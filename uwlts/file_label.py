@@ -47,6 +47,16 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
         raise CaptureError(str(error)) from error
 
 
+def format_of(path: str | Path) -> str | None:
+    """What an HDF5 file calls its format; None where it cannot be opened or calls it nothing."""
+    try:
+        # Unlocked, as it may be a recording that goes on.
+        with h5py.File(path, "r", locking=False) as file:
+            return _text(file, "format")
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+        return None
+
+
 def _text(file: h5py.File, name: str) -> str | None:
     """An attribute's text, None where it is missing or something else."""
     if name not in file.attrs:

@@ -11,7 +11,7 @@ from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.calibration.polynomial_model import FORMAT as POLYNOMIAL_FORMAT
 from uwlts.calibration.polynomial_model import PolynomialCalibration, read_polynomials
 from uwlts.capture import Capture
-from uwlts.cloud import PointCloud, read_cloud
+from uwlts.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.evaluate import FORMAT as EVALUATION_FORMAT
 from uwlts.evaluate import read_evaluation
@@ -33,11 +33,11 @@ def describe(name_or_path: str) -> str:
     suffixes = [s for s in path.suffixes if s != ".part"]
     if suffixes[-2:] == [".truth", ".h5"]:
         return "\n".join(truth_lines(*read_truth(path)))
+    if is_cloud(path):
+        return "\n".join(cloud_lines(read_cloud(path)))
     if suffixes[-1:] == [".h5"]:
         with Capture(path) as capture:
             return "\n".join(capture_lines(capture))
-    if suffixes[-1:] == [".ply"]:
-        return "\n".join(cloud_lines(read_cloud(path)))
     if suffixes[-1:] == [".json"]:
         return "\n".join(_json_lines(path))
     if suffixes and suffixes[-1] != ".toml":

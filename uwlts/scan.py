@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.brightness import MOST_BLUR_PX, beside_sheet, moved_by_blur_px
+from uwlts.brightness import MOST_BLUR_PX, beside_sheet, moved_by_blur_px, slopes_of_brightness
 from uwlts.calibration.joint.stored import is_joint
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.polynomial_model import PolynomialCalibration
@@ -181,6 +181,14 @@ def find_stripes(
     return FoundStripes(*(np.concatenate(parts) for parts in (frames, lines, centres, amplitudes, widths)), by_status)
 
 
+def sharp_lines(stripes: FoundStripes) -> np.ndarray:
+    """Numbers (M,) of the stripe centres that blur hardly moves; see `uwlts.brightness`."""
+    if len(stripes.line) == 0:
+        return np.empty(0, np.intp)
+    moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
+    return np.flatnonzero(np.abs(moved) < MOST_BLUR_PX)
+
+
 def reconstruct_capture(
     capture: Capture,
     calibration: AnyCalibration,
@@ -233,7 +241,7 @@ def reconstruct_stripes(
     sharp = np.arange(len(stripes.line))
     exact = isinstance(calibration, Calibration) and is_joint(calibration)
     if exact:
-        sharp = np.flatnonzero(np.abs(_moved_by_blur_px(stripes)) < MOST_BLUR_PX)
+        sharp = sharp_lines(stripes)
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
@@ -272,18 +280,15 @@ def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes
 
 
 def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:
+    """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
     if np.isfinite(capture.pose).any():
         return np.zeros((len(stripes.line), 3))
+    slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm[:])
+    header = capture.header
     return beside_sheet(
-        calibration, capture.header.sensor, stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude,
-        medium_index=index, stage_mm=capture.stage_mm[:], stage_direction=capture.header.stage_direction,
+        calibration, header.sensor, stripes.line, stripes.centre_px, slopes, medium_index=index,
+        stage_direction=header.stage_direction,
     )  # fmt: skip
-
-
-def _moved_by_blur_px(stripes: FoundStripes) -> np.ndarray:
-    if len(stripes.line) == 0:
-        return np.empty(0)
-    return moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
 
 
 def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:

@@ -412,22 +412,23 @@ class Uncertainty(Description):
     follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
     medium whose index is given. Of the stage: each position, the scale of
     all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
-    its plane when it bends like a dish, and the height of the steps.
+    its plane when it bends like a dish, and the height of the steps. What is said to be zero is not estimated but
+    held as described.
     """
 
-    window_distance_mm: Positive = 5.0
-    window_tilt_deg: Positive = 0.5
-    glass_thickness_mm: Positive = 0.05
-    glass_index: Positive = 1e-3
-    laser_window_tilt_deg: Positive = 0.5
-    bow_deg: Positive = 0.5
+    window_distance_mm: NotNegative = 5.0
+    window_tilt_deg: NotNegative = 0.5
+    glass_thickness_mm: NotNegative = 0.05
+    glass_index: NotNegative = 1e-3
+    laser_window_tilt_deg: NotNegative = 0.5
+    bow_deg: NotNegative = 0.5
     temperature_k: Positive = 1.0
     drift_k: NotNegative = 0.2
     index: Positive = 1e-4
     stage_position_mm: Positive = 0.005
-    stage_scale: Positive = 1e-4
+    stage_scale: NotNegative = 1e-4
     stage_alignment_deg: Positive = 0.5
-    target_bow_mm: Positive = 0.03
+    target_bow_mm: NotNegative = 0.03
     step_height_mm: Positive = 0.01
 
 

@@ -88,10 +88,10 @@ def verify(capture: Capture, calibration: AnyCalibration, *, limit_mm: float | N
         raise EvaluationError(f"{capture.path.name} does not say what it shows: its header needs an artefact")
     artefact = parse_artefact(capture.header.artefact)
     cloud = reconstruct_capture(capture, calibration, with_uncertainty=joint).cloud
-    figures = evaluate_cloud(cloud, artefact).figures_mm
-    known = figure_uncertainties(cloud, artefact, figures)
+    evaluation = evaluate_cloud(cloud, artefact)
+    known = figure_uncertainties(cloud, artefact, evaluation)
     verdicts = []
-    for figure, error in figures.items():
+    for figure, error in evaluation.figures_mm.items():
         quantity = calibrated_quantity(figure, artefact)
         if quantity is not None and "known radius" not in figure:
             measurement = known[figure].expanded_mm if figure in known else None

@@ -217,6 +217,7 @@ def test_version(command, program: str):
         ("uwlts calibrate --air air.h5 --out x.json --refractions 3", "3"),
         ("uwlts calibrate --air air.h5 --out x.json --poses wild", "wild"),
         ("uwlts calibrate --air air.h5 --out x.json --distortion k9", "k9"),
+        ("uwlts calibrate --water scan.h5 --out x.json --new-water", "--scan"),
         ("uwlts polynomials --out x.json", "--target"),
         ("uwlts polynomials --target air.h5", "--out"),
         ("uwlts polynomials --target air.h5 --out x.json --degree six", "six"),

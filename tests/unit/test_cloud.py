@@ -3,17 +3,25 @@
 import errno
 import os
 import resource
+from dataclasses import fields
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
-from uwlts.cloud import PointCloud, read_cloud, write_cloud
+from tests.system.in_process import uwlts
+from tests.unit import drawn_stripes
+from uwlts.capture import Capture
+from uwlts.cloud import PointCloud, is_cloud, read_cloud, write_cloud
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files import written_aside
+from uwlts.uncertainty.points import PointUncertainty
+
+KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
 
 
 def some_cloud(count: int = 40, **changes) -> PointCloud:
@@ -29,26 +37,121 @@ def some_cloud(count: int = 40, **changes) -> PointCloud:
     return PointCloud(**{**values, **changes})
 
 
-def test_a_cloud_comes_back_bit_by_bit(tmp_path):
-    cloud = some_cloud()
-    write_cloud(tmp_path / "a.ply", cloud)
-    back = read_cloud(tmp_path / "a.ply")
+def some_uncertainty(count: int = 40, patterns: int = 3) -> PointUncertainty:
+    rng = np.random.default_rng(5)
+    shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3)}
+    names = [part.name for part in fields(PointUncertainty)]
+    return PointUncertainty(**{n: rng.normal(size=shapes.get(n, (count, 3))).astype(np.float32) for n in names})
+
+
+@KINDS
+def test_a_cloud_comes_back_bit_by_bit(tmp_path, name):
+    cloud = some_cloud(uncertainty=some_uncertainty())
+    write_cloud(tmp_path / name, cloud)
+    back = read_cloud(tmp_path / name)
     assert len(back) == 40
-    for name, kind in (
+    for field, kind in (
         ("points_mm", np.float64), ("intensity", np.float32), ("frame", np.int32),
         ("line", np.int32), ("deviation_mm", np.float32),
     ):  # fmt: skip
-        assert getattr(back, name).dtype == kind
-        np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
+        assert getattr(back, field).dtype == kind
+        np.testing.assert_array_equal(getattr(back, field), getattr(cloud, field))
+    for part in fields(PointUncertainty):
+        found = getattr(back.uncertainty, part.name)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, getattr(cloud.uncertainty, part.name))
     assert back.metadata == cloud.metadata
-    assert os.listdir(tmp_path) == ["a.ply"]
+    assert os.listdir(tmp_path) == [name]
+    assert is_cloud(tmp_path / name)
 
 
-def test_a_cloud_without_points_or_deviation_comes_back(tmp_path):
-    write_cloud(tmp_path / "none.ply", PointCloud(np.zeros((0, 3)), [], [], []))
-    assert len(read_cloud(tmp_path / "none.ply")) == 0
-    write_cloud(tmp_path / "a.ply", some_cloud(deviation_mm=None))
-    assert read_cloud(tmp_path / "a.ply").deviation_mm is None
+@KINDS
+def test_a_cloud_without_points_deviation_or_uncertainty_comes_back(tmp_path, name):
+    write_cloud(tmp_path / f"none-{name}", PointCloud(np.zeros((0, 3)), [], [], []))
+    assert len(read_cloud(tmp_path / f"none-{name}")) == 0
+    write_cloud(tmp_path / name, some_cloud(deviation_mm=None))
+    back = read_cloud(tmp_path / name)
+    assert back.deviation_mm is None
+    assert back.uncertainty is None
+
+
+def test_both_files_hold_the_systematic_covariance_for_other_programs(tmp_path):
+    cloud = some_cloud(uncertainty=some_uncertainty())
+    for name in ("a.ply", "a.h5"):
+        write_cloud(tmp_path / name, cloud)
+    vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    pairs = [f"systematic_{pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")]
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert dict(file.attrs)["format"] == b"uwlts-cloud"
+        np.testing.assert_array_equal(file["systematic_mm2"], np.stack([vertices[pair] for pair in pairs], axis=1))
+
+
+def test_captures_and_clouds_in_hdf5_are_told_apart(tmp_path):
+    capture = drawn_stripes.write(tmp_path / "capture.h5", [])
+    write_cloud(tmp_path / "cloud.h5", some_cloud())
+    assert not is_cloud(capture)
+    with pytest.raises(CaptureError, match=r"its format is 'uwlts-capture', expected 'uwlts-cloud'"):
+        read_cloud(capture)
+    with pytest.raises(CaptureError, match=r"its format is 'uwlts-cloud', expected 'uwlts-capture'"):
+        Capture(tmp_path / "cloud.h5")
+
+
+def test_a_cloud_in_hdf5_goes_through_the_commands(tmp_path):
+    write_cloud(tmp_path / "a.h5", some_cloud(uncertainty=some_uncertainty()))
+    assert "cloud of 40 points from 6 frames" in uwlts("info", tmp_path / "a.h5").stdout
+    assert uwlts("export", tmp_path / "a.h5", "--out", tmp_path / "b.ply").returncode == 0
+    assert uwlts("export", tmp_path / "b.ply", "--out", tmp_path / "c.h5").returncode == 0
+    back = read_cloud(tmp_path / "c.h5")
+    np.testing.assert_array_equal(back.points_mm, some_cloud().points_mm)
+    np.testing.assert_array_equal(back.uncertainty.patterns_mm, some_uncertainty().patterns_mm)
+    refused = uwlts("export", drawn_stripes.write(tmp_path / "d.h5", []), "--out", tmp_path / "d.h5")
+    assert refused.returncode == 2
+
+
+def _without(name):
+    def damage(file):
+        del file[name]
+
+    return damage
+
+
+def _text_for(name):
+    def damage(file):
+        del file[name]
+        file[name] = np.array([b"one"] * 40)
+
+    return damage
+
+
+def _shorter(file):
+    values = file["frame"][:-1]
+    del file["frame"]
+    file["frame"] = values
+
+
+def _newer(file):
+    file.attrs["version"] = 99
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_without("line"), "has no line"),
+        (_without("random_mm2"), "has no random_mm2"),
+        (_text_for("intensity"), "intensity are no numbers"),
+        (_shorter, "frame has the shape"),
+        (_newer, "has version 99"),
+        (lambda file: file.create_group("more"), "not a complete HDF5 file of a cloud"),
+    ],
+)
+def test_a_damaged_cloud_in_hdf5_is_refused(tmp_path, damage, message):
+    path = tmp_path / "damaged.h5"
+    write_cloud(path, some_cloud(uncertainty=some_uncertainty()))
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(CaptureError, match=message) as refusal:
+        read_cloud(path)
+    assert "damaged.h5" in str(refusal.value)
 
 
 JSON = st.recursive(
@@ -68,8 +171,9 @@ def test_any_metadata_comes_back_through_short_ascii_lines(tmp_path_factory, met
     # The run of blanks puts every kind of character at the end of a comment.
     metadata = {**metadata, "blanks": "x" + " " * blanks + "\n"}
     path = tmp_path_factory.mktemp("metadata") / "a.ply"
-    write_cloud(path, some_cloud(3, metadata=metadata))
-    assert read_cloud(path).metadata == metadata
+    for each in (path, path.with_suffix(".h5")):
+        write_cloud(each, some_cloud(3, metadata=metadata))
+        assert read_cloud(each).metadata == metadata
     header = path.read_bytes().split(b"end_header\n")[0]
     # rply, the reader of CloudCompare and others, refuses comments of 1024 characters.
     assert max(len(line) for line in header.split(b"\n")) < 1024
@@ -109,14 +213,15 @@ def test_fields_saved_again_by_cloudcompare_are_recognised(tmp_path):
     assert (cloud.intensity[0], cloud.frame[0], cloud.line[0]) == (0.5, 7, 9)
 
 
-def test_every_truncation_is_refused(tmp_path):
-    write_cloud(tmp_path / "a.ply", some_cloud())
-    whole = (tmp_path / "a.ply").read_bytes()
+@KINDS
+def test_every_truncation_is_refused(tmp_path, name):
+    write_cloud(tmp_path / name, some_cloud())
+    whole, cut = (tmp_path / name).read_bytes(), tmp_path / f"cut-{name}"
     checked = 0
     for length in range(0, len(whole), 11):
-        (tmp_path / "cut.ply").write_bytes(whole[:length])
-        with pytest.raises(CaptureError, match=r"cut\.ply"):
-            read_cloud(tmp_path / "cut.ply")
+        cut.write_bytes(whole[:length])
+        with pytest.raises(CaptureError, match=cut.name):
+            read_cloud(cut)
         checked += 1
     assert checked > 150
 
@@ -165,8 +270,9 @@ def test_what_is_no_cloud_is_refused(tmp_path, content, message):
 
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    with pytest.raises(CaptureError, match="does not exist"):
-        read_cloud(tmp_path / "none.ply")
+    for name in ("none.ply", "none.h5"):
+        with pytest.raises(CaptureError, match="does not exist"):
+            read_cloud(tmp_path / name)
     with pytest.raises(CaptureError, match="cannot be read"):
         read_cloud(tmp_path)
 
@@ -194,8 +300,9 @@ def test_a_cloud_cannot_be_changed_through_its_arrays():
         cloud.points_mm[0] = 0
 
 
-def test_existing_files_are_refused_unless_overwriting_is_asked_for(tmp_path):
-    path = tmp_path / "a.ply"
+@KINDS
+def test_existing_files_are_refused_unless_overwriting_is_asked_for(tmp_path, name):
+    path = tmp_path / name
     write_cloud(path, some_cloud())
     with pytest.raises(OutputError, match="exists already"):
         write_cloud(path, some_cloud(3))
@@ -204,18 +311,19 @@ def test_existing_files_are_refused_unless_overwriting_is_asked_for(tmp_path):
     assert len(read_cloud(path)) == 3
 
 
-def test_a_write_that_the_system_cuts_short_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.ply"
+@KINDS
+def test_a_write_that_the_system_cuts_short_leaves_the_old_file(tmp_path, name):
+    path = tmp_path / name
     write_cloud(path, some_cloud(3))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
     try:
-        with pytest.raises(OutputError, match=r"cannot write .*a\.ply"):
+        with pytest.raises(OutputError, match=f"cannot write .*{name}"):
             write_cloud(path, some_cloud(5000), overwrite=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert len(read_cloud(path)) == 3
-    assert os.listdir(tmp_path) == ["a.ply"]
+    assert os.listdir(tmp_path) == [name]
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, ValueError, SystemExit])

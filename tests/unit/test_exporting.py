@@ -183,7 +183,7 @@ def test_what_exists_stays_and_nothing_is_made_of_nothing(tmp_path: Path, suffix
 
 
 def test_unknown_endings_are_refused(tmp_path: Path):
-    with pytest.raises(OutputError, match=r"ends with none of .ply, .xyz, .laz, .e57"):
+    with pytest.raises(OutputError, match=r"ends with none of .ply, .h5, .xyz, .laz, .e57"):
         export_cloud(a_cloud(), tmp_path / "a.obj")
 
 

@@ -170,4 +170,4 @@ def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
 )
 def test_angles_are_told_in_degrees(name, value, words):
     std = np.tan(np.radians(0.5)) if "slope" in name else np.radians(0.5)
-    assert off_as_words(name, value, 0.0, std).startswith(words)
+    assert off_as_words(name, value, 0.0, std, sigmas=6.0).startswith(words)

@@ -56,9 +56,10 @@ class CalibrationOptions:
     medium_index : float, optional
         Replaces the index of the medium of the step images.
     same_water : bool
-        Jointly: whether scans of spheres were taken in the same water as the target, not only in one described alike.
+        Jointly: whether scans were taken in the same water as the target, not only in one described alike.
     sizes_known : bool
-        Jointly: whether the spheres' diameters count as calibrated; they are estimated otherwise.
+        Jointly: whether diameters and spacings of what was scanned count as calibrated where their uncertainty is
+        stated; they are estimated otherwise.
     bounds_mm : (low, high), optional
         Window distances to search.
     """
@@ -370,7 +371,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
     return warnings
 
 
-def sources_of(air: Sequence[Capture], steps: Sequence[Capture], spheres: Sequence[Capture] = ()) -> dict[str, Any]:
+def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, Any]:
     """What a calibration was made from, by what and when, for its provenance."""
     return {
         "source": "calibration from captures",
@@ -378,5 +379,5 @@ def sources_of(air: Sequence[Capture], steps: Sequence[Capture], spheres: Sequen
         "software": f"uwlts {uwlts.__version__}",
         "air_captures": [source_of(capture) for capture in air],
         "step_captures": [source_of(capture) for capture in steps],
-        "sphere_captures": [source_of(capture) for capture in spheres],
+        "scan_captures": [source_of(capture) for capture in scans],
     }

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.observations import STEP, STRIPE
-from uwlts.calibration.joint.sphere_scans import SPHERE
 from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.surfaces import SCANNED
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_between, points_at
 from uwlts.calibration.model import Calibration
 from uwlts.sensor import Uncertainty
@@ -61,7 +61,7 @@ def in_use(calibration: Calibration, region: Region) -> InUse:
         drift = region.medium.index_per_kelvin(calibration.wavelength_nm) * uncertainty.drift_k
         covariance[place, place] += drift**2
     scatter = calibration.residuals["joint"]["scatter_px"]
-    noise = next((scatter[kind] for kind in (STRIPE, STEP, SPHERE) if kind in scatter), 0.0)
+    noise = next((scatter[kind] for kind in (STRIPE, STEP, *SCANNED) if kind in scatter), 0.0)
     return InUse(calibration, region, known, covariance, uncertainty, noise)
 
 

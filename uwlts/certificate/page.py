@@ -84,7 +84,7 @@ def certificate_page(
         c=content,
         captures=[
             *content["made_from"].get("air_captures", []), *content["made_from"].get("step_captures", []),
-            *content["made_from"].get("sphere_captures", []),
+            *content["made_from"].get("scan_captures", []),
         ],
         warnings=content["made_from"].get("warnings", []),
         known_before=content["made_from"].get("known_before", {}),

@@ -1,4 +1,4 @@
-"""A point cloud in the formats of other programs: PLY, XYZ, LAZ, E57."""
+"""A point cloud in the formats of other programs: PLY, HDF5, XYZ, LAZ, E57."""
 
 from importlib import import_module
 from io import BytesIO
@@ -12,7 +12,7 @@ from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import OutputError, SetupError
 from uwlts.files import refuse_unsuitable, written_aside
 
-CLOUD_FORMATS = (".ply", ".xyz", ".laz", ".e57")
+CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")
 
 LAZ_STEP_M = 1e-7
 """Coordinates in LAZ are whole multiples of it from the middle of the cloud: 0.1 um, over 214 m to either side."""
@@ -24,7 +24,7 @@ _INTENSITY_LIMITS = 0, 2**16 - 1
 def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> None:
     """Write a cloud in the format that the path's suffix names, whole or not at all.
 
-    - ``.ply``: as `uwlts.cloud.write_cloud`; mm, everything kept.
+    - ``.ply``, ``.h5``: as `uwlts.cloud.write_cloud`; mm, everything kept.
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
       the digits that they have.
     - ``.laz``: LAS 1.4, point format 6, metres in steps of 1e-7 m. The standard intensity is rounded to whole numbers
@@ -46,7 +46,7 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
     if len(cloud) == 0:
         raise OutputError("the cloud has no points: there is nothing to export")
     match suffix:
-        case ".ply":
+        case ".ply" | ".h5":
             write_cloud(path, cloud, overwrite=overwrite)
         case ".xyz":
             _write_xyz(cloud, path, overwrite=overwrite)

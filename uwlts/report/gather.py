@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.capture import Capture, CaptureHeader
-from uwlts.cloud import PointCloud, read_cloud
+from uwlts.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.errors import CaptureError
 from uwlts.report.judged import Judged, read_judged
 from uwlts.scan import calibration_digest
@@ -110,7 +110,7 @@ class Campaign:
 def gather_campaign(folder: str | Path) -> Campaign:
     """Read a campaign's folder.
 
-    Captures are ``NAME.h5`` with their truth ``NAME.truth.h5``, clouds ``NAME.ply``, evaluations
+    Captures are ``NAME.h5`` with their truth ``NAME.truth.h5``, clouds ``NAME.ply`` or ``.h5``, evaluations
     ``NAME.evaluation.json``, calibrations ``calibration*.json``, times ``seconds.json``. A cloud names its capture in
     its metadata; otherwise the capture of the same name is taken.
 
@@ -122,15 +122,16 @@ def gather_campaign(folder: str | Path) -> Campaign:
     folder = Path(folder)
     if not folder.is_dir():
         raise CaptureError(f"there is no folder {folder}; give the folder that holds the campaign's files")
-    captures = {path.name: _capture(path) for path in _files(folder, "*.h5", but=_TRUTH)}
+    in_hdf5 = list(_files(folder, "*.h5", but=_TRUTH))
+    captures = {path.name: _capture(path) for path in in_hdf5 if not is_cloud(path)}
     calibrations = [_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)]
     calibrations.sort(key=lambda found: (len(found.name), found.name))
-    clouds = {path.stem: read_cloud(path) for path in _files(folder, "*.ply")}
+    clouds = {path.stem: read_cloud(path) for path in [*filter(is_cloud, in_hdf5), *_files(folder, "*.ply")]}
     judged = {path.name.removesuffix(_EVALUATION): read_judged(path) for path in _files(folder, f"*{_EVALUATION}")}
     if not (clouds or judged or calibrations):
         raise CaptureError(
-            f"{folder} holds {len(captures)} captures, but no cloud (.ply), evaluation ({_EVALUATION}) or calibration "
-            "(calibration*.json): reconstruct and evaluate first"
+            f"{folder} holds {len(captures)} captures, but no cloud (.ply or .h5), evaluation ({_EVALUATION}) or "
+            "calibration (calibration*.json): reconstruct and evaluate first"
         )
     by_digest = {calibration.digest: calibration for calibration in calibrations}
     measurements = []

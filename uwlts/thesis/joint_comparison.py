@@ -32,7 +32,10 @@ Progress = Callable[[int, int], None]
 
 
 def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
-    """The joint calibration from all targets and steps of a campaign, kept with the others; the time to solve it in s.
+    """The joint calibration from a campaign, kept with the others; the time to solve it in s.
+
+    Targets, steps, and the scans of spheres in water: these were made in another water than the calibration, whose
+    index their roundness tells. Of their sizes it is told nothing.
 
     Raises
     ------
@@ -41,11 +44,13 @@ def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
     CalibrationError
         The recordings do not determine a calibration, or contradict each other.
     """
-    options = CalibrationOptions(poses="stage")
+    options = CalibrationOptions(poses="stage", same_water=False, sizes_known=False)
     with ExitStack() as stack:
         targets = [stack.enter_context(Capture(folder.target(kind))) for kind in ("bare", "air", "water")]
         steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
-        gathered = gather_jointly(targets, steps, options=options)
+        wet = [scan.path for scan in folder.scans() if scan.thing == "spheres" and scan.medium != "air"]
+        scans = [stack.enter_context(Capture(path)) for path in wet]
+        gathered = gather_jointly(targets, steps, scans, options=options)
     start = time.perf_counter()
     calibration = solve_jointly(gathered, options=options).calibration
     taken_s = time.perf_counter() - start
@@ -84,10 +89,10 @@ def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]
         found: dict[str, Any] = {"placement": scan.placement, "medium": scan.medium}
         for way, calibration in known.items():
             cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=way == JOINT).cloud
-            figures = evaluate_cloud(cloud, artefact).figures_mm
-            found[way] = {name: figures[name] for name in (_SPACING, *_DIAMETERS)}
+            evaluation = evaluate_cloud(cloud, artefact)
+            found[way] = {name: evaluation.figures_mm[name] for name in (_SPACING, *_DIAMETERS)}
             if way == JOINT:
-                std = figure_uncertainties(cloud, artefact, figures)
+                std = figure_uncertainties(cloud, artefact, evaluation)
                 found["std"] = {name: std[name].expanded_mm / 2 for name in found[way]}
     return found
 

@@ -16,18 +16,21 @@ class PointUncertainty:
     ----------
     random_mm2 : (N, 6) float32
         Covariance of each point by the stripe's noise, independent from point to point; see `PAIRS`.
+    position_mm : (N, 3) float32
+        How each point moves for one standard deviation of its image's stage position, independent from image to image.
     patterns_mm : (M, N, 3) float32
-        How each point moves for one standard deviation of each independent part of the calibration, largest first.
+        How each point moves for one standard deviation of what is independent in calibration and stage, largest first.
     """
 
     random_mm2: np.ndarray
+    position_mm: np.ndarray
     patterns_mm: np.ndarray
 
     def systematic_mm2(self) -> np.ndarray:
-        """Covariance (N, 6) of each point by the calibration."""
+        """Covariance (N, 6) of each point by calibration and stage."""
         return np.stack([np.sum(self.patterns_mm[:, :, i] * self.patterns_mm[:, :, j], axis=0) for i, j in PAIRS], 1)
 
     def std_mm(self) -> np.ndarray:
-        """Standard uncertainty (N, 3) of each coordinate, of both kinds together."""
+        """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
         total = self.random_mm2 + self.systematic_mm2()
-        return np.sqrt(total[:, [0, 3, 5]])
+        return np.sqrt(total[:, [0, 3, 5]] + np.square(self.position_mm))

@@ -15,6 +15,7 @@ from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.uncertainty.points import PAIRS, PointUncertainty
+from uwlts.uncertainty.stage import stage_root
 
 _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are not worth their room.
@@ -49,7 +50,8 @@ def point_uncertainty(
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
-    In the OCS, or in the scene where the frames carry poses; what stage or poses add is not in it.
+    In the OCS, or in the scene where the frames carry poses. What the stage does by its positions, scale and direction
+    is part of it, about the middle of its positions; what poses add is not.
 
     Raises
     ------
@@ -65,16 +67,24 @@ def point_uncertainty(
     posed = np.isfinite(capture.pose).all(axis=(1, 2))[:, None, None]
     into_scene = np.where(posed, pose, np.eye(3)) @ calibration.object_transform()[:3, :3].T
     root = _root(known.covariance)
+    stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
+    by_stage = stage_root(known, calibration, header, root)
+    root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     random, moved = [], []
     for start in range(0, len(pixels), _BLOCK):
         here = slice(start, start + _BLOCK)
         by_pixel, by_root = _derivatives(known, pixels[here], COLUMNS.index("uv"[across]), root)
         turned = into_scene[frame[here]]
         by_pixel, by_root = np.einsum("nij,nj->ni", turned, by_pixel), np.einsum("nij,rnj->rni", turned, by_root)
+        by_root += by_stage[:, None] * stage[frame[here], None]
         step = by_pixel * noise[here, None]
         random.append(np.stack([step[:, i] * step[:, j] for i, j in PAIRS], axis=1))
         moved.append(by_root)
-    return PointUncertainty(np.vstack(random).astype(np.float32), _patterns(np.concatenate(moved, axis=1)))
+    along = np.array(header.stage_direction)
+    position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
+    return PointUncertainty(
+        np.vstack(random).astype(np.float32), position.astype(np.float32), _patterns(np.concatenate(moved, axis=1))
+    )
 
 
 def _shared_by_neighbours(calibration: Calibration) -> float:

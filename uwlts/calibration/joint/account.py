@@ -10,7 +10,7 @@ from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.noise import strays
 from uwlts.calibration.joint.observations import TARGET, StepProfileEvidence
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.sphere_scans import SphereScanEvidence
+from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
 
 
 def evidence_figures(
@@ -58,7 +58,7 @@ def evidence_figures(
 def _stripe_pixels(evidence: Evidence, image: int) -> np.ndarray:
     if isinstance(evidence, StepProfileEvidence):
         return evidence.pixels
-    if isinstance(evidence, SphereScanEvidence):
+    if isinstance(evidence, SurfaceScanEvidence):
         return evidence.pixels[evidence.frame == image - evidence.image]
     return evidence.stripe_pixels[evidence.stripe_image == image]
 
@@ -72,11 +72,11 @@ def _covered(result: Estimate, view: View, pixels: np.ndarray, object_frame: np.
         "window": view.window,
         "points": len(at),
         "camera_depth_mm": [float(points[2].min()), float(points[2].max())],
-        "outline_mm": np.round(_outline(at), 3).tolist(),
+        "outline_mm": np.round(outline(at), 3).tolist(),
     }
 
 
-def _outline(at: np.ndarray) -> np.ndarray:
+def outline(at: np.ndarray) -> np.ndarray:
     """Corners (K, 2) of the convex hull; of points on a line its ends."""
     try:
         return at[ConvexHull(at).vertices]

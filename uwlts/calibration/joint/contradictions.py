@@ -14,6 +14,7 @@ from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
 from uwlts.calibration.joint.noise import strays
 from uwlts.calibration.joint.observations import TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.prior_words import off_as_words
+from uwlts.calibration.joint.quantities import quantity_of
 from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor, Uncertainty
 
@@ -92,6 +93,9 @@ def findings(
     contradictions += _of_stage(result, evidence, sources, sensor.uncertainty)
     unlike, unusual = _of_lens(result, sensor)
     contradictions += unlike
+    if not contradictions:
+        contradictions, of_earlier = _of_earlier(result)
+        doubts += of_earlier
     worse, doubtful = _of_images(images)
     contradictions += worse
     contradictions += _of_kinds(images)
@@ -126,8 +130,33 @@ def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
         share = float(np.sqrt(max(std**2 - after**2, (0.1 * std) ** 2)))
         sigmas = abs(value - known) / share
         if sigmas > _DOUBTFUL:
-            (wrong if sigmas > _WRONG else doubtful).append((sigmas, off_as_words(name, value, known, std)))
+            alone = known + (value - known) * (std / share) ** 2
+            words = off_as_words(name, alone, known, std, sigmas=sigmas)
+            (wrong if sigmas > _WRONG else doubtful).append((sigmas, words))
     return [words for _, words in sorted(wrong, reverse=True)], [words for _, words in sorted(doubtful, reverse=True)]
+
+
+def _of_earlier(result: Estimate) -> tuple[list[str], list[str]]:
+    """The parameter that new evidence moves farthest from an earlier calibration; one is named, as many go with it."""
+    earlier = result.parameters.earlier
+    if earlier is None:
+        return [], []
+    before, count = earlier.std(), len(earlier.values)
+    gained = before**2 - np.diag(result.covariance)[:count]
+    sigmas = np.abs(result.values[:count] - earlier.values) / np.sqrt(np.maximum(gained, (0.1 * before) ** 2))
+    worst = int(np.argmax(sigmas))
+    if sigmas[worst] <= _DOUBTFUL:
+        return [], []
+    quantity = quantity_of(result.parameters.names[worst])
+    value, known, std = (quantity.factor * each[worst] for each in (result.values, earlier.values, before))
+    digits = max(0, int(np.ceil(1 - np.log10(std))))
+    words = (
+        f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in the "
+        f"{quantity.words}: {value:.{digits}f} against {known:.{digits}f} +- {std:.2g}{quantity.unit and ' '}"
+        f"{quantity.unit}: check heights and media in the captures; if they are right, the sensor has changed, "
+        "calibrate again"
+    )
+    return ([words], []) if sigmas[worst] > _WRONG else ([], [words])
 
 
 def _of_lens(result: Estimate, sensor: Sensor) -> tuple[list[str], list[str]]:

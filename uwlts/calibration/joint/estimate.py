@@ -9,14 +9,15 @@ from uwlts.calibration.bordered import BorderedFit, Observation, fit_bordered
 from uwlts.calibration.joint.noise import Noise, judged, strays, with_slope_bias
 from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.sphere_scans import SPHERE, SphereScanEvidence
+from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
+from uwlts.calibration.joint.surfaces import SCANNED
 from uwlts.errors import CalibrationError
 from uwlts.sensor import Uncertainty
 
-Evidence = TargetEvidence | StepProfileEvidence | SphereScanEvidence
+Evidence = TargetEvidence | StepProfileEvidence | SurfaceScanEvidence
 Correct = Callable[[Sequence[Evidence], np.ndarray, Sequence[np.ndarray]], list[Evidence]]
 
-_FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3), SPHERE: Noise(0.3)}
+_FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3), **dict.fromkeys(SCANNED, Noise(0.3))}
 _SOFT_LIMIT = 3.0
 _ROUNDS = 10
 _SETTLED = 0.02
@@ -140,7 +141,7 @@ class _Problem:
     ) -> BorderedFit:  # fmt: skip
         def model(group: int, shared: np.ndarray, own: np.ndarray) -> list[Observation] | None:
             if group == len(evidence):
-                return [self._prior(shared)]
+                return self._before(shared)
             parts = evidence[group].residuals(self._parameters, shared, own)
             if parts is None:
                 return None
@@ -148,8 +149,11 @@ class _Problem:
             rows = [_weighted(r, ~mask, noise[r.kind]) for r, mask in zip(parts, masks, strict=True)]
             std = evidence[group].own_std(alignment=self._alignment, position_mm=self._position_mm)
             known = np.flatnonzero(np.isfinite(std))
-            off = (own[known] / std[known])[:, None]
-            return [*rows, Observation(off, np.zeros((len(off), len(shared))), np.diag(1.0 / std[known]), known)]
+            rows.append(_of_own(own[known] / std[known], np.diag(1.0 / std[known]), known, len(shared)))
+            if isinstance(evidence[group], SurfaceScanEvidence):
+                off, by_own = evidence[group].known_lengths(own)
+                rows.append(_of_own(off, by_own, np.arange(by_own.shape[1]), len(shared)))
+            return rows
 
         if left_out is None:
             how = {"smallest_gain": _FIRST_GAIN, "damping": _FIRST_DAMPING, "soft_limit": _SOFT_LIMIT}
@@ -158,11 +162,16 @@ class _Problem:
             how = {"smallest_gain": _SMALLEST_GAIN, "damping": _DAMPING}
         return fit_bordered(model, shared, [*own, np.empty(0)], **how)
 
-    def _prior(self, shared: np.ndarray) -> Observation:
+    def _before(self, shared: np.ndarray) -> list[Observation]:
+        """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
         std = self._parameters.prior_std()
         known = np.isfinite(std)
         off = (shared - self._parameters.prior_mean())[known] / std[known]
-        return Observation(off[:, None], np.diag(1.0 / std)[known], np.empty((len(off), 0)))
+        found = [Observation(off[:, None], np.diag(1.0 / std)[known], np.empty((len(off), 0)))]
+        if self._parameters.earlier is not None:
+            off, by_shared = self._parameters.earlier.residuals(shared)
+            found.append(Observation(off[:, None], by_shared, np.empty((len(off), 0))))
+        return found
 
     def residuals(
         self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray]
@@ -178,11 +187,17 @@ class _Problem:
             points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
             of_kind = [r for parts in residuals for r in parts if r.kind == kind]
             result[kind] = judged(kind, of_kind, points)
-            if kind == SPHERE:
-                spheres = sum(len(e.diameters_mm) for e in evidence if isinstance(e, SphereScanEvidence))
-                per_sphere = sum(len(r.values) for r in of_kind) / spheres
-                result[kind] = with_slope_bias(result[kind], points_per_sphere=per_sphere)
+            if kind in SCANNED:
+                scanned = [e.surface for e in evidence if isinstance(e, SurfaceScanEvidence)]
+                bodies = sum(surface.count for surface in scanned if surface.kind == kind)
+                each = sum(len(r.values) for r in of_kind) / bodies
+                result[kind] = with_slope_bias(result[kind], points_per_body=each)
         return result
+
+
+def _of_own(off: np.ndarray, by_own: np.ndarray, own: np.ndarray, shared: int) -> Observation:
+    """What is known of own parameters, in standard uncertainties."""
+    return Observation(off[:, None], np.zeros((len(off), shared)), by_own, own)
 
 
 def _weighted(residuals: Residuals, used: np.ndarray, noise: Noise) -> Observation:

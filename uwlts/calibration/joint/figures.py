@@ -12,8 +12,11 @@ def joint_figures(result: Estimate) -> dict[str, Any]:
     """Lens and window with their standard uncertainties, as other calibrations have them, and all of the estimate."""
     std, lens = result.std(), result.parameters.intrinsics.names
     prior = result.parameters.prior_std()
+    camera: dict[str, Any] = {"std": {name: std[name] for name in lens}}
+    if TARGET in result.noise:
+        camera["sigma_px"] = result.noise[TARGET].sigma_px
     figures: dict[str, Any] = {
-        "camera": {"sigma_px": result.noise[TARGET].sigma_px, "std": {name: std[name] for name in lens}},
+        "camera": camera,
         "joint": {
             "parameters": list(result.parameters.names),
             "values": result.values.tolist(),

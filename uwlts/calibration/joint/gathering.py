@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.calibration.evidence import Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.sphere_start import SphereStripes, sphere_stripes
+from uwlts.calibration.joint.scan_start import ScanStripes, scan_stripes
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.procedure import CalibrationOptions, common_sensor, sources_of
 from uwlts.capture import Capture
@@ -29,7 +29,7 @@ class Gathered:
     series : list of Series
         Target images, by what they were seen through.
     steps : list of (StepEvidence, View)
-    spheres : list of SphereStripes
+    scans : list of ScanStripes
     provenance : dict
     warnings : list of str
     """
@@ -38,13 +38,13 @@ class Gathered:
     media: dict[str, Medium]
     series: list[Series]
     steps: list[tuple[StepEvidence, View]]
-    spheres: list[SphereStripes]
+    scans: list[ScanStripes]
     provenance: dict[str, Any]
     warnings: list[str]
 
     def views(self) -> list[View]:
         """Through what each series of target images, each step image and each scan was seen."""
-        return [s.view for s in [*self.series, *self.spheres]] + [view for _, view in self.steps]
+        return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
     def sources(self, *, free: bool) -> list[dict[int, str]]:
         """Capture and frame of every target image of every placement, in the order of `series_start`."""
@@ -59,11 +59,11 @@ class Gathered:
 
 
 def gather_jointly(
-    targets: Sequence[Capture], steps: Sequence[Capture], spheres: Sequence[Capture] = (), *,
+    targets: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = (), *,
     options: CalibrationOptions, progress: Progress | None = None,
 ) -> Gathered:  # fmt: skip
-    """Find the target, the stripes on it and those on steps and spheres in all images."""
-    sensor = common_sensor([*targets, *steps, *spheres])
+    """Find the target, the stripes on it and those on steps and scanned surfaces in all images."""
+    sensor = common_sensor([*targets, *steps, *scans])
     media: dict[str, Medium] = {}
     views: dict[View, list[Capture]] = {}
     for capture in targets:
@@ -83,14 +83,14 @@ def gather_jointly(
         warnings += left_out
     if steps and not on_steps:
         raise CalibrationError(no_stripe_in(steps))
-    on_spheres = []
-    for capture in spheres:
-        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the spheres"
-        on_spheres.append(sphere_stripes(capture, _view(capture, media, name), stripe=options.stripe))
-    windowed = [c for c in [*steps, *targets, *spheres] if c.header.sensor.camera.window.mounted]
+    on_scans = []
+    for capture in scans:
+        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
+        on_scans.append(scan_stripes(capture, _view(capture, media, name), stripe=options.stripe))
+    windowed = [c for c in [*steps, *targets, *scans] if c.header.sensor.camera.window.mounted]
     return Gathered(
         sensor=windowed[0].header.sensor if windowed else sensor, media=media, series=series, steps=on_steps,
-        spheres=on_spheres, provenance=sources_of(targets, steps, spheres), warnings=warnings,
+        scans=on_scans, provenance=sources_of(targets, steps, scans), warnings=warnings,
     )  # fmt: skip
 
 

@@ -14,8 +14,8 @@ from uwlts.calibration.joint.noise import Noise, with_slope_bias
 from uwlts.calibration.joint.observations import TARGET
 from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.shots import SPHERE_MM, SPHERES, Shot, sphere_shot, step_shot, target_shot
-from uwlts.calibration.joint.sphere_scans import SPHERE
 from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.surfaces import Spheres
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_over, regions
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.plate_extent import plate_extent
@@ -114,9 +114,9 @@ def _noise_of(calibration: Calibration, shot: Shot) -> dict[str, Noise]:
     known = {name: Noise(sigma, joint["shared_variance"][name]) for name, sigma in joint["scatter_px"].items()}
     stripe = max((noise for name, noise in known.items() if name != TARGET), key=Noise.effective_px)
     found = {kind: known.get(kind, stripe) for kind in {part.kind for part in shot.residuals}}
-    if SPHERE in found:
+    if Spheres.kind in found:
         each = sum(len(part.values) for part in shot.residuals) / SPHERES
-        found[SPHERE] = with_slope_bias(found[SPHERE], points_per_sphere=each)
+        found[Spheres.kind] = with_slope_bias(found[Spheres.kind], points_per_body=each)
     return found
 
 

@@ -11,8 +11,9 @@ from uwlts.metrology.robust_fit import MAD_TO_STD
 _STRAY = 5.0
 _LAGS = 100
 _SHARED_LAG = 0.05
-_SLOPE_BIAS_PX = 0.03
-"""Size of the error of a stripe's centre that goes with the slope of the surface, as rendered spheres show it."""
+_SLOPE_BIAS_PX = 0.01
+"""Size of the error of a stripe's centre that goes with the slope of the surface, of which `uwlts.brightness` takes out
+two thirds where rendered spheres show it."""
 
 _FINEST_PX = 1e-3
 """No point of an image counts as better known, lest what is known before counts for nothing."""
@@ -65,9 +66,9 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
     return Noise(sigma, max(together, 1.0))
 
 
-def with_slope_bias(noise: Noise, *, points_per_sphere: float) -> Noise:
-    """Noise on spheres, whose points share what the stripe's centre is off where the surface leans."""
-    return Noise(noise.sigma_px, noise.together, points_per_sphere * (_SLOPE_BIAS_PX / noise.sigma_px) ** 2)
+def with_slope_bias(noise: Noise, *, points_per_body: float) -> Noise:
+    """Noise on a scanned body, whose points share what the stripe's centre is off where the surface leans."""
+    return Noise(noise.sigma_px, noise.together, points_per_body * (_SLOPE_BIAS_PX / noise.sigma_px) ** 2)
 
 
 def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:

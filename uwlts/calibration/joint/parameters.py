@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uwlts.calibration.intrinsics import Intrinsics
+from uwlts.calibration.joint.earlier import EarlierEstimate
 from uwlts.calibration.joint.rays import COLUMNS, LENS, WINDOW, RayJets, ray_jets
 from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
 from uwlts.calibration.joint.sheet_jets import DescribedSheet, PointJets, points_on_sheet
@@ -21,7 +22,10 @@ class View:
 
 @dataclass(frozen=True)
 class Prior:
-    """A parameter known before as ``mean`` with the standard uncertainty ``std``; infinite, the mean is but a start."""
+    """A parameter known before as ``mean`` with the standard uncertainty ``std``.
+
+    Where that is infinite the mean is but a start; where it is zero the parameter is held and not estimated.
+    """
 
     mean: float
     std: float
@@ -41,7 +45,9 @@ class Parameters:
     media : tuple of str
         Names of the media other than air.
     priors : dict
-        `Prior` of every parameter but the lens's, in the order of the vector.
+        `Prior` of every parameter but the lens's, in the order of the vector, which lacks those that are held.
+    earlier : EarlierEstimate, optional
+        What an earlier calibration says of the first parameters of the vector, besides the priors.
     """
 
     intrinsics: Intrinsics
@@ -49,22 +55,24 @@ class Parameters:
     window: WindowModel | None
     media: tuple[str, ...]
     priors: dict[str, Prior]
+    earlier: EarlierEstimate | None = None
     names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", (*self.intrinsics.names, *self.priors))
+        known = (name for name, prior in self.priors.items() if prior.std > 0)
+        object.__setattr__(self, "names", (*self.intrinsics.names, *known))
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""
-        return np.concatenate([lens, [prior.mean for prior in self.priors.values()]])
+        return np.concatenate([lens, [prior.mean for prior in self._estimated()]])
 
     def prior_std(self) -> np.ndarray:
         """Standard uncertainty (P,) of each parameter before; infinite where nothing is known."""
-        return np.concatenate([np.full(len(self.intrinsics.names), np.inf), [p.std for p in self.priors.values()]])
+        return np.concatenate([np.full(len(self.intrinsics.names), np.inf), [p.std for p in self._estimated()]])
 
     def prior_mean(self) -> np.ndarray:
         """What each parameter (P,) is before; zero where nothing is known."""
-        return np.concatenate([np.zeros(len(self.intrinsics.names)), [p.mean for p in self.priors.values()]])
+        return np.concatenate([np.zeros(len(self.intrinsics.names)), [p.mean for p in self._estimated()]])
 
     def camera(self, values: np.ndarray) -> CameraModel:
         """The camera of a vector."""
@@ -121,13 +129,18 @@ class Parameters:
         return result
 
     def value(self, values: np.ndarray, name: str) -> float:
-        """A parameter but the lens's; zero for one that is not estimated."""
-        return float(values[self.names.index(name)]) if name in self.priors else 0.0
+        """A parameter but the lens's; zero for one that there is not."""
+        if name in self.names:
+            return float(values[self.names.index(name)])
+        return self.priors[name].mean if name in self.priors else 0.0
 
     def add(self, by_shared: np.ndarray, name: str, column: np.ndarray) -> None:
         """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
-        if name in self.priors:
+        if name in self.names:
             by_shared[:, self.names.index(name)] += column
+
+    def _estimated(self) -> list[Prior]:
+        return [self.priors[name] for name in self.names[len(self.intrinsics.names) :]]
 
     def _index_name(self, view: View) -> str:
         return f"index of {self.media[view.medium]}"

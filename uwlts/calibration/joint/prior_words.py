@@ -20,15 +20,15 @@ _WORDS = {
 }  # fmt: skip
 
 
-def off_as_words(name: str, value: float, known: float, std: float) -> str:
-    """That a parameter was found at a value and was known before as ``known`` with the standard uncertainty ``std``."""
+def off_as_words(name: str, value: float, known: float, std: float, *, sigmas: float) -> str:
+    """That the images alone say a value, so many standard uncertainties of both off what was known before."""
     if name == "stage_scale":
         return (
-            f"the stage moves {1 + value:.5g} mm per mm of its positions, stated 1 +- {std:g}: check the target's "
-            "spacing and the stage's scale"
+            f"the stage moves {1 + value:.5g} mm per mm of its positions, stated 1 +- {std:g} ({sigmas:.1f} "
+            "standard uncertainties off): check the target's spacing and the stage's scale"
         )
     if name.startswith("index of "):
-        words, unit, check = f"refractive {name}", "", "the medium in the captures, or --index"
+        words, unit, check = f"refractive {name}", "", "the medium and the step's height in the captures, or --index"
     elif name.startswith("height of "):
         words, unit, check = name, "mm", "which standard it is"
     else:
@@ -40,6 +40,6 @@ def off_as_words(name: str, value: float, known: float, std: float) -> str:
         value, known, std = np.degrees([value, known, std])
     digits = max(0, int(np.ceil(1 - np.log10(std))))
     return (
-        f"{words} found {value:.{digits}f}{unit and ' ' + unit}, described as {known:.{digits}f} +- {std:.2g}: check "
-        f"{check}"
+        f"{words} found {value:.{digits}f}{unit and ' ' + unit}, described as {known:.{digits}f} +- {std:.2g} "
+        f"({sigmas:.1f} standard uncertainties off): check {check}"
     )

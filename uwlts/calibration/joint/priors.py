@@ -5,7 +5,7 @@ import numpy as np
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.parameters import Prior
 from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
-from uwlts.calibration.joint.sphere_scans import SLOPES
+from uwlts.calibration.joint.surface_scans import SLOPES
 from uwlts.calibration.model import WindowModel
 from uwlts.calibration.procedure import CalibrationOptions
 
@@ -47,10 +47,10 @@ def priors_of(
     priors["sheet_bow"] = Prior(float(np.radians(sensor.laser.bow_deg)), float(bow))
     if gathered.media and sensor.laser.window.mounted:
         priors["laser_window_turn"] = Prior(float(np.arcsin(sensor.laser.window.normal()[0])), float(turn))
-    if gathered.spheres:
+    if gathered.scans:
         lean = float(np.tan(np.radians(known.stage_alignment_deg)))
         priors |= dict.fromkeys(SLOPES, Prior(0.0, lean))
-    if options.poses != "free" or gathered.spheres:
+    if options.poses != "free" or gathered.scans:
         priors["stage_scale"] = Prior(0.0, known.stage_scale)
     priors["target_bow"] = Prior(0.0, known.target_bow_mm)
     return priors | heights

@@ -16,16 +16,56 @@ from uwlts.calibration.joint.figures import joint_figures
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, refuse_two_lenses
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.priors import priors_of
-from uwlts.calibration.joint.sphere_start import sphere_scans
+from uwlts.calibration.joint.scan_start import surface_scans
 from uwlts.calibration.joint.start import series_start, sheet_start
 from uwlts.calibration.joint.step_start import line_start, step_profiles
+from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
+from uwlts.calibration.joint.surfaces import Plane
 from uwlts.calibration.model import Calibration, KnownMedium, KnownStage
 from uwlts.calibration.procedure import CalibrationOptions, nominal_window
 from uwlts.calibration.sheet import object_frame
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.placement import laser_pose
+from uwlts.sensor import Uncertainty
 from uwlts.targets import CircleTarget
+
+
+@dataclass(frozen=True, eq=False)
+class JointProblem:
+    """All evidence with what is to be estimated from it, and where that starts.
+
+    Attributes
+    ----------
+    parameters : Parameters
+    evidence : list
+    shared : (P,)
+        Start.
+    own : list of (b,)
+        Starts of the evidence's own parameters.
+    uncertainty : Uncertainty
+    diameter_mm : float or None
+        Of the target's circles, whose images are to be corrected; None where nothing is.
+    sources : list of dict
+        For every piece of evidence the names of its images by their numbers.
+    warnings : list of str
+    """
+
+    parameters: Parameters
+    evidence: list[Evidence]
+    shared: np.ndarray
+    own: list[np.ndarray]
+    uncertainty: Uncertainty
+    diameter_mm: float | None
+    sources: list[dict[int, str]]
+    warnings: list[str]
+
+    def solve(self) -> Estimate:
+        """The estimate, not judged yet; errors as `estimate`."""
+        return estimate(
+            self.parameters, self.evidence, self.shared, self.own, uncertainty=self.uncertainty,
+            correct=None if self.diameter_mm is None else partial(centred, self.parameters, self.diameter_mm),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +87,7 @@ class JointResult:
 def calibrate_jointly(
     targets: Sequence[Capture],
     steps: Sequence[Capture] = (),
-    spheres: Sequence[Capture] = (),
+    scans: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
     progress: Progress | None = None,
@@ -62,8 +102,8 @@ def calibrate_jointly(
         sheet too.
     steps : sequence of Capture
         A step standard in a medium.
-    spheres : sequence of Capture
-        Scans of spheres that stand still while the stage moves the sensor.
+    scans : sequence of Capture
+        Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
     options : CalibrationOptions
         Its ``refractions`` do not count: windows are plates as described.
     progress : callable, optional
@@ -73,14 +113,14 @@ def calibrate_jointly(
     CalibrationError
         The evidence does not determine the calibration or contradicts it.
     DescriptionError
-        A capture does not describe its target or its step standard.
+        A capture does not describe its target, its step standard or what it scans.
     """
     options = CalibrationOptions() if options is None else options
-    return solve_jointly(gather_jointly(targets, steps, spheres, options=options, progress=progress), options=options)
+    return solve_jointly(gather_jointly(targets, steps, scans, options=options, progress=progress), options=options)
 
 
-def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
-    """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
+def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
+    """What is to be estimated from what the captures show, with a start; errors as `calibrate_jointly`."""
     sensor, warnings = gathered.sensor, list(gathered.warnings)
     refuse_two_lenses(gathered)
     window = None
@@ -101,7 +141,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     first = sheet.model(np.append(turns, (0.0, 0.0)))
     first_calibration = start.calibration(sensor, window, first)
     steps, left_out = step_profiles(gathered, first_calibration, window)
-    scans, missed = sphere_scans(gathered.spheres, first_calibration, indices, sizes_known=options.sizes_known)
+    scans, missed = surface_scans(gathered.scans, first_calibration, sensor, indices, sizes_known=options.sizes_known)
     warnings += [*left_out, *missed]
     priors = priors_of(gathered, window, indices, turns, {e.height: known for e, known in steps}, options)
     parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors)
@@ -110,27 +150,35 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     own = [*start.own, *(line_start(e, parameters, shared) for e, _ in steps), *(own for _, own in scans)]
     target = gathered.series[0].found.target
     circles = options.correct_circles and isinstance(target, CircleTarget)
-    result = estimate(
-        parameters, evidence, shared, own, uncertainty=sensor.uncertainty,
-        correct=partial(centred, parameters, target.diameter_mm) if circles else None,
-    )  # fmt: skip
     sources = gathered.sources(free=free)
     sources += [{e.image: gathered.steps[e.image][0].source} for e, _ in steps]
     sources += [e.sources() for e, _ in scans]
+    return JointProblem(
+        parameters, evidence, shared, own, sensor.uncertainty, target.diameter_mm if circles else None, sources,
+        warnings,
+    )  # fmt: skip
+
+
+def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
+    """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
+    sensor, problem = gathered.sensor, joint_problem(gathered, options=options)
+    evidence, sources, warnings = problem.evidence, problem.sources, list(problem.warnings)
+    parameters, result = problem.parameters, problem.solve()
     against = findings(result, evidence, sources, sensor=sensor)
     if against.contradictions:
         raise CalibrationError(against.refusal())
     warnings += against.doubts
     provenance = gathered.provenance | {"poses": options.poses, "medium_index": options.medium_index}
-    provenance |= {"known_before": sensor.uncertainty.model_dump(), "target": target.model_dump(mode="json")}
+    target = gathered.series[0].found.target.model_dump(mode="json")
+    provenance |= {"known_before": sensor.uncertainty.model_dump(), "target": target}
     frame = object_frame(parameters.sheet_model(result.values), laser_axis=laser_pose(sensor).axis)
     kept = evidence_figures(result, evidence, sources, frame)
     stages = [
         KnownStage(
-            described=gathered.spheres[0].stage_direction.tolist(),
+            described=gathered.scans[0].stage_direction.tolist(),
             direction=(scan.moved_direction(parameters, result.values) @ frame[:3, :3]).tolist(),
         )
-        for scan, _ in scans[:1]
+        for scan in [e for e in evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)][:1]
     ]
     calibration = _calibration(gathered, result, frame, stages, kept, provenance | {"warnings": warnings})
     return JointResult(calibration, result, warnings)

@@ -8,8 +8,9 @@ import numpy as np
 
 from uwlts.calibration.joint.observations import Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Prior
-from uwlts.calibration.joint.sphere_scans import SLOPES, SphereScanEvidence
 from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.surface_scans import SLOPES, SurfaceScanEvidence
+from uwlts.calibration.joint.surfaces import Spheres
 from uwlts.calibration.joint.volume import pixels_at
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
@@ -130,10 +131,16 @@ def sphere_shot(
             image.append(np.full(len(found), number))
     if min(map(len, pixels)) < _FEWEST_LINES:
         return None
-    evidence = SphereScanEvidence(
-        view=known.view, pixels=np.vstack(pixels), sphere=np.concatenate(sphere), frame=np.concatenate(image),
-        stage_mm=stage, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T, diameters_mm=np.full(SPHERES, SPHERE_MM),
-        diameter_std_mm=np.full(SPHERES, np.inf), across=_across(calibration), image=0, source="",
+    unknown = np.full(SPHERES, np.inf)
+    surface = Spheres(
+        np.full(SPHERES, SPHERE_MM), unknown, np.full(SPHERES - 1, _SPHERES_APART_MM), unknown[1:],
+        np.concatenate(sphere),
+    )  # fmt: skip
+    stripes = np.vstack(pixels)
+    evidence = SurfaceScanEvidence(
+        view=known.view, pixels=stripes, beside_mm=np.zeros((3, len(stripes))), surface=surface,
+        frame=np.concatenate(image), stage_mm=stage, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T,
+        across=_across(calibration), image=0, source="",
     )  # fmt: skip
     own = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(SPHERES + len(stage))])
     parts = evidence.residuals(known.parameters, known.values, own)

@@ -6,6 +6,7 @@ import numpy as np
 
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
+from uwlts.calibration.joint.rays import WINDOW
 from uwlts.calibration.joint.sheet_jets import DescribedSheet
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.polynomial_model import PolynomialCalibration
@@ -68,7 +69,8 @@ def _stored(calibration: Calibration, medium: Medium, *, mounted: bool, uncertai
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
     sheet = DescribedSheet(**{name: np.array(value) for name, value in joint["described_sheet"].items()})
     media = [name.removeprefix("index of ") for name in names if name.startswith("index of ")]
-    known = next((n for n, found in enumerate(calibration.media) if found.medium == medium), None)
+    # As `Calibration.index_of`: the last of equal ones.
+    known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
     window = mounted and calibration.window is not None
     view = View(window, None if medium.kind == "air" else known)
     if known is not None:
@@ -89,6 +91,19 @@ def _stored(calibration: Calibration, medium: Medium, *, mounted: bool, uncertai
     if tuple(names[:lens]) != intrinsics.names or covariance.shape != (len(names), len(names)):
         raise ValueError("its parameters do not fit together")
     priors = {name: Prior(value, np.inf) for name, value in zip(names[lens:], values[lens:], strict=True)}
+    priors |= {name: Prior(value, 0.0) for name, value in _held(calibration).items() if name not in priors}
     return StoredEstimate(
         Parameters(intrinsics, sheet, calibration.window, tuple(media), priors), values, covariance, view
     )
+
+
+def _held(calibration: Calibration) -> dict[str, float]:
+    """What the calibration's models say of window and sheet, for parameters that were held and not estimated."""
+    held: dict[str, float] = {}
+    if (window := calibration.window) is not None:
+        normal = np.array(window.normal) / window.normal[2]
+        values = (window.distance_mm, float(normal[0]), float(normal[1]), window.thickness_mm, window.glass_index)
+        held |= dict(zip(WINDOW, values, strict=True))
+    if (fan := calibration.sheet.fan) is not None:
+        held |= {"sheet_bow": fan.bow_rad, "laser_window_turn": fan.window_turn_rad}
+    return held

@@ -1,0 +1,160 @@
+"""The comparison: every model calibrated and judged, what of the usual model is needed, and the simplest that does."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from uwlts.calibration.joint.procedure import JointProblem
+from uwlts.calibration.model_choice.candidates import Candidate, dimensions_of
+from uwlts.calibration.model_choice.held_out import INSIDE, Split, splits
+from uwlts.calibration.model_choice.prediction import Prediction, predict
+from uwlts.calibration.model_choice.scores import Score, Tally, tally
+from uwlts.errors import CalibrationError
+from uwlts.workers import Tell, work_through
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A model with its score for each way of holding out, or the reason why it has none."""
+
+    candidate: Candidate
+    parameters: int | None
+    scores: dict[str, Score]
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The models, the usual one first, and what their scores say.
+
+    Attributes
+    ----------
+    judged : list of Judged
+    ways : dict
+        `Split` by its name.
+    predictions : dict
+        Of the models that have scores, by the way of holding out.
+    tallies : dict
+        For each way of holding out, of those models in their order.
+    """
+
+    judged: list[Judged]
+    ways: dict[str, Split]
+    predictions: dict[Candidate, dict[str, Prediction]]
+    tallies: dict[str, Tally]
+
+    def best(self) -> Candidate:
+        """The model of the smallest mean square miss, both ways of holding out counting alike."""
+        return self.good_among(self._able())[0].candidate
+
+    def as_good(self) -> list[Candidate]:
+        """Those that are no worse than the best in either way, but for chance."""
+        return [each.candidate for each in self.good_among(self._able())[1]]
+
+    def simplest(self) -> Candidate:
+        """Of these that with the fewest parameters."""
+        return min(self.good_among(self._able())[1], key=lambda each: each.parameters).candidate
+
+    def _able(self) -> list[Judged]:
+        return [each for each in self.judged if each.scores]
+
+    def number(self, candidate: Candidate) -> int:
+        """Number of a model among those that have scores."""
+        return list(self.predictions).index(candidate)
+
+    def no_worse(self, candidate: Candidate, other: Candidate, where: str) -> bool:
+        """Whether a model predicts as well as another in one way of holding out.
+
+        Where images held out differ by more than chance, all may yet share errors of the stage and of poses that favour
+        one model. So a model that holds parameters of the other also counts as good if the other's estimate cannot tell
+        these from what is held.
+        """
+        told = self.predictions[other][INSIDE].told_from(self.predictions[candidate][INSIDE])
+        return not told or self.tallies[where].as_good(self.number(candidate), self.number(other))
+
+    def good_among(self, judged: Sequence[Judged]) -> tuple[Judged, list[Judged]]:
+        """Of some models the best, and those that are as good in both ways."""
+        best = min(judged, key=lambda each: sum(score.all_mm**2 for score in each.scores.values()))
+        good = [e for e in judged if all(self.no_worse(e.candidate, best.candidate, where) for where in self.ways)]
+        return best, good
+
+    def level(self, name: str, levels: Sequence[object]) -> object:
+        """Of the ways in which one thing can be modelled, the simplest that is as good as the best of them."""
+        alternatives = [replace(Candidate(), **{name: value}) for value in levels]
+        _, good = self.good_among([e for e in self.judged if e.scores and e.candidate in alternatives])
+        return getattr(min(good, key=lambda each: each.parameters).candidate, name)
+
+
+def choose(
+    problem: JointProblem, *, workers: int | None = None, progress: Progress = lambda done, total: None
+) -> Choice:
+    """Compare models on the evidence of a joint problem: the usual one, what differs by one thing, and the simplest.
+
+    Raises
+    ------
+    CalibrationError
+        There are too few images, or the usual model cannot be calibrated without those held out.
+    """
+    ways, usual = splits(problem), Candidate()
+    dimensions = dimensions_of(problem.parameters)
+    singles = [usual, *(replace(usual, **{name: other}) for name, others in dimensions.items() for other in others)]
+    total = len(ways) * (len(singles) + 1)
+    found = _predicted(problem, singles, ways, workers=workers, progress=lambda done: progress(done, total))
+    if isinstance(found[usual], str):
+        raise CalibrationError(f"without the images held out there is no calibration: {found[usual]}")
+    first = choice_of(found, ways)
+    needed = {name: first.level(name, [getattr(usual, name), *others]) for name, others in dimensions.items()}
+    simple, before = replace(usual, **needed), len(ways) * len(singles)
+    if simple not in found:
+        found |= _predicted(
+            problem, [simple], ways, workers=workers, progress=lambda done: progress(before + done, total)
+        )
+    progress(total, total)
+    return choice_of(found, ways)
+
+
+def _predicted(
+    problem: JointProblem, candidates: Sequence[Candidate], ways: Sequence[Split], *, workers: int | None,
+    progress: Callable[[int], None],
+) -> dict[Candidate, dict[str, Prediction] | str]:  # fmt: skip
+    """For each model its predictions by the way of holding out, or why there are none."""
+    done = 0
+
+    def heard(message: object) -> None:
+        nonlocal done
+        done += 1
+        progress(done)
+
+    jobs = [(problem, candidate, way) for candidate in candidates for way in ways]
+    results = work_through(_work, jobs, workers=workers, heard=heard)
+    found: dict[Candidate, dict[str, Prediction] | str] = {}
+    for place, candidate in enumerate(candidates):
+        own = results[place * len(ways) : (place + 1) * len(ways)]
+        reasons = [each for each in own if isinstance(each, str)]
+        found[candidate] = reasons[0] if reasons else {way.where: p for way, p in zip(ways, own, strict=True)}
+    return found
+
+
+def _work(job: tuple[JointProblem, Candidate, Split], tell: Tell) -> Prediction | str:
+    try:
+        return predict(*job)
+    except CalibrationError as error:
+        return str(error)
+    finally:
+        tell(None)
+
+
+def choice_of(found: dict[Candidate, dict[str, Prediction] | str], ways: Sequence[Split]) -> Choice:
+    """The choice among models by what each predicts in both ways, or the reason why it does not."""
+    predictions = {candidate: result for candidate, result in found.items() if not isinstance(result, str)}
+    tallies = {way.where: tally([each[way.where] for each in predictions.values()]) for way in ways}
+    judged = []
+    for candidate, result in found.items():
+        if isinstance(result, str):
+            judged.append(Judged(candidate, None, {}, result))
+        else:
+            number = list(predictions).index(candidate)
+            scores = {where: each.score(number) for where, each in tallies.items()}
+            judged.append(Judged(candidate, len(result[INSIDE].parameters.names), scores))
+    return Choice(judged, {way.where: way for way in ways}, predictions, tallies)

@@ -1,0 +1,160 @@
+"""What a model, calibrated without some images, misses in them."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.stats import chi2
+
+from uwlts.calibration.joint.circle_centres import centred
+from uwlts.calibration.joint.estimate import Estimate, Evidence
+from uwlts.calibration.joint.noise import strays
+from uwlts.calibration.joint.observations import TARGET, Residuals, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.procedure import JointProblem
+from uwlts.calibration.model_choice.candidates import Candidate, recast
+from uwlts.calibration.model_choice.held_out import Image, Split, of_images, without
+from uwlts.errors import CalibrationError
+from uwlts.metrology.robust_fit import MAD_TO_STD
+
+_STRAY = 5.0
+_ROUNDS, _SETTLED_PX = 20, 1e-4
+_LARGEST_STRAY_SHARE = 0.2
+_BY_CHANCE = 0.0027
+"""Probability of three standard deviations or more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Misses:
+    """By how much the points of one kind in one image are missed: (n,) each in px in the image, in mm on the object."""
+
+    image: Image
+    kind: str
+    px: np.ndarray
+    mm: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Misses in all images held out, and what the model estimated: shared parameters (P,) and covariance (P, P)."""
+
+    misses: list[Misses]
+    parameters: Parameters
+    values: np.ndarray
+    covariance: np.ndarray
+
+    def told_from(self, smaller: "Prediction") -> bool:
+        """Whether the estimate tells this model from one that holds some of its parameters, by three sigma.
+
+        True of models of which neither holds the other's.
+        """
+        names, others = self.parameters.names, smaller.parameters.names
+        more = [place for place, name in enumerate(names) if name not in others]
+        if not set(others) <= set(names) or not more:
+            return True
+        held = np.array([smaller.parameters.value(smaller.values, names[place]) for place in more])
+        off = self.values[more] - held
+        square = off @ np.linalg.solve(self.covariance[np.ix_(more, more)], off)
+        return bool(chi2.sf(square, len(more)) < _BY_CHANCE)
+
+
+def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Prediction:
+    """Calibrate without the images held out, and predict these.
+
+    Where the stage moved the target, its place in an image held out follows from the others and the stage's position,
+    the errors of whose positions are the others' mean. Else the pose is fitted to the target's points, or the line of
+    the lower tread to the stripe on a step: nothing of the calibration is.
+
+    Raises
+    ------
+    CalibrationError
+        The other images do not determine the model or do not fit it, or a ray of the images held out meets nothing.
+    """
+    whole = recast(problem, candidate)
+    training, numbers = without(whole, split.held)
+    estimate = training.solve()
+    _refuse_misfit(estimate)
+    own = dict(zip(numbers, estimate.own, strict=True))
+    kept = dict(zip(numbers, training.evidence, strict=True))
+    found = []
+    for number in sorted({number for number, _ in split.held}):
+        piece, images = whole.evidence[number], sorted(image for held, image in split.held if held == number)
+        for evidence, pose, fitted in _posed(whole, estimate, piece, number, images, kept.get(number), own.get(number)):
+            parts = _residuals(whole, estimate, evidence, pose, fitted=fitted)
+            found += [_misses(number, part) for part in parts if part.image in images]
+    return Prediction(found, estimate.parameters, estimate.values, estimate.covariance)
+
+
+def _refuse_misfit(estimate: Estimate) -> None:
+    """CalibrationError where much of the evidence was left out, without which an estimate means nothing."""
+    for kind, noise in estimate.noise.items():
+        parts = [part for parts in estimate.residuals for part in parts if part.kind == kind]
+        share = np.concatenate([strays(part, noise) for part in parts]).mean()
+        if share > _LARGEST_STRAY_SHARE:
+            raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
+
+
+def _posed(
+    problem: JointProblem, estimate: Estimate, piece: Evidence, number: int, images: list[int],
+    kept: TargetEvidence | None, own: np.ndarray | None,
+) -> list[tuple[Evidence, np.ndarray, str]]:  # fmt: skip
+    """Evidence held out with its own parameters, and the kind of residual to which these are yet to be fitted."""
+    if isinstance(piece, StepProfileEvidence):
+        return [(piece, problem.own[number], "")]
+    if kept is not None and piece.staged and len(kept.images()):
+        rotation, direction = cv2.Rodrigues(own[:3])[0], piece.placement.direction(own[6:8])
+        held = of_images(piece, images)
+        shift = own[3:6] - rotation @ direction * np.append(own[8:], 0.0).mean()
+        return [(held, np.concatenate([own[:3], shift, own[6:8], np.zeros(len(held.images()))]), "none")]
+    found = []
+    for image in images:
+        at = piece.pose(problem.parameters, problem.shared, problem.own[number], image)
+        start = np.concatenate([cv2.Rodrigues(at[:3, :3])[0].ravel(), at[:3, 3]])
+        found.append((replace(of_images(piece, [image]), staged=False), start, TARGET))
+    return found
+
+
+def _residuals(
+    problem: JointProblem, estimate: Estimate, evidence: Evidence, own: np.ndarray, *, fitted: str
+) -> list[Residuals]:
+    """Residuals of the evidence with its own parameters, fitted to those of one kind, to all, or to none."""
+    for _ in range(_ROUNDS):
+        parts = _seen(problem, estimate, evidence, own)
+        chosen = [part for part in parts if fitted in ("", part.kind)]
+        if not chosen:
+            return parts
+        values, by_own = np.concatenate([p.values for p in chosen]), np.vstack([p.by_own for p in chosen])
+        off = np.abs(values)
+        near = off <= max(_STRAY * MAD_TO_STD * float(np.median(off)), _SETTLED_PX)
+        step = -np.linalg.lstsq(by_own[near], values[near], rcond=None)[0]
+        own = own + step
+        if np.abs(by_own @ step).max() < _SETTLED_PX:
+            return _seen(problem, estimate, evidence, own)
+    raise CalibrationError("the place of what an image shows could not be found by the model")
+
+
+def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, own: np.ndarray) -> list[Residuals]:
+    parameters, values = estimate.parameters, estimate.values
+    if problem.diameter_mm is not None:
+        evidence = centred(parameters, problem.diameter_mm, [evidence], values, [own])[0]
+    parts = evidence.residuals(parameters, values, own)
+    if parts is None:
+        raise CalibrationError("by this model a ray that was seen meets no sheet or target")
+    return parts
+
+
+def _misses(number: int, part: Residuals) -> Misses:
+    """Misses of a part: of the target's points the distance, on the object that of the point from its ray.
+
+    Moving the target by a vector m moves the residuals r by J m; the shortest m that takes r away is J^T (J J^T)^-1 r.
+    On a step the own parameter 1 is how far the tread moves.
+    """
+    where = (number, part.image)
+    if part.kind == TARGET:
+        px, by = part.values.reshape(-1, 2), part.by_own.reshape(len(part.values) // 2, 2, -1)[:, :, 3:6]
+        across = by.transpose(0, 2, 1)
+        mm = (across @ np.linalg.solve(by @ across, px[:, :, None]))[:, :, 0]
+        return Misses(where, part.kind, np.linalg.norm(px, axis=1), np.linalg.norm(mm, axis=1))
+    moved = part.by_own[:, 3:6] if part.by_own.shape[1] > 2 else part.by_own[:, 1:]
+    px = np.abs(part.values)
+    return Misses(where, part.kind, px, px / np.linalg.norm(moved, axis=1))

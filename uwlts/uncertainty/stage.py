@@ -1,0 +1,28 @@
+"""What the stage of a scan leaves open: its scale and its direction move points by how far it has gone."""
+
+import numpy as np
+
+from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.surface_scans import SLOPES, across_of
+from uwlts.calibration.model import Calibration
+from uwlts.capture import CaptureHeader
+
+
+def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:
+    """How independent parts move a point (R + E, 3) for each mm that the stage has gone; OCS.
+
+    What the estimate knows of the stage goes with its own parts, ``root`` (P, R). The others are as the sensor's
+    description says, and the scale that was found, as it is not applied to scans.
+    """
+    described, uncertainty = np.array(header.stage_direction), header.sensor.uncertainty
+    names = known.parameters.names
+    ways = dict(zip(SLOPES, across_of(described), strict=True)) | {"stage_scale": described}
+    calibrated = [name for name in ways if name in names]
+    if not any(np.allclose(found.described, described) for found in calibration.stages):
+        calibrated = [name for name in calibrated if name not in SLOPES]
+    lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
+    std = dict.fromkeys(SLOPES, lean) | {"stage_scale": uncertainty.stage_scale}
+    within = sum((np.outer(root[names.index(name)], ways[name]) for name in calibrated), np.zeros((root.shape[1], 3)))
+    besides = [std[name] * way for name, way in ways.items() if name not in calibrated]
+    besides.append(known.parameters.value(known.values, "stage_scale") * described)
+    return np.vstack([within, *besides])
