@@ -25,7 +25,7 @@ UNSETTLED = "the residuals' scatter changes from round to round"
 _SETTLED_PX = 1e-3
 # Of a cost that is the number of residuals: parameters then move by a hundredth of their uncertainty at most. What the
 # first round finds is but a start for the next.
-_SMALLEST_GAIN, _FIRST_GAIN = 1e-9, 1e-5
+_SMALLEST_GAIN, _FIRST_GAIN = 1e-9, 1e-3
 _DAMPING, _FIRST_DAMPING = 1e-9, 1e-4
 _FIRST_ROUNDS = 30
 

@@ -25,7 +25,7 @@ Scanned = SphereStandard | PlaneStandard | Pipe
 _EVALUATION = {SphereStandard: evaluate_spheres, PlaneStandard: evaluate_plane, Pipe: evaluate_pipe}
 
 # More points of a scan tell hardly more: neighbours err together.
-_MOST_POINTS = 6000
+_MOST_POINTS = 2000
 _FEWEST_POINTS = 100
 """Of an image, before thinning."""
 _STEEPEST = 0.3
