@@ -181,12 +181,13 @@ def find_stripes(
     return FoundStripes(*(np.concatenate(parts) for parts in (frames, lines, centres, amplitudes, widths)), by_status)
 
 
-def sharp_lines(stripes: FoundStripes) -> np.ndarray:
-    """Numbers (M,) of the stripe centres that blur hardly moves; see `uwlts.brightness`."""
+def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px; see `uwlts.brightness`."""
     if len(stripes.line) == 0:
-        return np.empty(0, np.intp)
+        return np.empty(0, np.intp), np.empty(0)
     moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
-    return np.flatnonzero(np.abs(moved) < MOST_BLUR_PX)
+    sharp = np.flatnonzero(np.abs(moved) < MOST_BLUR_PX)
+    return sharp, moved[sharp]
 
 
 def reconstruct_capture(
@@ -238,18 +239,16 @@ def reconstruct_stripes(
     index = medium_index(capture, calibration) if index is None else index
     require_index(index)
     lines = stripes.lines_by_status
-    sharp = np.arange(len(stripes.line))
+    sharp, blur = np.arange(len(stripes.line)), np.zeros(len(stripes.line))
     exact = isinstance(calibration, Calibration) and is_joint(calibration)
     if exact:
-        sharp = sharp_lines(stripes)
+        sharp, blur = sharp_lines(stripes)
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
     found = _points(capture, calibration, stripes, index)
-    points = found.points_mm
-    if exact:
-        points = points + _beside(capture, calibration, stripes, index)
-    points = _posed(points, capture, stripes.frame)
+    beside = _beside(capture, calibration, stripes, index) if exact else np.zeros((len(sharp), 3))
+    points = _posed(found.points_mm + beside, capture, stripes.frame)
     good = np.flatnonzero(found.status == RayStatus.OK)
     kept = stripes[good]
     cloud = PointCloud(
@@ -260,7 +259,9 @@ def reconstruct_stripes(
         },
     )  # fmt: skip
     if with_uncertainty:
-        known = point_uncertainty(capture, calibration, kept.frame, kept.line, kept.centre_px)
+        known = point_uncertainty(
+            capture, calibration, kept.frame, kept.line, kept.centre_px, blur_px=blur[good], beside_mm=beside[good]
+        )
         cloud = replace(cloud, uncertainty=known)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     by_status = {status.name.lower(): int(rays[status]) for status in RayStatus}

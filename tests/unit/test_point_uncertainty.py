@@ -13,6 +13,7 @@ from uwlts.calibration.joint.stored import stored_estimate
 from uwlts.calibration.joint.surface_scans import SLOPES
 from uwlts.calibration.model import KnownMedium, KnownStage
 from uwlts.calibration.procedure import CalibrationOptions
+from uwlts.calibration.sources import source_of
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.cloud import PointCloud, read_cloud, write_cloud
 from uwlts.errors import CalibrationError
@@ -283,3 +284,32 @@ def test_a_calibration_by_turns_tells_none(calibration, thesis):
     without = calibration.model_copy(update={"residuals": {}})
     with pytest.raises(CalibrationError, match="calibrate jointly"):
         stored_estimate(without, thesis, MEDIUM)
+
+
+def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    rng = np.random.default_rng(2)
+    blur, beside = rng.normal(0, 0.05, len(line)), rng.normal(0, 0.01, (len(line), 3))
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        plain = point_uncertainty(capture, calibration, frame, line, centre)
+        known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
+    per_px = noise_mm(plain) / (stripe_noise_px(frame, line, centre) * np.sqrt(
+        calibration.residuals["joint"]["shared_variance"]["stripe on the target"]))[:, None]  # fmt: skip
+    added = [0.3 * per_px * blur[:, None], 0.2 * beside]
+    expected = sum(np.stack([each[:, i] * each[:, j] for i, j in PAIRS], axis=1) for each in added)
+    # Patterns that move the points by less than 0.05 um together are left out.
+    np.testing.assert_allclose(known.systematic_mm2() - plain.systematic_mm2(), expected, atol=1e-7, rtol=1e-2)
+
+
+def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    drifting = thesis.model_copy(update={"uncertainty": thesis.uncertainty.model_copy(update={"drift_k": 30.0})})
+    water = thesis.media["water"]
+    known = calibration.model_copy(update={"media": (calibration.media[0].model_copy(update={"medium": water}),)})
+    with capture_of(tmp_path, drifting, water) as capture:
+        own = known.model_copy(update={"provenance": known.provenance | {"scan_captures": [source_of(capture)]}})
+        free, tied = (
+            point_uncertainty(capture, each, frame, line, centre).systematic_mm2()[:, 5] for each in (known, own)
+        )
+    # 30 K are 3e-3 of the index: along Z, 0.07 mm or more.
+    assert (free - tied > 0.06**2).all()

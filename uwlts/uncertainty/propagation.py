@@ -11,6 +11,7 @@ import numpy as np
 from uwlts.calibration.joint.rays import COLUMNS
 from uwlts.calibration.joint.stored import StoredEstimate, stored_estimate
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.sources import source_of
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.metrology.robust_fit import MAD_TO_STD
@@ -21,6 +22,10 @@ _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are not worth their room.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
+
+# Rendered spheres show 0.2 to 0.5 of what blur may do, by how the light is spread in it, and that what comes from
+# beside the sheet is right to a tenth; how thick the sheet is a description tells less well.
+_BLUR_SHARE, _BESIDE_SHARE = 0.3, 0.2
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
@@ -46,12 +51,22 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
 
 
 def point_uncertainty(
-    capture: Capture, calibration: Calibration, frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray
+    capture: Capture,
+    calibration: Calibration,
+    frame: np.ndarray,
+    line: np.ndarray,
+    centre_px: np.ndarray,
+    *,
+    blur_px: np.ndarray | None = None,
+    beside_mm: np.ndarray | None = None,
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
     In the OCS, or in the scene where the frames carry poses. What the stage does by its positions, scale and direction
-    is part of it, about the middle of its positions; what poses add is not.
+    is part of it, about the middle of its positions; what poses add is not. The water may have drifted since the
+    calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may move the centres, and
+    ``beside_mm`` (N, 3), how far points were moved to where their light comes from (`uwlts.brightness`), are each wrong
+    by some share, the same for all points.
 
     Raises
     ------
@@ -59,7 +74,10 @@ def point_uncertainty(
         The calibration holds no joint estimate, or the points cannot be reconstructed by it.
     """
     header = capture.header
-    known = stored_estimate(calibration, header.sensor, header.medium)
+    sensor = header.sensor
+    if _made_from(calibration, capture):
+        sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
+    known = stored_estimate(calibration, sensor, header.medium)
     across = 1 if calibration.stripe_along == "width" else 0
     pixels = np.stack((line, centre_px) if across else (centre_px, line), axis=1).astype(np.float64)
     noise = stripe_noise_px(frame, line, centre_px) * _shared_by_neighbours(calibration)
@@ -79,12 +97,22 @@ def point_uncertainty(
         by_root += by_stage[:, None] * stage[frame[here], None]
         step = by_pixel * noise[here, None]
         random.append(np.stack([step[:, i] * step[:, j] for i, j in PAIRS], axis=1))
+        if blur_px is not None:
+            by_root = np.concatenate([by_root, [_BLUR_SHARE * by_pixel * blur_px[here, None]]])
+        if beside_mm is not None:
+            by_root = np.concatenate([by_root, [_BESIDE_SHARE * beside_mm[here]]])
         moved.append(by_root)
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
     return PointUncertainty(
         np.vstack(random).astype(np.float32), position.astype(np.float32), _patterns(np.concatenate(moved, axis=1))
     )
+
+
+def _made_from(calibration: Calibration, capture: Capture) -> bool:
+    """Whether a capture is one of the scans that a calibration was made from."""
+    own = [s for s in calibration.provenance.get("scan_captures", []) if s["file"] == capture.path.name]
+    return any(source["sha256"] == source_of(capture)["sha256"] for source in own)
 
 
 def _shared_by_neighbours(calibration: Calibration) -> float:

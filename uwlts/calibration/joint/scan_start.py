@@ -70,7 +70,7 @@ def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> Scan
     if not isinstance(artefact, Scanned):
         raise DescriptionError(f"{capture.path.name} shows a {artefact.kind}: {wanted}")
     found = find_stripes(capture, options=stripe)
-    found = found[sharp_lines(found)]
+    found = found[sharp_lines(found)[0]]
     stage = capture.stage_mm[:]
     return ScanStripes(
         capture.path.name, found.frame, found.line, found.centre_px,
