@@ -912,7 +912,7 @@ def thesis(
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     if joint:
-        _compare_jointly(folder, overwrite=overwrite)
+        _compare_jointly(folder, workers=workers, again=again, overwrite=overwrite)
         return
     tables, campaigns = load_published(published), campaign_folders(folder)
     refuse_unsuitable(folder / "report.html", overwrite=overwrite)
@@ -994,16 +994,15 @@ def _led_through(
     return (target, (), step, plan.poses) if plan.target_in_air() else ((), target, step, plan.poses)
 
 
-def _compare_jointly(folder: Path, *, overwrite: bool) -> None:
+def _compare_jointly(folder: Path, *, workers: int | None, again: bool, overwrite: bool) -> None:
     """Compare the joint calibration with the thesis's ways on all campaigns of a folder."""
     from uwlts.thesis.folder import campaign_folders
-    from uwlts.thesis.joint_comparison import compare_campaign, summary_lines, write_joint_summary
+    from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_summary
 
     refuse_unsuitable(folder / "summary.json", overwrite=overwrite)
-    results = []
-    for campaign in campaign_folders(folder):
-        with progress_bar(f"comparing {campaign.path.name}") as progress:
-            results.append(compare_campaign(campaign, progress=progress))
+    campaigns = campaign_folders(folder)
+    with progress_bar("comparing campaigns") as progress:
+        results = compare_campaigns(campaigns, workers=workers, again=again, progress=progress)
     print("\n".join(summary_lines(write_joint_summary(folder, results, overwrite=overwrite))))
     print(f"wrote {folder / 'summary.json'}")
 

@@ -18,7 +18,7 @@ from uwlts.capture import Capture
 from uwlts.scan import find_stripes
 from uwlts.thesis.evaluation import evaluate_campaign
 from uwlts.thesis.folder import CampaignFolder
-from uwlts.thesis.joint_comparison import compare_campaign, joint_summary, summary_lines
+from uwlts.thesis.joint_comparison import compare_campaigns, joint_summary, summary_lines
 from uwlts.thesis.measurements import measure_scan
 from uwlts.thesis.methods import TWO, calibrations
 
@@ -130,7 +130,7 @@ def test_noise_of_two_hundredths_is_noticed(edition, results, tmp_path, monkeypa
 
 def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(edition: CampaignFolder, results: dict):
     """The laser's window is tilted by 0.1 deg, which neither of the thesis's ways knows of."""
-    summary = joint_summary([compare_campaign(edition)])
+    summary = joint_summary(compare_campaigns([edition]))
     spacing = {way: np.abs(errors) for way, errors in summary["spacing_error_mm"].items()}
     assert spacing["joint"].max() < 0.01
     assert spacing["joint"].mean() < 0.5 * spacing["one_refraction"].mean()

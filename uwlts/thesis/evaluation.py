@@ -17,11 +17,11 @@ from uwlts.calibration.polynomial_model import PolynomialCalibration
 from uwlts.calibration.procedure import CalibrationOptions, gather
 from uwlts.capture import Capture
 from uwlts.errors import CaptureError
-from uwlts.files import written_aside
 from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
 from uwlts.scan import AnyCalibration, reconstruct_capture
 from uwlts.thesis.budget import spacing_budget
 from uwlts.thesis.folder import MEDIA, CampaignFolder, ScanFile
+from uwlts.thesis.kept_results import keep, kept, up_to_date
 from uwlts.thesis.measurements import THESIS, Measurement, measure_scan
 from uwlts.thesis.methods import POLYNOMIALS, PROPOSED, TWO, calibrations
 from uwlts.thesis.monte_carlo import propagate
@@ -52,21 +52,19 @@ def evaluate_campaign(
         The recordings do not determine a calibration.
     """
     path = folder.path / RESULTS
-    if path.is_file() and not overwrite and not _has_newer_recordings(folder.path, path):
+    if not overwrite and up_to_date(path):
         results = read_results(path)
         if trials in (0, results["trials"]):
             return results
         calibrated = calibrations(folder)
         scans = _sphere_scans(folder, calibrated[PROPOSED, "water"])
-        return _kept(path, results | _monte_carlo(folder, scans, trials, workers, progress))
+        return _keep(path, results | _monte_carlo(folder, scans, trials, workers, progress))
     calibrated = calibrations(folder, progress=lambda done, total: progress("calibrations", done, total))
     measurements = _measured(folder, calibrated, workers, progress)
     proposed = calibrated[PROPOSED, "water"]
     scans = _sphere_scans(folder, proposed)
     choices, profiles = window_choices(folder, proposed, scans)
     results = {
-        "format": FORMAT,
-        "version": VERSION,
         "measurements": [asdict(found) for found in measurements],
         "window": {choice.images: asdict(choice) for choice in choices},
         "window_profiles": profiles,
@@ -75,31 +73,16 @@ def evaluate_campaign(
         "budget": _budget(folder, measurements, proposed, scans),
         "line_profiles": {side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
     }
-    return _kept(path, results | _monte_carlo(folder, scans, trials, workers, progress))
+    return _keep(path, results | _monte_carlo(folder, scans, trials, workers, progress))
 
 
-def _kept(path: Path, results: dict[str, Any]) -> dict[str, Any]:
-    """The results, after they have been written to their file."""
-    with written_aside(path, overwrite=True) as aside:
-        aside.write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
-    return results
-
-
-def _has_newer_recordings(folder: Path, results: Path) -> bool:
-    finished = results.stat().st_mtime_ns
-    return any(path.stat().st_mtime_ns > finished for path in folder.glob("*.h5"))
+def _keep(path: Path, results: dict[str, Any]) -> dict[str, Any]:
+    return keep(path, results, format=FORMAT, version=VERSION)
 
 
 def read_results(path: Path) -> dict[str, Any]:
     """Results as `evaluate_campaign` has kept them; CaptureError where the file is damaged or newer."""
-    try:
-        results = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"cannot read {path}: {error}; remove it to evaluate the campaign again") from error
-    known = isinstance(results, dict) and (results.get("format"), results.get("version")) == (FORMAT, VERSION)
-    if not known:
-        raise CaptureError(f"{path} holds no results that this program reads; remove it to evaluate again")
-    return results
+    return kept(path, format=FORMAT, version=VERSION)
 
 
 def _measured(

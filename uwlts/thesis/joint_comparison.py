@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,13 @@ from uwlts.files import written_aside
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.scan import find_stripes, reconstruct_stripes
 from uwlts.thesis.folder import CampaignFolder, ScanFile
+from uwlts.thesis.kept_results import keep, kept, up_to_date
 from uwlts.thesis.methods import PROPOSED, TWO, calibrations
 from uwlts.uncertainty.figures import figure_uncertainties
+from uwlts.workers import Tell, work_through
 
+RESULTS = "joint.json"
+FORMAT, VERSION = "uwlts-joint-comparison", 1
 ONE_REFRACTION, TWO_REFRACTIONS, JOINT = "one_refraction", "two_refractions", "joint"
 _COVERAGE = 1.96
 _SPACING, _DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
@@ -58,20 +62,54 @@ def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
     return calibration, taken_s
 
 
-def compare_campaign(folder: CampaignFolder, *, progress: Progress = lambda done, total: None) -> dict[str, Any]:
+def compare_campaigns(
+    folders: Sequence[CampaignFolder], *, workers: int | None = None, again: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Errors of every scan of spheres and planes by the three ways, with the joint one's uncertainties, as plain JSON.
+
+    Those of each campaign are kept in its folder, and read from there unless ``again`` is set or a recording is newer.
+    ``progress(done, total)`` counts scans.
 
     Raises
     ------
     CaptureError, CalibrationError, EvaluationError
         A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
+    SetupError
+        A process that works on a campaign was ended from outside.
     """
+    total, done = sum(len(_compared(folder)) for folder in folders), 0
+
+    def heard(_: None) -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    jobs = [_Job(folder, again) for folder in folders]
+    return work_through(_compare, jobs, workers=workers, heard=heard)
+
+
+@dataclass(frozen=True)
+class _Job:
+    folder: CampaignFolder
+    again: bool
+
+
+def _compared(folder: CampaignFolder) -> list[ScanFile]:
+    return [scan for scan in folder.scans() if scan.thing in ("spheres", "plane")]
+
+
+def _compare(job: _Job, tell: Tell) -> dict[str, Any]:
+    """Tells of every scan."""
+    folder, path = job.folder, job.folder.path / RESULTS
+    if not job.again and up_to_date(path):
+        for _ in _compared(folder):
+            tell(None)
+        return kept(path, format=FORMAT, version=VERSION)
     by_turns = calibrations(folder)
     joint, solve_s = joint_calibration(folder)
-    scans = [scan for scan in folder.scans() if scan.thing in ("spheres", "plane")]
     spheres, planes = [], []
-    for number, scan in enumerate(scans):
-        progress(number, len(scans))
+    for scan in _compared(folder):
         known = {JOINT: joint, ONE_REFRACTION: by_turns[PROPOSED, scan.medium]}
         if (TWO, scan.medium) in by_turns:
             known[TWO_REFRACTIONS] = by_turns[TWO, scan.medium]
@@ -79,8 +117,9 @@ def compare_campaign(folder: CampaignFolder, *, progress: Progress = lambda done
             spheres.append(_of_spheres(scan, known))
         else:
             planes.append(_of_plane(scan, joint))
-    progress(len(scans), len(scans))
-    return {"campaign": folder.path.name, "solve_s": solve_s, "spheres": spheres, "planes": planes}
+        tell(None)
+    results = {"campaign": folder.path.name, "solve_s": solve_s, "spheres": spheres, "planes": planes}
+    return keep(path, results, format=FORMAT, version=VERSION)
 
 
 def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]:
@@ -113,7 +152,9 @@ def _of_plane(scan: ScanFile, joint: Calibration) -> dict[str, Any]:
             distance_mm=float(window.reach_mm(depth)),
         )  # fmt: skip
     limit = across * leaning / np.tan(setup.triangulation_angle_rad)
-    return {"placement": scan.placement, "medium": scan.medium, "std_mm": std_mm, "over_limit": std_mm / limit}
+    return {
+        "placement": scan.placement, "medium": scan.medium, "std_mm": std_mm, "over_limit": float(std_mm / limit),
+    }  # fmt: skip
 
 
 def joint_summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
