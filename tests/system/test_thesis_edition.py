@@ -129,12 +129,20 @@ def test_noise_of_two_hundredths_is_noticed(edition, results, tmp_path, monkeypa
 
 
 def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(edition: CampaignFolder, results: dict):
-    """The laser's window is tilted by 0.1 deg, which neither of the thesis's ways knows of."""
+    """The laser's window is tilted by 0.1 deg, which neither of the thesis's ways knows of.
+
+    Seven profiles of each sphere leave the joint one 0.005 mm of spacing and 0.007 mm of diameter.
+    """
     summary = joint_summary(compare_campaigns([edition]))
-    spacing = {way: np.abs(errors) for way, errors in summary["spacing_error_mm"].items()}
+    spacing, diameter = (
+        {way: np.abs(errors) for way, errors in summary[name].items()}
+        for name in ("spacing_error_mm", "diameter_error_mm")
+    )
     assert spacing["joint"].max() < 0.01
-    assert spacing["joint"].mean() < 0.5 * spacing["one_refraction"].mean()
-    assert np.abs(summary["diameter_error_mm"]["joint"]).max() < 0.03
+    assert diameter["joint"].max() < 0.015
+    for way in ("one_refraction", "two_refractions"):
+        assert spacing["joint"].mean() < 0.8 * spacing[way].mean()
+        assert diameter["joint"].mean() < 0.5 * diameter[way].mean()
     assert max(summary["plane_std_over_speckle_limit"]) < 1.5
     assert summary["coverage_95"] is not None
     assert not summary["air"]["spacing_error_mm"]
