@@ -150,3 +150,15 @@ def test_processes_end_with_their_command(tmp_path: Path, how: str):
     output, errors = command.communicate(timeout=30)
     assert (command.returncode, output, errors) == (-signal.SIGKILL if how == "kill" else 130, "", "")
     assert len(list(tmp_path.glob("*.begun"))) == len(list(tmp_path.glob("*.stopped")))
+
+
+def threads(job, tell):
+    return os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("OMP_NUM_THREADS")
+
+
+def test_workers_do_linear_algebra_in_one_thread_unless_told_otherwise(monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert work_through(threads, [0, 1], workers=2) == [("1", "3")] * 2
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    assert os.environ["OMP_NUM_THREADS"] == "3"

@@ -4,7 +4,7 @@ import numpy as np
 
 from uwlts.errors import RangeError
 
-RIM_POINTS = 64
+RIM_POINTS = 16
 
 
 def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
