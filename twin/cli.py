@@ -236,7 +236,8 @@ def reproduce(
     campaign
         Name or path of the campaign's description; "thesis" unless given, or "joint" with --joint.
     joint
-        Compare the joint calibration with the thesis's two ways on the same images; writes OUT/summary.json.
+        Compare the joint calibration with the thesis's two ways on the same images; writes OUT/report.html and
+        summary.json.
     out
         Folder for campaigns and report; runs/CAMPAIGN unless given.
     campaigns

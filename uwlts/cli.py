@@ -896,7 +896,7 @@ def thesis(
     workers
         Scans measured at a time; as many as there are processors unless given.
     joint
-        Compare the joint calibration with the thesis's two ways instead; writes summary.json.
+        Compare the joint calibration with the thesis's two ways instead; writes report.html and summary.json.
     again
         Evaluate campaigns anew that have results already.
     overwrite
@@ -999,12 +999,13 @@ def _compare_jointly(folder: Path, *, workers: int | None, again: bool, overwrit
     from uwlts.thesis.folder import campaign_folders
     from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_summary
 
-    refuse_unsuitable(folder / "summary.json", overwrite=overwrite)
+    for name in ("report.html", "summary.json"):
+        refuse_unsuitable(folder / name, overwrite=overwrite)
     campaigns = campaign_folders(folder)
     with progress_bar("comparing campaigns") as progress:
         results = compare_campaigns(campaigns, workers=workers, again=again, progress=progress)
     print("\n".join(summary_lines(write_joint_summary(folder, results, overwrite=overwrite))))
-    print(f"wrote {folder / 'summary.json'}")
+    print(f"wrote {folder / 'report.html'} and summary.json")
 
 
 def _warn(text: str) -> None:

@@ -22,6 +22,7 @@ from uwlts.files import written_aside
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.scan import find_stripes, reconstruct_stripes
 from uwlts.thesis.folder import CampaignFolder, ScanFile
+from uwlts.thesis.joint_page import joint_page
 from uwlts.thesis.kept_results import keep, kept, up_to_date
 from uwlts.thesis.methods import PROPOSED, TWO, calibrations
 from uwlts.uncertainty.figures import figure_uncertainties
@@ -175,9 +176,13 @@ def joint_summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def write_joint_summary(folder: Path, results: Sequence[dict[str, Any]], *, overwrite: bool = False) -> dict[str, Any]:
-    """Write summary.json into a folder, whole or not at all; OutputError where that fails."""
+    """Write report.html and summary.json into a folder, each whole or not at all; OutputError where that fails."""
     summary = joint_summary(results)
-    with written_aside(folder / "summary.json", overwrite=overwrite) as aside:
+    with (
+        written_aside(folder / "report.html", overwrite=overwrite) as page,
+        written_aside(folder / "summary.json", overwrite=overwrite) as aside,
+    ):
+        page.write_text(joint_page(results, summary), encoding="utf-8")
         aside.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return summary
 

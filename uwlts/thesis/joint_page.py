@@ -1,0 +1,77 @@
+"""The joint comparison as a page to read."""
+
+from collections.abc import Sequence
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment
+from markupsafe import Markup
+
+import uwlts
+from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
+
+_WORDS = {"one_refraction": "one refraction", "two_refractions": "two refractions", "joint": "joint"}
+_QUANTITIES = {
+    "spacing_error_mm": ("sphere spacing", ("SSE",)),
+    "diameter_error_mm": ("sphere diameter", ("diameter error sphere 1", "diameter error sphere 2")),
+}
+# Side by side within each campaign.
+_BESIDE = {"one_refraction": -0.2, "two_refractions": 0.0, "joint": 0.2}
+
+
+def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
+    """The page as text, from the results of `compare_campaigns` and their `joint_summary`."""
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    text = files("uwlts.thesis").joinpath("joint.html.j2").read_text(encoding="utf-8")
+    media = [medium for medium in ("water", "air") if any(summary[medium]["spacing_error_mm"].values())]
+    return environment.from_string(text).render(
+        software=f"uwlts {uwlts.__version__}", campaigns=summary["campaigns"], solve_s=max(summary["solve_s"]),
+        media=[
+            {
+                "name": medium,
+                "rows": _rows(summary[medium]),
+                "over_limit": summary[medium]["plane_std_over_speckle_limit"],
+                "coverage": summary[medium]["coverage_95"],
+                "picture": Markup(svg(_panels(results, medium))),
+            }
+            for medium in media
+        ],
+    )  # fmt: skip
+
+
+def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
+    """Mean and largest error by quantity and way, and how many times the joint one's mean."""
+    rows = []
+    for name, (quantity, _) in _QUANTITIES.items():
+        means = {way: float(np.mean(np.abs(errors))) for way, errors in part[name].items()}
+        rows += [
+            {
+                "quantity": quantity, "way": _WORDS[way], "mean": mean,
+                "largest": float(np.max(np.abs(part[name][way]))), "times": mean / means["joint"],
+                "number": len(part[name][way]),
+            }
+            for way, mean in means.items()
+        ]  # fmt: skip
+    return rows
+
+
+def _panels(results: Sequence[dict[str, Any]], medium: str) -> list[Panel]:
+    """Errors of all scans by campaign; the joint ones with their stated 95 % intervals."""
+    panels = []
+    for quantity, figures in _QUANTITIES.values():
+        curves = []
+        for colour, (way, words) in zip((COLOURS[5], COLOURS[1], COLOURS[0]), _WORDS.items(), strict=True):
+            points = [
+                (place + _BESIDE[way] + 0.03 * (number - 2.5), scan[way][figure], scan["std"][figure])
+                for place, result in enumerate(results)
+                for number, scan in enumerate(s for s in result["spheres"] if s["medium"] == medium and way in s)
+                for figure in figures
+            ]
+            if points:
+                x, y, std = np.array(points).T
+                error = 1960 * std if way == "joint" else None
+                name = words if error is None else f"{words}, with the stated 95 % intervals"
+                curves.append(Curve(name, x, 1000 * y, colour, error, joined=False))
+        panels.append(Panel(f"{quantity} in {medium}", "campaign", "error / µm", curves))
+    return panels
