@@ -5,6 +5,9 @@ is left is what speckle, noise and the methods do. Images depend on the seeds al
 what was measured; the injected errors show that 0.02 mm more or less does not pass.
 """
 
+import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -147,3 +150,19 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(edition: C
     assert summary["coverage_95"] is not None
     assert not summary["air"]["spacing_error_mm"]
     assert summary_lines(summary)[0].startswith("water, error of the sphere spacing")
+
+
+def test_models_are_chosen_as_the_sensor_was_built(edition: CampaignFolder, tmp_path: Path):
+    """Camera's and laser's windows are tilted by 0.08 and 0.1 deg, the lens has k1 and k2, and the sheet no bow."""
+    page, folder = tmp_path / "models.html", edition.path
+    command = [sys.executable, "-m", "uwlts.cli", "models", "--air", folder / "target-bare.h5", "--out", page]
+    command += ["--water", folder / "target-water.h5", "--step", *sorted(folder.glob("step-*-water.h5"))]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    content = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))
+    assert content["simplest"] == "sheet without bow"
+    needed = {"one refraction", "window not tilted", "laser window not turned", "no distortion", "distortion k1"}
+    adds = {model["model"]: model["outside"]["adds_mm"] or 0.0 for model in content["models"]}
+    assert {name for name, more in adds.items() if more > 0.002} == needed
+    assert "polynomials" in done.stdout
+    assert "<svg" in page.read_text(encoding="utf-8")
