@@ -27,6 +27,9 @@ MOST_BLUR_PX = 0.1
 _REACH_MM = 2.0
 """Images taken within this way of the stage tell of the brightness at a point."""
 
+_LEAST_APART_MM = 0.05
+"""Least standard deviation of the positions of images for their brightness to be compared: a third of a sheet."""
+
 _LINES = 12
 _BEND_LINES = 6
 _LEAST_SHARE = 0.2
@@ -83,7 +86,7 @@ def beside_sheet(
 
 
 def slopes_of_brightness(
-    frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray
+    frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray, exposure_ms: np.ndarray
 ) -> np.ndarray:
     """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where neighbours do not tell it.
 
@@ -95,7 +98,9 @@ def slopes_of_brightness(
     amplitude : (N,)
         Positive.
     stage_mm : (F,)
-        Position of every image.
+        Position of every image, in any order; several may be taken at one.
+    exposure_ms : (F,)
+        Of every image; where that is not known of all, they are taken for exposed alike.
     """
     order = np.argsort(stage_mm, kind="stable")
     rank = np.empty(len(order), np.intp)
@@ -103,11 +108,13 @@ def slopes_of_brightness(
     used = np.unique(rank[frame])
     row = np.searchsorted(used, rank[frame])
     position = stage_mm[order][used]
-    step = float(np.median(np.diff(position))) if len(position) > 1 else np.inf
-    reach = int(_REACH_MM / step) if step > 0 else 0
+    within = np.searchsorted(position, position + _REACH_MM, side="right") - np.arange(len(position)) - 1
+    whole = position <= position[-1] - _REACH_MM
+    reach = int(np.median(within[whole])) if whole.any() else len(position) - 1
     if reach < 1:
         return np.zeros(len(frame))
-    by_stage, _ = _slopes(row, line, np.log(amplitude), position, rows=reach, columns=_LINES)
+    exposure = exposure_ms[frame] if np.all(exposure_ms[np.unique(frame)] > 0) else 1.0
+    by_stage, _ = _slopes(row, line, np.log(amplitude / exposure), position, rows=reach, columns=_LINES)
     return by_stage
 
 
@@ -161,9 +168,10 @@ def _slopes(
     ss, xx, sx = mean(s * s) - ms * ms, mean(x * x) - mx * mx, mean(s * x) - ms * mx
     sz, xz = mean(s * z) - ms * mz, mean(x * z) - mx * mz
     wide = (share > _LEAST_SHARE) & (xx > 1.0)
-    # Neighbours in a row, or in the same images only, tell nothing of the slope across it.
-    steps = np.median(np.diff(position)) if len(position) > 1 else 1.0
-    deep = wide & (ss > 0.15 * steps**2) & (ss * xx - sx * sx > 1e-3 * ss * xx)
+    # Neighbours in a row, or in images taken nearly at one place, tell nothing of the slope across it.
+    step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
+    least = max(0.15 * step**2, _LEAST_APART_MM**2)
+    deep = wide & (ss > least) & (ss < _REACH_MM**2) & (ss * xx - sx * sx > 1e-3 * ss * xx)
     by_position, by_column = np.zeros(shape), np.zeros(shape)
     np.divide(sz * xx - xz * sx, ss * xx - sx * sx, out=by_position, where=deep)
     np.divide(xz, xx, out=by_column, where=wide)

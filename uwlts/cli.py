@@ -997,14 +997,15 @@ def _led_through(
 def _compare_jointly(folder: Path, *, workers: int | None, again: bool, overwrite: bool) -> None:
     """Compare the joint calibration with the thesis's ways on all campaigns of a folder."""
     from uwlts.thesis.folder import campaign_folders
-    from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_summary
+    from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines
+    from uwlts.thesis.joint_page import write_joint_comparison
 
     for name in ("report.html", "summary.json"):
         refuse_unsuitable(folder / name, overwrite=overwrite)
     campaigns = campaign_folders(folder)
     with progress_bar("comparing campaigns") as progress:
         results = compare_campaigns(campaigns, workers=workers, again=again, progress=progress)
-    print("\n".join(summary_lines(write_joint_summary(folder, results, overwrite=overwrite))))
+    print("\n".join(summary_lines(write_joint_comparison(folder, results, overwrite=overwrite))))
     print(f"wrote {folder / 'report.html'} and summary.json")
 
 

@@ -284,7 +284,9 @@ def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, i
     """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
     if np.isfinite(capture.pose).any():
         return np.zeros((len(stripes.line), 3))
-    slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm[:])
+    slopes = slopes_of_brightness(
+        stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm[:], capture.exposure_ms[:]
+    )
     header = capture.header
     return beside_sheet(
         calibration, header.sensor, stripes.line, stripes.centre_px, slopes, medium_index=index,

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from uwlts.errors import OutputError
-from uwlts.thesis.joint_comparison import summary_lines, write_joint_summary
+from uwlts.thesis.joint_comparison import summary_lines
+from uwlts.thesis.joint_page import write_joint_comparison
 
 FIGURES = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
 
@@ -29,7 +30,7 @@ def result(number):
 
 def test_summary_and_page_say_the_same(tmp_path):
     results = [result(0), result(1)]
-    summary = write_joint_summary(tmp_path, results)
+    summary = write_joint_comparison(tmp_path, results)
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8")) == summary
     assert summary["spacing_error_mm"]["joint"] == [0.0, 0.01]
     assert summary["diameter_error_mm"]["two_refractions"] == [0.06, -0.03] * 2
@@ -49,7 +50,7 @@ def test_summary_and_page_say_the_same(tmp_path):
 
 
 def test_existing_results_are_not_overwritten(tmp_path):
-    write_joint_summary(tmp_path, [result(1)])
+    write_joint_comparison(tmp_path, [result(1)])
     with pytest.raises(OutputError, match="report.html"):
-        write_joint_summary(tmp_path, [result(1)])
-    write_joint_summary(tmp_path, [result(2)], overwrite=True)
+        write_joint_comparison(tmp_path, [result(1)])
+    write_joint_comparison(tmp_path, [result(2)], overwrite=True)

@@ -115,6 +115,16 @@ def test_one_step_tells_the_index_of_colder_water(earlier, thesis):
     assert change.name == "water 2"
 
 
+def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thesis):
+    """Two waters, in one of which the stripe lies on the lower tread alone."""
+    evidence = steps(thesis)
+    flat = replace(evidence.steps[0][0], pixels=tread(15.0, index=INDEX, beyond=31.0))
+    evidence = replace(evidence, media=evidence.media | {"pool": COLD}, steps=[*evidence.steps, (flat, View(True, 1))])
+    result = refreshed(earlier, evidence, index_std=POORLY_KNOWN)
+    assert [change.name for change in result.changes] == ["water 2"]
+    assert "step: left out" in result.warnings[0]
+
+
 def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
     result = refreshed(earlier, steps(thesis, depths_mm=(-45.0, -15.0, 15.0, 60.0, 85.0)), index_std=POORLY_KNOWN)
     change = result.changes[0]

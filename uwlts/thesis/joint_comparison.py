@@ -1,11 +1,9 @@
 """The joint calibration against the thesis's two ways, on the same images of its campaign."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,11 +16,9 @@ from uwlts.capture import Capture
 from uwlts.design import speckle_limit_um
 from uwlts.design_table import nominal_setup
 from uwlts.evaluate import parse_artefact
-from uwlts.files import written_aside
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.scan import find_stripes, reconstruct_stripes
 from uwlts.thesis.folder import CampaignFolder, ScanFile
-from uwlts.thesis.joint_page import joint_page
 from uwlts.thesis.kept_results import keep, kept, up_to_date
 from uwlts.thesis.methods import PROPOSED, TWO, calibrations
 from uwlts.uncertainty.figures import figure_uncertainties
@@ -32,7 +28,7 @@ RESULTS = "joint.json"
 FORMAT, VERSION = "uwlts-joint-comparison", 1
 ONE_REFRACTION, TWO_REFRACTIONS, JOINT = "one_refraction", "two_refractions", "joint"
 _COVERAGE = 1.96
-_SPACING, _DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
+SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
 Progress = Callable[[int, int], None]
 
 
@@ -130,7 +126,7 @@ def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]
         for way, calibration in known.items():
             cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=way == JOINT).cloud
             evaluation = evaluate_cloud(cloud, artefact)
-            found[way] = {name: evaluation.figures_mm[name] for name in (_SPACING, *_DIAMETERS)}
+            found[way] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
             if way == JOINT:
                 std = figure_uncertainties(cloud, artefact, evaluation)
                 found["std"] = {name: std[name].expanded_mm / 2 for name in found[way]}
@@ -165,26 +161,14 @@ def joint_summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         spheres = [s for result in results for s in result["spheres"] if s["medium"] == medium]
         ways = [way for way in (ONE_REFRACTION, TWO_REFRACTIONS, JOINT) if spheres and way in spheres[0]]
         planes = [p["over_limit"] for result in results for p in result["planes"] if p["medium"] == medium]
-        inside = [abs(s[JOINT][n]) <= _COVERAGE * s["std"][n] for s in spheres for n in (_SPACING, *_DIAMETERS)]
+        inside = [abs(s[JOINT][n]) <= _COVERAGE * s["std"][n] for s in spheres for n in (SPACING, *DIAMETERS)]
         summary[medium] = {
-            "spacing_error_mm": {way: [s[way][_SPACING] for s in spheres] for way in ways},
-            "diameter_error_mm": {way: [s[way][n] for s in spheres for n in _DIAMETERS] for way in ways},
+            "spacing_error_mm": {way: [s[way][SPACING] for s in spheres] for way in ways},
+            "diameter_error_mm": {way: [s[way][n] for s in spheres for n in DIAMETERS] for way in ways},
             "plane_std_over_speckle_limit": planes,
             "coverage_95": float(np.mean(inside)) if inside else None,
         }
     return summary["water"] | {"solve_s": [result["solve_s"] for result in results]} | summary
-
-
-def write_joint_summary(folder: Path, results: Sequence[dict[str, Any]], *, overwrite: bool = False) -> dict[str, Any]:
-    """Write report.html and summary.json into a folder, each whole or not at all; OutputError where that fails."""
-    summary = joint_summary(results)
-    with (
-        written_aside(folder / "report.html", overwrite=overwrite) as page,
-        written_aside(folder / "summary.json", overwrite=overwrite) as aside,
-    ):
-        page.write_text(joint_page(results, summary), encoding="utf-8")
-        aside.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return summary
 
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:

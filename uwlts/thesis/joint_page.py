@@ -1,7 +1,9 @@
-"""The joint comparison as a page to read."""
+"""The joint comparison's files: a page to read, and its summary."""
 
+import json
 from collections.abc import Sequence
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,15 +11,30 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 import uwlts
+from uwlts.files import written_aside
 from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
+from uwlts.thesis.joint_comparison import DIAMETERS, JOINT, ONE_REFRACTION, SPACING, TWO_REFRACTIONS, joint_summary
 
-_WORDS = {"one_refraction": "one refraction", "two_refractions": "two refractions", "joint": "joint"}
+_WORDS = {ONE_REFRACTION: "one refraction", TWO_REFRACTIONS: "two refractions", JOINT: "joint"}
 _QUANTITIES = {
-    "spacing_error_mm": ("sphere spacing", ("SSE",)),
-    "diameter_error_mm": ("sphere diameter", ("diameter error sphere 1", "diameter error sphere 2")),
-}
+    "spacing_error_mm": ("sphere spacing", (SPACING,)), "diameter_error_mm": ("sphere diameter", DIAMETERS),
+}  # fmt: skip
 # Side by side within each campaign.
-_BESIDE = {"one_refraction": -0.2, "two_refractions": 0.0, "joint": 0.2}
+_BESIDE = {ONE_REFRACTION: -0.2, TWO_REFRACTIONS: 0.0, JOINT: 0.2}
+
+
+def write_joint_comparison(
+    folder: Path, results: Sequence[dict[str, Any]], *, overwrite: bool = False
+) -> dict[str, Any]:
+    """Write report.html and summary.json into a folder, each whole or not at all; OutputError where that fails."""
+    summary = joint_summary(results)
+    with (
+        written_aside(folder / "report.html", overwrite=overwrite) as page,
+        written_aside(folder / "summary.json", overwrite=overwrite) as aside,
+    ):
+        page.write_text(joint_page(results, summary), encoding="utf-8")
+        aside.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return summary
 
 
 def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
@@ -48,7 +65,7 @@ def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
         rows += [
             {
                 "quantity": quantity, "way": _WORDS[way], "mean": mean,
-                "largest": float(np.max(np.abs(part[name][way]))), "times": mean / means["joint"],
+                "largest": float(np.max(np.abs(part[name][way]))), "times": mean / means[JOINT],
                 "number": len(part[name][way]),
             }
             for way, mean in means.items()
@@ -70,7 +87,7 @@ def _panels(results: Sequence[dict[str, Any]], medium: str) -> list[Panel]:
             ]
             if points:
                 x, y, std = np.array(points).T
-                error = 1960 * std if way == "joint" else None
+                error = 1960 * std if way == JOINT else None
                 name = words if error is None else f"{words}, with the stated 95 % intervals"
                 curves.append(Curve(name, x, 1000 * y, colour, error, joined=False))
         panels.append(Panel(f"{quantity} in {medium}", "campaign", "error / µm", curves))

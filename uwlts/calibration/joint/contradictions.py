@@ -148,13 +148,11 @@ def _of_earlier(result: Estimate) -> tuple[list[str], list[str]]:
     if sigmas[worst] <= _DOUBTFUL:
         return [], []
     quantity = quantity_of(result.parameters.names[worst])
-    value, known, std = (quantity.factor * each[worst] for each in (result.values, earlier.values, before))
-    digits = max(0, int(np.ceil(1 - np.log10(std))))
+    value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
     words = (
         f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in the "
-        f"{quantity.words}: {value:.{digits}f} against {known:.{digits}f} +- {std:.2g}{quantity.unit and ' '}"
-        f"{quantity.unit}: check heights and media in the captures; if they are right, the sensor has changed, "
-        "calibrate again"
+        f"{quantity.words}: {quantity.shown(value, std)} against {quantity.shown_with(known, std)}: check heights and "
+        "media in the captures; if they are right, the sensor has changed, calibrate again"
     )
     return ([words], []) if sigmas[worst] > _WRONG else ([], [words])
 

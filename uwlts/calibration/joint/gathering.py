@@ -62,7 +62,18 @@ def gather_jointly(
     targets: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = (), *,
     options: CalibrationOptions, progress: Progress | None = None,
 ) -> Gathered:  # fmt: skip
-    """Find the target, the stripes on it and those on steps and scanned surfaces in all images."""
+    """Find the target, the stripes on it and those on steps and scanned surfaces in all images.
+
+    Raises
+    ------
+    CalibrationError
+        The captures come from different sensors, show no target or several, mean different media by one name, or no
+        step image shows a stripe.
+    DescriptionError
+        A capture describes its target wrongly, or not its step standard or what it scans.
+    CaptureError
+        A scan shows no stripe, or an image is damaged.
+    """
     sensor = common_sensor([*targets, *steps, *scans])
     media: dict[str, Medium] = {}
     views: dict[View, list[Capture]] = {}

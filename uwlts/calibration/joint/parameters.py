@@ -71,7 +71,7 @@ class Parameters:
         return np.concatenate([np.full(len(self.intrinsics.names), np.inf), [p.std for p in self._estimated()]])
 
     def prior_mean(self) -> np.ndarray:
-        """What each parameter (P,) is before; zero where nothing is known."""
+        """What each parameter (P,) is before: where nothing is known its start, of the lens's zero."""
         return np.concatenate([np.zeros(len(self.intrinsics.names)), [p.mean for p in self._estimated()]])
 
     def camera(self, values: np.ndarray) -> CameraModel:

@@ -1,4 +1,4 @@
-"""The joint calibration from captures: target images in air and in water, the stripes on it, steps; in any mix."""
+"""The joint calibration from captures: target images in air and in water, stripes on it, steps, scans; in any mix."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -111,9 +111,11 @@ def calibrate_jointly(
     Raises
     ------
     CalibrationError
-        The evidence does not determine the calibration or contradicts it.
+        No target is among the captures; the evidence does not determine the calibration or contradicts it.
     DescriptionError
-        A capture does not describe its target, its step standard or what it scans.
+        A capture describes its target wrongly, or not its step standard or what it scans.
+    CaptureError
+        A scan shows no stripe, or an image is damaged.
     """
     options = CalibrationOptions() if options is None else options
     return solve_jointly(gather_jointly(targets, steps, scans, options=options, progress=progress), options=options)
@@ -122,6 +124,8 @@ def calibrate_jointly(
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
     """What is to be estimated from what the captures show, with a start; errors as `calibrate_jointly`."""
     sensor, warnings = gathered.sensor, list(gathered.warnings)
+    if not gathered.series:
+        raise CalibrationError("no capture shows a target: the joint calibration starts with one in air or in water")
     refuse_two_lenses(gathered)
     window = None
     if any(view.window for view in gathered.views()):

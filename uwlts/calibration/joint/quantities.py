@@ -11,12 +11,21 @@ _DEG = float(np.degrees(1.0))
 class Quantity:
     """A parameter in words, its unit as shown, and how much of that unit one of the estimate's is.
 
-    Slopes of the window's normal count as angles: at 1 deg that is right to a part in 10 000.
+    Slopes count as angles: at 1 deg that is right to a part in 10 000.
     """
 
     words: str
     unit: str = ""
     factor: float = 1.0
+
+    def shown(self, value: float, std: float) -> str:
+        """A value of the estimate as a number of the unit, to the digits that its standard uncertainty leaves."""
+        digits = max(0, int(np.ceil(1 - np.log10(self.factor * std))))
+        return f"{self.factor * value:.{digits}f}"
+
+    def shown_with(self, value: float, std: float) -> str:
+        """The same with the standard uncertainty and the unit."""
+        return f"{self.shown(value, std)} +- {self.factor * std:.2g}{self.unit and ' '}{self.unit}"
 
 
 _QUANTITIES = {
@@ -36,8 +45,8 @@ _QUANTITIES = {
     "sheet_bow": Quantity("bow of the sheet", "°", _DEG),
     "laser_window_turn": Quantity("turn of the laser's window", "°", _DEG),
     "stage_scale": Quantity("scale of the stage", "µm/m", 1e6),
-    "scan_slope_1": Quantity("lean of the scan's direction, first across", "°", _DEG),
-    "scan_slope_2": Quantity("lean of the scan's direction, second across", "°", _DEG),
+    "scan_slope_1": Quantity("lean of the scan's direction (X towards Y)", "°", _DEG),
+    "scan_slope_2": Quantity("lean of the scan's direction (X towards Z)", "°", _DEG),
     "target_bow": Quantity("bend of the target", "µm", 1e3),
 }
 

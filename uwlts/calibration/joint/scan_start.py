@@ -59,6 +59,8 @@ def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> Scan
         The capture does not describe spheres, a plane or a pipe.
     CaptureError
         No image shows a stripe.
+    CalibrationError
+        The images carry poses of their own.
     """
     wanted = "a scan to calibrate from shows spheres, a plane or a pipe, described as its artefact"
     if capture.header.artefact is None:
@@ -69,12 +71,17 @@ def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> Scan
         raise DescriptionError(f"{capture.path.name} does not describe what it shows: {error}") from error
     if not isinstance(artefact, Scanned):
         raise DescriptionError(f"{capture.path.name} shows a {artefact.kind}: {wanted}")
+    if np.isfinite(capture.pose).any():
+        raise CalibrationError(
+            f"the images of {capture.path.name} carry poses: in a scan to calibrate from the stage alone moves the "
+            "sensor, take one without poses"
+        )
     found = find_stripes(capture, options=stripe)
     found = found[sharp_lines(found)[0]]
     stage = capture.stage_mm[:]
     return ScanStripes(
         capture.path.name, found.frame, found.line, found.centre_px,
-        slopes_of_brightness(found.frame, found.line, found.amplitude, stage), stage,
+        slopes_of_brightness(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]), stage,
         np.array(capture.header.stage_direction), artefact, view,
     )  # fmt: skip
 
@@ -104,7 +111,7 @@ def surface_scan(
     often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS
     good = often & (np.abs(stripes.slopes) < _STEEPEST) & np.isfinite(points).all(axis=1)
     if not good.any():
-        raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} profile lines")
+        raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} profile lines, sharp and evenly bright")
     there = np.flatnonzero(good)
     there = there[:: -(-len(there) // _MOST_POINTS)]
     artefact = stripes.artefact

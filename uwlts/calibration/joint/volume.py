@@ -1,6 +1,6 @@
 """What a joint estimate's uncertainty does to points and lengths over the volume that its evidence covers.
 
-The volume is the region of the sheet in which stripes lay on targets and steps, as an outline in the plane of the OCS's
+The volume is the region of the sheet in which stripes lay on what was seen, as an outline in the plane of the OCS's
 Y and Z: what is measured elsewhere is extrapolated. Lengths between two of its points do not change when all of it
 moves rigidly, so that what only moves the sensor's frame does not count.
 """

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.estimate import Estimate
-from uwlts.calibration.joint.volume import Lengths, estimate_in, lengths_over, regions
+from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_over, regions
 from uwlts.calibration.model import Calibration
 
 
@@ -56,7 +56,7 @@ class WaterChange:
 
 
 def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChange]:
-    """What an estimate to which an earlier one was known says of the media that are new in it.
+    """What an estimate to which an earlier one was known says of the media that are new in it and were seen.
 
     Parameters
     ----------
@@ -71,12 +71,13 @@ def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChang
     covariance[:count] = 0.0
     covariance[:count, :count] = parameters.earlier.covariance
     std_before, std = np.sqrt(np.diag(covariance)), result.std()
+    seen = {region.view.medium: region for region in regions(calibration)}
     found = []
     for number, name in enumerate(parameters.media):
         place = parameters.names.index(f"index of {name}")
-        if place < count:
+        if place < count or number not in seen:
             continue
-        lengths = _lengths(calibration, number)
+        lengths = _lengths(calibration, seen[number])
         found.append(
             WaterChange(
                 name, float(before[place]), float(std_before[place]), float(result.values[place]),
@@ -87,8 +88,7 @@ def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChang
     return found
 
 
-def _lengths(calibration: Calibration, medium: int) -> Lengths | None:
-    region = next(region for region in regions(calibration) if region.view.medium == medium)
+def _lengths(calibration: Calibration, region: Region) -> Lengths | None:
     return lengths_over(calibration, estimate_in(calibration, region), region) if region.has_area() else None
 
 
