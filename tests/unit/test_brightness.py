@@ -104,14 +104,47 @@ def test_slopes_are_those_of_the_brightness_up_to_the_borders():
     stage = np.array([5.0, 0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0])
     there = np.abs(line - 130) < 10 + 3 * frame
     amplitude = 40.0 * np.exp(0.3 * stage[frame] - 0.02 * line)
-    slopes = slopes_of_brightness(frame[there], line[there], amplitude[there], stage)
+    slopes = slopes_of_brightness(frame[there], line[there], amplitude[there], stage, np.ones(9))
     np.testing.assert_allclose(slopes, 0.3, atol=1e-9)
 
 
-@pytest.mark.parametrize("stage", [np.zeros(4), np.arange(4) * 5.0, np.array([1.0])])
+@pytest.mark.parametrize(
+    "stage",
+    [
+        np.array([0.0, 1.0]),
+        np.arange(0.0, 3.0, 0.05),
+        np.repeat(np.arange(8.0), 2),
+        np.concatenate([np.arange(8.0), np.arange(8.0)[::-1] + 0.002]),
+    ],
+    ids=["two images", "fine steps", "two images at each place", "there and back"],
+)
+def test_slopes_are_found_however_the_stage_goes(stage):
+    frame, line = (a.ravel() for a in np.meshgrid(np.arange(len(stage)), np.arange(40), indexing="ij"))
+    # Bent, so that neighbours beyond the reach would show.
+    amplitude = 40.0 * np.exp(0.3 * stage[frame] + 0.05 * stage[frame] ** 2)
+    slopes = slopes_of_brightness(frame, line, amplitude, stage, np.ones(len(stage)))
+    inner = (stage[frame] > 1.9) & (stage[frame] < stage.max() - 1.9)
+    np.testing.assert_allclose(slopes[inner], 0.3 + 0.1 * stage[frame][inner], atol=0.02)
+    assert np.abs(slopes - 0.3 - 0.1 * stage[frame]).max() < 0.11
+
+
+def test_exposures_do_not_show_in_the_slopes():
+    stage, exposure = np.arange(9.0), np.array([1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 2.0, 2.0, 2.0])
+    frame, line = (a.ravel() for a in np.meshgrid(np.arange(9), np.arange(40), indexing="ij"))
+    amplitude = exposure[frame] * np.exp(0.3 * stage[frame])
+    np.testing.assert_allclose(slopes_of_brightness(frame, line, amplitude, stage, exposure), 0.3, atol=1e-9)
+    alike = slopes_of_brightness(frame, line, np.exp(0.3 * stage[frame]), stage, np.zeros(9))
+    np.testing.assert_allclose(alike, 0.3, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [np.zeros(4), 5.0 + 0.001 * np.array([0.3, -1.2, 0.8, 0.1]), np.arange(4) * 5.0, np.array([1.0])],
+    ids=["one place", "one place, as read back", "far apart", "one image"],
+)
 def test_images_at_one_place_or_far_apart_tell_no_slope(stage):
     frame, line = (a.ravel() for a in np.meshgrid(np.arange(len(stage)), np.arange(50), indexing="ij"))
-    assert not slopes_of_brightness(frame, line, 10.0 + frame, stage).any()
+    assert not slopes_of_brightness(frame, line, 10.0 + frame, stage, np.ones(len(stage))).any()
 
 
 def test_speckle_hardly_shows_in_the_slopes():
@@ -119,7 +152,7 @@ def test_speckle_hardly_shows_in_the_slopes():
     rng = np.random.default_rng(3)
     frame, line = (a.ravel() for a in np.meshgrid(np.arange(40), np.arange(400), indexing="ij"))
     amplitude = 60.0 * np.exp(0.2 * rng.standard_normal(len(frame)))
-    slopes = slopes_of_brightness(frame, line, amplitude, np.arange(40.0))
+    slopes = slopes_of_brightness(frame, line, amplitude, np.arange(40.0), np.ones(40))
     inner = (frame > 1) & (frame < 38) & (line > 12) & (line < 388)
     assert np.std(slopes[inner]) == pytest.approx(0.2 / np.sqrt(125 * 2.0), rel=0.15)
 

@@ -338,6 +338,17 @@ def test_an_unsuitable_capture_is_refused(drawn, tmp_path, header, error, said):
         refresh(calibration, [capture])
 
 
+def test_a_capture_given_twice_is_refused(drawn, tmp_path):
+    """Its noise would count as two independent ones."""
+    folder, sensor = drawn
+    path = step_capture(tmp_path, sensor)
+    copy = tmp_path / "copy.h5"
+    copy.write_bytes(path.read_bytes())
+    known, said = read_calibration(folder / "calibration.json"), r"step\.h5 and copy\.h5 are the same capture"
+    with Capture(path) as one, Capture(copy) as other, pytest.raises(CalibrationError, match=said):
+        refresh(known, [one, other])
+
+
 def test_an_unsuitable_calibration_is_refused(drawn, earlier):
     folder, sensor = drawn
     with pytest.raises(CalibrationError, match="calibrate jointly"):

@@ -287,15 +287,16 @@ def test_scans_along_different_directions_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("artefact", "error", "says"),
+    ("artefact", "pose", "error", "says"),
     [
-        (None, DescriptionError, "does not say what it shows"),
-        ({"kind": "step", "height_mm": 20.0}, DescriptionError, "shows a step"),
-        ({"kind": "pipe"}, DescriptionError, "diameter_mm"),
-        ({"kind": "plane"}, CaptureError, "no stripe"),
+        (None, None, DescriptionError, "does not say what it shows"),
+        ({"kind": "step", "height_mm": 20.0}, None, DescriptionError, "shows a step"),
+        ({"kind": "pipe"}, None, DescriptionError, "diameter_mm"),
+        ({"kind": "plane"}, None, CaptureError, "no stripe"),
+        ({"kind": "plane"}, np.eye(4), CalibrationError, "carry poses"),
     ],
 )
-def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, error, says):
+def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, pose, error, says):
     header = CaptureHeader(
         name="scan", sensor=SENSOR, medium_name="water", medium=Medium(kind="custom", index=WATER),
         stage_direction=(1.0, 0.0, 0.0), saturation_dn=255, artefact=artefact,
@@ -303,6 +304,6 @@ def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, error,
     path = tmp_path / "scan.h5"
     with CaptureWriter(path, header, dtype=np.uint8) as writer:
         image = np.zeros((SENSOR.camera.height_px, SENSOR.camera.width_px), dtype=np.uint8)
-        writer.append(Frame(image, 0.0, True, 1.0, 0.0))
+        writer.append(Frame(image, 0.0, True, 1.0, 0.0, pose))
     with Capture(path) as capture, pytest.raises(error, match=says):
         scan_stripes(capture, VIEW, stripe=CalibrationOptions().stripe)

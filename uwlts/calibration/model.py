@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from uwlts.calibration.joint_record import require_joint
 from uwlts.files import written_aside
 from uwlts.json_file import described, read_json
 from uwlts.sensor import Description, Distortion, Medium, Positive, Vector
@@ -127,6 +128,8 @@ class Calibration(Description):
         if self.window is not None:
             _require_unit(self.window.normal, "the window's normal")
         require_plain_json(self.residuals, self.provenance)
+        if "joint" in self.residuals:
+            require_joint(self.residuals["joint"])
         return self
 
     def index_of(self, medium: Medium) -> float:

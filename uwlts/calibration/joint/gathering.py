@@ -1,6 +1,6 @@
 """What captures show of all evidence, and through what they were taken."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,14 +67,16 @@ def gather_jointly(
     Raises
     ------
     CalibrationError
-        The captures come from different sensors, show no target or several, mean different media by one name, or no
-        step image shows a stripe.
+        The captures come from different sensors, show no target or several, mean different media by one name, or one
+        is given twice; no step image shows a stripe, or a scan carries poses.
     DescriptionError
         A capture describes its target wrongly, or not its step standard or what it scans.
     CaptureError
         A scan shows no stripe, or an image is damaged.
     """
     sensor = common_sensor([*targets, *steps, *scans])
+    provenance = sources_of(targets, steps, scans)
+    _refuse_twice(provenance)
     media: dict[str, Medium] = {}
     views: dict[View, list[Capture]] = {}
     for capture in targets:
@@ -101,7 +103,7 @@ def gather_jointly(
     windowed = [c for c in [*steps, *targets, *scans] if c.header.sensor.camera.window.mounted]
     return Gathered(
         sensor=windowed[0].header.sensor if windowed else sensor, media=media, series=series, steps=on_steps,
-        scans=on_scans, provenance=sources_of(targets, steps, scans), warnings=warnings,
+        scans=on_scans, provenance=provenance, warnings=warnings,
     )  # fmt: skip
 
 
@@ -114,6 +116,16 @@ def refuse_two_lenses(gathered: Gathered) -> None:
             f"some captures in {list(gathered.media)[wet.medium]} were taken without a window and others were not: a "
             "lens that touches the medium is another lens; calibrate it by itself, or set window.mounted"
         )
+
+
+def _refuse_twice(provenance: Mapping[str, Any]) -> None:
+    """CalibrationError where two captures are the same, as their noise would count as two independent ones."""
+    names: dict[str, str] = {}
+    for source in [each for kind in ("air", "step", "scan") for each in provenance[f"{kind}_captures"]]:
+        name, digest = source["file"], source["sha256"]
+        if digest in names:
+            raise CalibrationError(f"{names[digest]} and {name} are the same capture: give it once")
+        names[digest] = name
 
 
 def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> View:

@@ -22,9 +22,9 @@ def refreshed_calibration(
 ) -> Calibration:  # fmt: skip
     """The calibration of an estimate to which an earlier one was known.
 
-    Its figures tell of all evidence, earlier and new, and its ``std_before`` of what was known before any. Where the
-    camera's pixels were calibrated in earlier water they are in the new as well, so that the volume is the same.
-    Directions of stages stay as they were found.
+    Its figures tell of all evidence, earlier and new, the scatter of steps of the new ones alone, and its
+    ``std_before`` of what was known before any. Where the camera's pixels were calibrated in earlier water they are in
+    the new as well, so that the volume is the same. Directions of stages stay as they were found.
     """
     parameters, values = result.parameters, result.values
     sheet = parameters.sheet_model(values)

@@ -149,8 +149,8 @@ def sphere_shot(
 
 
 def extended(known: StoredEstimate, priors: Mapping[str, Prior]) -> StoredEstimate:
-    """The estimate with those of these parameters that it has not, behind its own."""
-    added = {name: prior for name, prior in priors.items() if name not in known.parameters.names}
+    """The estimate with those of these parameters that it has not and that are not known exactly, behind its own."""
+    added = {name: prior for name, prior in priors.items() if name not in known.parameters.names and prior.std > 0}
     count = len(known.values)
     covariance = np.zeros((count + len(added),) * 2)
     covariance[:count, :count] = known.covariance

@@ -53,7 +53,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         raise CalibrationError("the calibration tells no uncertainty: calibrate jointly (--water or --joint)")
     try:
         return _stored(calibration, medium, mounted=mounted, uncertainty=uncertainty)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, IndexError) as error:
         raise CalibrationError(f"the calibration's joint estimate is damaged: {error!r}") from error
 
 
@@ -69,6 +69,8 @@ def _stored(calibration: Calibration, medium: Medium, *, mounted: bool, uncertai
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
     sheet = DescribedSheet(**{name: np.array(value) for name, value in joint["described_sheet"].items()})
     media = [name.removeprefix("index of ") for name in names if name.startswith("index of ")]
+    if len(media) != len(calibration.media):
+        raise ValueError(f"it has {len(media)} indices of media, the calibration {len(calibration.media)} media")
     # As `Calibration.index_of`: the last of equal ones.
     known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
     window = mounted and calibration.window is not None
