@@ -38,22 +38,25 @@ _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
 
 _MOVED_MM = 0.05
-"""So far the sheet is moved to find along which way the points of its light lie."""
+_MOVED_PX = 0.5
+"""So far sheet and pixel are moved to find which ways the points go."""
 
 
 def beside_sheet(
-    calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, slopes: np.ndarray, *,
-    medium_index: float, stage_direction: Sequence[float],
+    calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, width_px: np.ndarray,
+    slopes: np.ndarray, *, medium_index: float, stage_direction: Sequence[float],
 ) -> np.ndarray:  # fmt: skip
     """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
+
+    The sheet is as thick as described, but no thicker than the stripes would make it on a surface square to the laser.
 
     Parameters
     ----------
     calibration : Calibration
     sensor : Sensor
         As described: how thick the sheet is.
-    line, centre_px : (N,)
-        Stripe centres.
+    line, centre_px, width_px : (N,)
+        Stripe centres, and full widths at half maximum.
     slopes : (N,)
         Of the brightness; see `slopes_of_brightness`.
     medium_index : float
@@ -68,12 +71,12 @@ def beside_sheet(
     sheet = calibration.sheet
     window = calibration.window if sensor.camera.window.mounted else None
 
-    def points(offset_mm: float) -> np.ndarray:
+    def points(offset_mm: float, further_px: float = 0.0) -> np.ndarray:
         moved = calibration.model_copy(
             update={"sheet": sheet.model_copy(update={"offset_mm": offset_mm}), "window": window}
         )
         found = reconstruct_profile(
-            moved, line, centre_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
+            moved, line, centre_px + further_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
         )
         return found.points_mm
 
@@ -82,7 +85,10 @@ def beside_sheet(
     in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
     away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
     sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
-    return per_mm * (slopes / across * sigma**2)[:, None]
+    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+    per_px = (points(sheet.offset_mm, _MOVED_PX) - on_sheet) / _MOVED_PX
+    thickest = np.median(width_px) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
+    return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
 
 
 def slopes_of_brightness(

@@ -289,7 +289,7 @@ def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, i
     )
     header = capture.header
     return beside_sheet(
-        calibration, header.sensor, stripes.line, stripes.centre_px, slopes, medium_index=index,
+        calibration, header.sensor, stripes.line, stripes.centre_px, stripes.width_px, slopes, medium_index=index,
         stage_direction=header.stage_direction,
     )  # fmt: skip
 

@@ -84,7 +84,7 @@ def scan_of(sensor: Sensor, bodies, artefact, *, stage_mm, count=200, noise=NONE
             which.append(np.full(len(found), place))
     pixels = np.vstack(pixels)
     stripes = ScanStripes(
-        source, np.concatenate(image), pixels[:, 0], pixels[:, 1], np.zeros(len(pixels)),
+        source, np.concatenate(image), pixels[:, 0], pixels[:, 1], np.full(len(pixels), 4.0), np.zeros(len(pixels)),
         np.asarray(stage_mm, dtype=float), np.array([1.0, 0.0, 0.0]), artefact, VIEW,
     )  # fmt: skip
     return stripes, np.concatenate(which)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.unit.joint_views import MEDIUM, WATER, seen
-from uwlts.brightness import moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
+from uwlts.brightness import beside_sheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.placement import camera_from_object, laser_pose
@@ -62,6 +62,23 @@ def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
     assert len(off[0]) == len(off[1]) == len(frame)
     assert np.abs(off[0]).min() > 0.005
     assert np.abs(off[1]).max() < 0.0008
+
+
+def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
+    """A sheet described as ten times as thick counts as one that makes the stripes: 0.16 mm for 2.3548 px here."""
+    line, centre = np.repeat(LINES, 2), np.tile([400.0, 600.0], len(LINES))
+    slopes, width = np.full(len(line), 0.1), np.full(len(line), 2.3548)
+    laser = thesis.laser.model_copy(update={"waist_radius_mm": 3.0})
+    calibration = nominal_calibration(thesis, thesis.media["water"])
+    thick, thin = (
+        beside_sheet(calibration, sensor, line, centre, width, slopes, medium_index=WATER, stage_direction=(1, 0, 0))
+        for sensor in (thesis.model_copy(update={"laser": laser}), thesis)
+    )
+    along_z = thick / thick[:, 2:]
+    np.testing.assert_allclose(thin / thin[:, 2:], along_z, rtol=1e-9)
+    sigma = np.sqrt(np.abs(thick[:, 0]) / 0.1)
+    assert ((sigma > 0.1) & (sigma < 0.25)).all()
+    np.testing.assert_allclose(np.sqrt(np.abs(thin[:, 0]) / 0.1), 0.15, rtol=0.1)
 
 
 def ridge(lean, bend, fading, blur):

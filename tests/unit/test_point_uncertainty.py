@@ -257,9 +257,9 @@ def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
     assert figure_uncertainties(still, DUMBBELL, evaluation)[name].random_mm < 0.7 * found[name].random_mm
 
 
-@pytest.mark.parametrize("calibrated", [True, False])
-def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, thesis, calibrated):
-    """Its direction by the estimate where that has found it, else by the description; its scale by the estimate."""
+@pytest.mark.parametrize(("calibrated", "way"), [(True, 1.0), (True, -1.0), (False, 1.0)])
+def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, thesis, calibrated, way):
+    """Its direction by the estimate where that has found it, also for the way back, else by the description."""
     stored = stored_estimate(calibration, thesis, MEDIUM)
     priors = stored.parameters.priors | dict.fromkeys(SLOPES, Prior(0.0, 1.0))
     parameters = replace(stored.parameters, priors=priors)
@@ -268,8 +268,9 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
     covariance[-2:, -2:] = [[4e-8, 1e-8], [1e-8, 9e-8]]
     known = replace(stored, parameters=parameters, values=np.append(stored.values, [0.0, 0.0]), covariance=covariance)
     stages = (KnownStage(described=(1.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0)),) if calibrated else ()
+    header = header_of(thesis, MEDIUM).model_copy(update={"stage_direction": (way, 0.0, 0.0)})
     found = stage_root(
-        known, calibration.model_copy(update={"stages": stages}), header_of(thesis, MEDIUM),
+        known, calibration.model_copy(update={"stages": stages}), header,
         np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance))),
     )  # fmt: skip
     place = parameters.names.index("stage_scale")

@@ -257,6 +257,9 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
     frame = result.calibration.object_transform()
     moved, stage = stage_direction(SENSOR), result.calibration.stages[0]
     assert stage.described == pytest.approx((1.0, 0.0, 0.0))
+    back = result.calibration.stage_direction_of((-1.0, 0.0, 0.0))
+    assert back == pytest.approx(-np.array(stage.direction))
+    assert result.calibration.stage_direction_of((0.0, 1.0, 0.0)) == (0.0, 1.0, 0.0)
     slopes = [std[name] for name in SLOPES]
     assert np.linalg.norm(frame[:3, :3] @ stage.direction - moved) < 4.5 * np.linalg.norm(slopes)
     assert max(slopes) < 0.6 * np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
@@ -268,7 +271,9 @@ def test_scans_that_do_not_show_what_they_say_are_left_out():
     bodies, plane = KINDS["plane"]
     stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3], count=300)
     wrong = replace(stripes, artefact=Pipe(diameter_mm=220.0), source="pipe.h5")
-    few = replace(stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "slopes")})
+    few = replace(
+        stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
+    )
     found, warnings = surface_scans(
         [wrong, few, stripes], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True
     )

@@ -138,8 +138,20 @@ class Calibration(Description):
         return medium.refractive_index(self.wavelength_nm) if known is None else known
 
     def stage_direction_of(self, described: Vector) -> Vector:
-        """Unit direction in the OCS of a stage that is described so, as calibrated where it was."""
-        return next((found.direction for found in self.stages if np.allclose(found.described, described)), described)
+        """Unit direction in the OCS of a stage that is described so, or as going back, as calibrated where it was."""
+        found = self.stage_of(described)
+        if found is None:
+            return described
+        stage, forth = found
+        return stage.direction if forth else tuple(-part for part in stage.direction)
+
+    def stage_of(self, described: Vector) -> tuple[KnownStage, bool] | None:
+        """The stage that was calibrated along a direction of the OCS, and whether it goes that way or back."""
+        for stage in self.stages:
+            for forth in (True, False):
+                if np.allclose(stage.described, np.array(described) * (1 if forth else -1)):
+                    return stage, forth
+        return None
 
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""

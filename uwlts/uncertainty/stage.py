@@ -16,10 +16,10 @@ def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureH
     """
     described, uncertainty = np.array(header.stage_direction), header.sensor.uncertainty
     names = known.parameters.names
-    ways = dict(zip(SLOPES, across_of(described), strict=True)) | {"stage_scale": described}
-    calibrated = [name for name in ways if name in names]
-    if not any(np.allclose(found.described, described) for found in calibration.stages):
-        calibrated = [name for name in calibrated if name not in SLOPES]
+    found = calibration.stage_of(header.stage_direction)
+    sign = 1.0 if found is None or found[1] else -1.0
+    ways = dict(zip(SLOPES, sign * across_of(sign * described), strict=True)) | {"stage_scale": described}
+    calibrated = [name for name in ways if name in names and (name not in SLOPES or found is not None)]
     lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
     std = dict.fromkeys(SLOPES, lean) | {"stage_scale": uncertainty.stage_scale}
     within = sum((np.outer(root[names.index(name)], ways[name]) for name in calibrated), np.zeros((root.shape[1], 3)))

@@ -43,6 +43,7 @@ class ScanStripes:
     frame: np.ndarray
     line: np.ndarray
     centre_px: np.ndarray
+    width_px: np.ndarray
     slopes: np.ndarray
     stage_mm: np.ndarray
     stage_direction: np.ndarray
@@ -80,7 +81,7 @@ def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> Scan
     found = found[sharp_lines(found)[0]]
     stage = capture.stage_mm[:]
     return ScanStripes(
-        capture.path.name, found.frame, found.line, found.centre_px,
+        capture.path.name, found.frame, found.line, found.centre_px, found.width_px,
         slopes_of_brightness(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]), stage,
         np.array(capture.header.stage_direction), artefact, view,
     )  # fmt: skip
@@ -103,7 +104,7 @@ def surface_scan(
         stage_direction=stripes.stage_direction,
     ).points_mm  # fmt: skip
     beside = beside_sheet(
-        start, sensor, stripes.line, stripes.centre_px, stripes.slopes, medium_index=medium_index,
+        start, sensor, stripes.line, stripes.centre_px, stripes.width_px, stripes.slopes, medium_index=medium_index,
         stage_direction=stripes.stage_direction,
     )  # fmt: skip
     points = points + beside
