@@ -23,9 +23,9 @@ _ROUNDS = 10
 _SETTLED = 0.02
 UNSETTLED = "the residuals' scatter changes from round to round"
 _SETTLED_PX = 1e-3
-# Of a cost that is the number of residuals: parameters then move by a hundredth of their uncertainty at most. What the
-# first round finds is but a start for the next.
-_SMALLEST_GAIN, _FIRST_GAIN = 1e-9, 1e-3
+# Of a cost that is the number of residuals: a step that gains so little moves the parameters by a tenth of their
+# uncertainty, and what is left after it is far less. What the first round finds is but a start for the next.
+_SMALLEST_GAIN, _FIRST_GAIN = 1e-7, 1e-3
 _DAMPING, _FIRST_DAMPING = 1e-9, 1e-4
 _FIRST_EVERY = 4
 """Of the stripe's lines on targets, in the first round."""
