@@ -72,6 +72,25 @@ def test_a_damaged_estimate_is_noticed_when_it_is_read(written, tmp_path, damage
     assert said in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("known_before", {"bow_deg": "x"}, "known_before.bow_deg: "),
+        ("known_before", {"curl_deg": 1.0}, "known_before.curl_deg: Extra inputs"),
+        ("step_captures", 3, "step_captures: "),
+        ("scan_captures", [{"file": "scan.h5"}], "scan_captures.0.sha256: Field required"),
+    ],
+)
+def test_a_damaged_origin_is_noticed_when_it_is_read(written, tmp_path, key, value, said):
+    content = json.loads(written.read_text(encoding="utf-8"))
+    content["provenance"][key] = value
+    path = tmp_path / "damaged.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(CaptureError, match="the joint estimate is damaged") as refused:
+        read_calibration(path)
+    assert said in str(refused.value)
+
+
 def test_indices_without_their_media_are_noticed(written):
     calibration = read_calibration(written)
     assert found_estimate(calibration, WATER).parameters.media == ("water",)

@@ -4,6 +4,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
+from uwlts.sensor import Uncertainty
+
 _Count = Annotated[int, Field(ge=0)]
 _Std = Annotated[FiniteFloat, Field(ge=0)]
 _Numbers = list[FiniteFloat]
@@ -43,10 +45,28 @@ class _Joint(BaseModel):
     covered: list[_Covered] = []
 
 
-def require_joint(figures: Any) -> None:
-    """Refuse figures of a joint estimate that lack something, or of which the sizes do not fit; ValueError."""
+class _Source(BaseModel):
+    file: str
+    sha256: str
+
+
+class _Origin(BaseModel):
+    known_before: Uncertainty = Uncertainty()
+    air_captures: list[_Source] = []
+    step_captures: list[_Source] = []
+    scan_captures: list[_Source] = []
+
+
+def require_joint(figures: Any, provenance: Any) -> None:
+    """Refuse figures of a joint estimate, or what tells where it comes from, that lack something or do not fit.
+
+    Raises
+    ------
+    ValueError
+    """
     try:
         joint = _Joint.model_validate(figures)
+        _Origin.model_validate(provenance)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))

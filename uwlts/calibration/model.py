@@ -129,7 +129,7 @@ class Calibration(Description):
             _require_unit(self.window.normal, "the window's normal")
         require_plain_json(self.residuals, self.provenance)
         if "joint" in self.residuals:
-            require_joint(self.residuals["joint"])
+            require_joint(self.residuals["joint"], self.provenance)
         return self
 
     def index_of(self, medium: Medium) -> float:
