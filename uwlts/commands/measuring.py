@@ -1,0 +1,184 @@
+"""Commands from captures to judged point clouds."""
+
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from uwlts.commands.options import Flag, Method, app
+from uwlts.console import progress_bar
+from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.files import refuse_unsuitable
+
+
+@app.command
+def reconstruct(
+    capture: Path,
+    *,
+    calibration: Path,
+    out: Path,
+    index: float | None = None,
+    method: Method | None = None,
+    peak: Literal["strongest", "first", "last"] = "strongest",
+    overwrite: Flag = False,
+) -> None:
+    """Turn a capture into a point cloud.
+
+    Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply
+
+    Parameters
+    ----------
+    capture
+        Capture of a scan.
+    calibration
+        Calibration of the sensor, or one by polynomials.
+    out
+        Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and by a joint
+        calibration its uncertainty.
+    index
+        Refractive index of the medium, in place of the one that follows from the capture.
+    method
+        How the stripe's centre is found.
+    peak
+        Which of several stripes on a line counts.
+    overwrite
+        Replace an existing file.
+    """
+    from uwlts.calibration.joint.stored import is_joint
+    from uwlts.calibration.polynomial_model import read_any_calibration
+    from uwlts.capture import Capture
+    from uwlts.cloud import write_cloud
+    from uwlts.scan import reconstruct_capture
+    from uwlts.stripe import StripeOptions
+
+    refuse_unsuitable(out, overwrite=overwrite)
+    options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
+    known = read_any_calibration(calibration)
+    with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
+        scan = reconstruct_capture(
+            opened, known, options=options, index=index, with_uncertainty=is_joint(known), progress=progress
+        )
+        lit = int(opened.laser_on.sum())
+    write_cloud(out, scan.cloud, overwrite=overwrite)
+    lines = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in scan.lines_by_status.items() if count)
+    print(f"laser images with a point: {len(set(scan.cloud.frame.tolist()))} of {lit}")
+    print(f"profile lines: {lines}")
+    lost = {name: count for name, count in scan.rays_by_status.items() if count and name != "ok"}
+    if lost:
+        reasons = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in lost.items())
+        print(f"stripe centres without a point: {reasons}")
+    print(f"wrote {out} with {len(scan.cloud)} points")
+
+
+@app.command
+def evaluate(
+    cloud: Path,
+    *,
+    out: Path,
+    artefact: Path | None = None,
+    truth: Path | None = None,
+    coloured: Path | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Judge a cloud by its artefact's calibrated values, and point by point by a truth file.
+
+    Example: uwlts evaluate spheres.ply --truth spheres.truth.h5 --out spheres.evaluation.json
+
+    Parameters
+    ----------
+    cloud
+        Point cloud (.ply or .h5).
+    out
+        Evaluation to write (JSON).
+    artefact
+        TOML file with the artefact's kind and calibrated values, in place of what the capture says.
+    truth
+        Ground truth of the capture, if it was rendered.
+    coloured
+        Also write the cloud with the deviation of every point to this file.
+    overwrite
+        Replace existing files.
+    """
+    from uwlts.cloud import read_cloud, write_cloud
+    from uwlts.evaluate import judge, parse_artefact, write_evaluation
+    from uwlts.inventory import evaluation_lines
+    from uwlts.truth import read_truth
+
+    for path in (out, coloured):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    points = read_cloud(cloud)
+    table = _read_toml(artefact) if artefact else points.metadata.get("artefact")
+    judgement = judge(
+        points,
+        artefact=parse_artefact(table) if table else None,
+        truth=read_truth(truth)[1] if truth else None,
+        source=cloud.name,
+    )
+    write_evaluation(out, judgement, overwrite=overwrite)
+    if coloured:
+        write_cloud(coloured, judgement.cloud, overwrite=overwrite)
+    print("\n".join(evaluation_lines(judgement.content)))
+    print(f"wrote {out}")
+
+
+@app.command
+def report(
+    folder: Path,
+    *,
+    reference: str | None = None,
+    out: Path | None = None,
+    pictures: Path | None = None,
+    overwrite: Flag = False,
+) -> None:
+    """Gather a campaign's files into one page with pictures, a summary and a table on the terminal.
+
+    The folder holds captures NAME.h5, coloured clouds NAME.ply (or .h5), evaluations NAME.evaluation.json and
+    calibrations.
+
+    Example: uwlts report runs/demo --reference thesis
+
+    Parameters
+    ----------
+    folder
+        Folder of the campaign.
+    reference
+        Published values to set beside the measured ones: name (thesis) or path of a TOML file.
+    out
+        Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
+    pictures
+        Also write every measurement's stripe and cloud as PNG files into this folder.
+    overwrite
+        Replace an existing report, summary and pictures.
+    """
+    from uwlts.report import (
+        gather_campaign,
+        load_reference,
+        print_table,
+        summary_table,
+        write_pictures,
+        write_report,
+        write_summary,
+    )
+
+    campaign = gather_campaign(folder)
+    published = load_reference(reference) if reference else None
+    page = out or folder / "report.html"
+    write_summary(page.with_name("summary.json"), campaign, published, overwrite=overwrite)
+    write_report(page, campaign, published, overwrite=overwrite)
+    if pictures:
+        try:
+            pictures.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make the folder {pictures}: {error.strerror}") from error
+        write_pictures(pictures, campaign, overwrite=overwrite)
+    print_table(summary_table(campaign, published))
+    print(f"wrote {page} and {page.with_name('summary.json')}")
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DescriptionError(f"{path} is not valid TOML: {error}") from error

@@ -1,0 +1,28 @@
+"""The ``uwlts`` command line itself, and what its commands share."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+import uwlts
+
+app = App(
+    name="uwlts",
+    help="Software of an underwater laser triangulation sensor.",
+    version=uwlts.__version__,
+    help_format="plaintext",
+)
+
+Flag = Annotated[bool, Parameter(negative="")]
+Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+Coefficients = Annotated[
+    tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
+]
+Method = Literal["centre-of-mass", "profile-fit", "quadratic", "zero-crossing"]
+
+
+def warn(text: str) -> None:
+    """Say on standard error what does not keep a command from its work."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
