@@ -1,6 +1,7 @@
 """What a calibration's file tells of the captures it was made from, so that they can be found and proven the same."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,11 @@ import numpy as np
 
 from uwlts.capture import Capture
 from uwlts.errors import CaptureError
+
+
+def captures_in(provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The captures, as `source_of` tells of them, that a provenance names: of targets, steps and scans."""
+    return [source for kind in ("air", "step", "scan") for source in provenance.get(f"{kind}_captures", [])]
 
 
 def source_of(capture: Capture) -> dict[str, Any]:

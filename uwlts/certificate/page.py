@@ -3,17 +3,16 @@
 import json
 import math
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment
 from markupsafe import Markup
 
 from uwlts.calibration.joint.stored import is_joint
 from uwlts.calibration.joint.volume import regions
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.sources import captures_in
 from uwlts.certificate.changes import change_from, require_same_sensor
 from uwlts.certificate.content import parameter_rows
 from uwlts.certificate.form import form_of
@@ -21,7 +20,8 @@ from uwlts.certificate.lengths import Worth, in_use
 from uwlts.certificate.pictures import correlation_picture, heat_map, image_residuals, length_chart
 from uwlts.errors import OutputError
 from uwlts.files import refuse_unsuitable, written_aside
-from uwlts.report.numbers import MISSING, fixed, typographic
+from uwlts.report.numbers import MISSING, fixed
+from uwlts.report.template import rendered
 
 _WORST_IMAGES = 5
 
@@ -75,17 +75,11 @@ def certificate_page(
     """
     if before is not None:
         require_same_sensor(calibration, before[1])
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["minus"] = typographic
-    template = environment.from_string(
-        files("uwlts.certificate").joinpath("template.html.j2").read_text(encoding="utf-8")
-    )
-    return template.render(
+    return rendered(
+        "uwlts.certificate",
+        "template.html.j2",
         c=content,
-        captures=[
-            *content["made_from"].get("air_captures", []), *content["made_from"].get("step_captures", []),
-            *content["made_from"].get("scan_captures", []),
-        ],
+        captures=captures_in(content["made_from"]),
         warnings=content["made_from"].get("warnings", []),
         known_before=content["made_from"].get("known_before", {}),
         parameters=_parameters(content["parameters"], before),

@@ -35,7 +35,7 @@ def calibrate(
     """Calibrate camera, window and sheet from images of a target in air or in water, and of a step standard in water.
 
     From a target in air and steps it goes by turns: camera and sheet first, then the window's distance. With a target
-    in water, or with --joint, all is estimated together (docs/joint-calibration.md).
+    in water, with scans, or with --joint, all is estimated together (docs/joint-calibration.md).
 
     Example: uwlts calibrate --air target.h5 --step step-near.h5 step-far.h5 --out calibration.json
 

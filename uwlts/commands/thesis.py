@@ -37,7 +37,8 @@ def thesis(
     workers
         Scans measured at a time; as many as there are processors unless given.
     joint
-        Compare the joint calibration with the thesis's two ways instead; writes report.html and summary.json.
+        Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without Monte
+        Carlo; writes report.html and summary.json.
     again
         Evaluate campaigns anew that have results already.
     overwrite

@@ -4,11 +4,9 @@ import json
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
@@ -20,10 +18,11 @@ from uwlts.report.figures import Drawn, along_stripe_figure, cloud_figure, histo
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement
 from uwlts.report.headline import explanations, headline_tiles, introduction
 from uwlts.report.judged import ArtefactFigures, TruthComparisons, TruthFigures
-from uwlts.report.numbers import fixed, is_number, small_length, typographic, unit_of, words_of
+from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.report.pictures import cloud_png, data_uri, stripe_png
 from uwlts.report.published import Reference
 from uwlts.report.table import Row, summary_table, true_window_distance
+from uwlts.report.template import rendered
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "plotly")
 
@@ -48,12 +47,11 @@ def write_report(
 
 def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
     """The page as text."""
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["minus"] = typographic
-    template = environment.from_string(files("uwlts.report").joinpath("template.html.j2").read_text(encoding="utf-8"))
     collected = _Figures()
     rows = summary_table(campaign, reference)
-    return template.render(
+    return rendered(
+        "uwlts.report",
+        "template.html.j2",
         title=campaign.folder.resolve().name,
         introduction=introduction(campaign),
         tiles=headline_tiles(campaign, reference),

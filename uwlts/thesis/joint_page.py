@@ -2,17 +2,16 @@
 
 import json
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment
 from markupsafe import Markup
 
 import uwlts
 from uwlts.files import written_aside
 from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
+from uwlts.report.template import rendered
 from uwlts.thesis.joint_comparison import DIAMETERS, JOINT, ONE_REFRACTION, SPACING, TWO_REFRACTIONS, joint_summary
 
 _WORDS = {ONE_REFRACTION: "one refraction", TWO_REFRACTIONS: "two refractions", JOINT: "joint"}
@@ -39,10 +38,9 @@ def write_joint_comparison(
 
 def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
     """The page as text, from the results of `compare_campaigns` and their `joint_summary`."""
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    text = files("uwlts.thesis").joinpath("joint.html.j2").read_text(encoding="utf-8")
     media = [medium for medium in ("water", "air") if any(summary[medium]["spacing_error_mm"].values())]
-    return environment.from_string(text).render(
+    return rendered(
+        "uwlts.thesis", "joint.html.j2",
         software=f"uwlts {uwlts.__version__}", campaigns=summary["campaigns"], solve_s=max(summary["solve_s"]),
         media=[
             {

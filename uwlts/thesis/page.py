@@ -1,21 +1,19 @@
 """The reproduction's report: one HTML page that holds everything it shows and asks nothing of the network."""
 
 from collections.abc import Sequence
-from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment
 from markupsafe import Markup
 
 import uwlts
 from uwlts.capture import Capture
 from uwlts.cloud import read_cloud
 from uwlts.report.cloud_picture import cloud_picture
-from uwlts.report.numbers import typographic
 from uwlts.report.pictures import data_uri, png
 from uwlts.report.stripe_picture import stripe_picture, stripe_view
+from uwlts.report.template import rendered
 from uwlts.thesis.differences import differences, far_off
 from uwlts.thesis.figures import (
     comparison_figure,
@@ -51,9 +49,6 @@ _TITLES = {
 
 def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[TableRow], published: Published) -> str:
     """The page as text, with pictures from the first campaign in the folder."""
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["minus"] = typographic
-    template = environment.from_string(files("uwlts.thesis").joinpath("template.html.j2").read_text(encoding="utf-8"))
     first = results[0]
     z_of_v, y_of_z = polynomials_figures(first)
     headline = headline_rows(rows)
@@ -63,7 +58,9 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
         if row.table == "Figure 66" and row.quantity == "STD" and row.row.endswith("thesis image processing")
         and FORGOTTEN not in row.row
     ]  # fmt: skip
-    return template.render(
+    return rendered(
+        "uwlts.thesis",
+        "template.html.j2",
         published=published.title,
         campaigns=len(results),
         headline=headline,

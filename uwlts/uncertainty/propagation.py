@@ -11,7 +11,7 @@ import numpy as np
 from uwlts.calibration.joint.rays import COLUMNS
 from uwlts.calibration.joint.stored import StoredEstimate, stored_estimate
 from uwlts.calibration.model import Calibration
-from uwlts.calibration.sources import source_of
+from uwlts.calibration.sources import sha256_of
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.metrology.robust_fit import MAD_TO_STD
@@ -111,8 +111,8 @@ def point_uncertainty(
 
 def _made_from(calibration: Calibration, capture: Capture) -> bool:
     """Whether a capture is one of the scans that a calibration was made from."""
-    own = [s for s in calibration.provenance.get("scan_captures", []) if s["file"] == capture.path.name]
-    return any(source["sha256"] == source_of(capture)["sha256"] for source in own)
+    named = {s["sha256"] for s in calibration.provenance.get("scan_captures", []) if s["file"] == capture.path.name}
+    return bool(named) and sha256_of(capture.path) in named
 
 
 def _shared_by_neighbours(calibration: Calibration) -> float:

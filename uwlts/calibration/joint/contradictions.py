@@ -101,7 +101,11 @@ def findings(
     contradictions += _of_kinds(images)
     waves, slight_waves = _of_shapes(result)
     contradictions += waves
-    doubts += unusual + doubtful + slight_waves + _of_strays(result)
+    doubts += unusual + doubtful + slight_waves
+    doubts += [
+        f"{100 * share:.0f} % of the {kind} was left out as strays: look at the images"
+        for kind, share in much_left_out(result).items()
+    ]
     if result.stopped == UNSETTLED:
         doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
     return Findings(contradictions, doubts)
@@ -252,14 +256,14 @@ def _of_shapes(result: Estimate) -> tuple[list[str], list[str]]:
     return wrong, doubtful
 
 
-def _of_strays(result: Estimate) -> list[str]:
-    """Kinds of which much was left out."""
-    found = []
+def much_left_out(result: Estimate) -> dict[str, float]:
+    """The share that was left out as strays, of the kinds of residuals of which that is much."""
+    found = {}
     for kind, noise in result.noise.items():
         parts = [part for parts in result.residuals for part in parts if part.kind == kind]
-        share = np.concatenate([strays(part, noise) for part in parts]).mean()
+        share = float(np.concatenate([strays(part, noise) for part in parts]).mean())
         if share > _STRAY_SHARE:
-            found.append(f"{100 * share:.0f} % of the {kind} was left out as strays: look at the images")
+            found[kind] = share
     return found
 
 

@@ -11,6 +11,7 @@ from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.scan_start import ScanStripes, scan_stripes
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.procedure import CalibrationOptions, common_sensor, sources_of
+from uwlts.calibration.sources import captures_in
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.sensor import Medium, Sensor
@@ -121,7 +122,7 @@ def refuse_two_lenses(gathered: Gathered) -> None:
 def _refuse_twice(provenance: Mapping[str, Any]) -> None:
     """CalibrationError where two captures are the same, as their noise would count as two independent ones."""
     names: dict[str, str] = {}
-    for source in [each for kind in ("air", "step", "scan") for each in provenance[f"{kind}_captures"]]:
+    for source in captures_in(provenance):
         name, digest = source["file"], source["sha256"]
         if digest in names:
             raise CalibrationError(f"{names[digest]} and {name} are the same capture: give it once")

@@ -51,12 +51,17 @@ def strays(residuals: Residuals, noise: Noise) -> np.ndarray:
     return large
 
 
+def stray_limit(values: np.ndarray) -> float:
+    """Size beyond which values are strays, five of their standard deviations; half of them would have to be strays."""
+    return _STRAY * MAD_TO_STD * float(np.median(np.abs(values)))
+
+
 def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
     """Scatter of all residuals of a kind; ``points`` (N, 3) are the target's, for residuals of that kind."""
     values = np.concatenate([r.values for r in residuals])
-    spread = MAD_TO_STD * float(np.median(np.abs(values)))
-    kept = np.abs(values) <= _STRAY * spread
-    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else spread
+    limit = stray_limit(values)
+    kept = np.abs(values) <= limit
+    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / _STRAY
     if sigma < _FINEST_PX:
         return Noise(_FINEST_PX)
     if kind == TARGET:

@@ -20,6 +20,7 @@ from uwlts.calibration.joint.stored import StoredEstimate, found_estimate
 from uwlts.calibration.joint.water_change import WaterChange, water_changes
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.procedure import CalibrationOptions
+from uwlts.calibration.sources import captures_in
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.scan import check_fits
@@ -91,13 +92,8 @@ def refresh(
         _refuse_unsuitable(capture, calibration)
     options = CalibrationOptions() if options is None else options
     gathered = gather_jointly([], steps, options=options, progress=progress)
-    used = {
-        source["sha256"]
-        for kind, sources in calibration.provenance.items()
-        if kind.endswith("_captures")
-        for source in sources
-    }
-    again = [source["file"] for source in gathered.provenance["step_captures"] if source["sha256"] in used]
+    used = {source["sha256"] for source in captures_in(calibration.provenance)}
+    again = [source["file"] for source in captures_in(gathered.provenance) if source["sha256"] in used]
     if again:
         raise CalibrationError(f"the calibration was made from {', '.join(again)} already: take a new image")
     return solve_refreshed(calibration, gathered, options=options, index_std=index_std)

@@ -1,17 +1,16 @@
 """The comparison as a page to read, and its JSON."""
 
 import json
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment
 from markupsafe import Markup
 
 from uwlts.calibration.model_choice.held_out import INSIDE, OUTSIDE
 from uwlts.errors import OutputError
 from uwlts.files import refuse_unsuitable, written_aside
 from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
+from uwlts.report.template import rendered
 
 
 def refuse_unsuitable_outputs(page: Path, *, overwrite: bool) -> None:
@@ -36,9 +35,10 @@ def write_models(page: Path, content: dict[str, Any], *, overwrite: bool = False
 
 def models_page(content: dict[str, Any]) -> str:
     """The page as text."""
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    text = files("uwlts.calibration.model_choice").joinpath("template.html.j2").read_text(encoding="utf-8")
-    return environment.from_string(text).render(c=content, ways=(INSIDE, OUTSIDE), picture=_picture(content))
+    return rendered(
+        "uwlts.calibration.model_choice", "template.html.j2", c=content, ways=(INSIDE, OUTSIDE),
+        picture=_picture(content),
+    )  # fmt: skip
 
 
 def _picture(content: dict[str, Any]) -> Markup | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
+from uwlts.calibration.joint.noise import stray_limit
 from uwlts.calibration.joint.observations import STRIPE
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.line_polynomials import fit_line_polynomials
@@ -14,10 +15,8 @@ from uwlts.calibration.model_choice.prediction import Prediction
 from uwlts.calibration.model_choice.scores import rms_of_images
 from uwlts.calibration.polynomial_evidence import object_coordinates, stripes_on_plate
 from uwlts.capture import CaptureHeader
-from uwlts.metrology.robust_fit import MAD_TO_STD
 
 DEGREE = 6
-_STRAY = 5.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def polynomial_score(
 
 def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
     """Root mean square of the misses in several images, without strays, and its standard error."""
-    limit = _STRAY * MAD_TO_STD * np.median(np.abs(np.concatenate(misses)))
+    limit = stray_limit(np.concatenate(misses))
     kept = [off[np.abs(off) <= limit] for off in misses]
     squares, counts = np.array([np.sum(off**2) for off in kept]), np.array([len(off) for off in kept])
     return rms_of_images(squares, counts)

@@ -7,19 +7,17 @@ import numpy as np
 from scipy.stats import chi2
 
 from uwlts.calibration.joint.circle_centres import centred
+from uwlts.calibration.joint.contradictions import much_left_out
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import strays
-from uwlts.calibration.joint.observations import TARGET, Residuals, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.noise import stray_limit
+from uwlts.calibration.joint.observations import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.model_choice.candidates import Candidate, recast
 from uwlts.calibration.model_choice.held_out import Image, Split, of_images, without
 from uwlts.errors import CalibrationError
-from uwlts.metrology.robust_fit import MAD_TO_STD
 
-_STRAY = 5.0
 _ROUNDS, _SETTLED_PX = 20, 1e-4
-_LARGEST_STRAY_SHARE = 0.2
 _BY_CHANCE = 0.0027
 """Probability of three standard deviations or more."""
 
@@ -73,7 +71,9 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
     whole = recast(problem, candidate)
     training, numbers = without(whole, split.held)
     estimate = training.solve()
-    _refuse_misfit(estimate)
+    if misfits := much_left_out(estimate):
+        kind, share = next(iter(misfits.items()))
+        raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
     own = dict(zip(numbers, estimate.own, strict=True))
     kept = dict(zip(numbers, training.evidence, strict=True))
     found = []
@@ -85,47 +85,37 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
     return Prediction(found, estimate.parameters, estimate.values, estimate.covariance)
 
 
-def _refuse_misfit(estimate: Estimate) -> None:
-    """CalibrationError where much of the evidence was left out, without which an estimate means nothing."""
-    for kind, noise in estimate.noise.items():
-        parts = [part for parts in estimate.residuals for part in parts if part.kind == kind]
-        share = np.concatenate([strays(part, noise) for part in parts]).mean()
-        if share > _LARGEST_STRAY_SHARE:
-            raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
-
-
 def _posed(
     problem: JointProblem, estimate: Estimate, piece: Evidence, number: int, images: list[int],
     kept: TargetEvidence | None, own: np.ndarray | None,
-) -> list[tuple[Evidence, np.ndarray, str]]:  # fmt: skip
-    """Evidence held out with its own parameters, and the kind of residual to which these are yet to be fitted."""
+) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:  # fmt: skip
+    """Evidence held out with its own parameters, and the kinds of residuals to which these are yet to be fitted."""
     if isinstance(piece, StepProfileEvidence):
-        return [(piece, problem.own[number], "")]
+        return [(piece, problem.own[number], (STEP,))]
     if kept is not None and piece.staged and len(kept.images()):
         rotation, direction = cv2.Rodrigues(own[:3])[0], piece.placement.direction(own[6:8])
         held = of_images(piece, images)
         shift = own[3:6] - rotation @ direction * np.append(own[8:], 0.0).mean()
-        return [(held, np.concatenate([own[:3], shift, own[6:8], np.zeros(len(held.images()))]), "none")]
+        return [(held, np.concatenate([own[:3], shift, own[6:8], np.zeros(len(held.images()))]), ())]
     found = []
     for image in images:
         at = piece.pose(problem.parameters, problem.shared, problem.own[number], image)
         start = np.concatenate([cv2.Rodrigues(at[:3, :3])[0].ravel(), at[:3, 3]])
-        found.append((replace(of_images(piece, [image]), staged=False), start, TARGET))
+        found.append((replace(of_images(piece, [image]), staged=False), start, (TARGET,)))
     return found
 
 
 def _residuals(
-    problem: JointProblem, estimate: Estimate, evidence: Evidence, own: np.ndarray, *, fitted: str
+    problem: JointProblem, estimate: Estimate, evidence: Evidence, own: np.ndarray, *, fitted: tuple[str, ...]
 ) -> list[Residuals]:
-    """Residuals of the evidence with its own parameters, fitted to those of one kind, to all, or to none."""
+    """Residuals of the evidence with its own parameters, fitted to those of some kinds."""
     for _ in range(_ROUNDS):
         parts = _seen(problem, estimate, evidence, own)
-        chosen = [part for part in parts if fitted in ("", part.kind)]
+        chosen = [part for part in parts if part.kind in fitted]
         if not chosen:
             return parts
         values, by_own = np.concatenate([p.values for p in chosen]), np.vstack([p.by_own for p in chosen])
-        off = np.abs(values)
-        near = off <= max(_STRAY * MAD_TO_STD * float(np.median(off)), _SETTLED_PX)
+        near = np.abs(values) <= max(stray_limit(values), _SETTLED_PX)
         step = -np.linalg.lstsq(by_own[near], values[near], rcond=None)[0]
         own = own + step
         if np.abs(by_own @ step).max() < _SETTLED_PX:

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwlts.calibration.joint.noise import stray_limit
 from uwlts.calibration.joint.observations import TARGET
 from uwlts.calibration.model_choice.prediction import Misses, Prediction
-from uwlts.metrology.robust_fit import MAD_TO_STD
 
 POINTS, STRIPES = "points", "stripes"
 """The target's points; stripes on target and steps."""
 
-_STRAY = 5.0
 _DRAWS = 2000
 
 
@@ -103,8 +102,7 @@ def _used(predictions: Sequence[Prediction]) -> list[np.ndarray]:
     """Which points (n,) of each of the misses count: not those that all models miss by far."""
     limits: dict[str, float] = {}
     for kind in {miss.kind for miss in predictions[0].misses}:
-        medians = [np.median(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions]
-        limits[kind] = _STRAY * MAD_TO_STD * float(min(medians))
+        limits[kind] = min(stray_limit(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions)
 
     def near(same: Sequence[Misses]) -> np.ndarray:
         return np.min([miss.px for miss in same], axis=0) <= limits[same[0].kind]
