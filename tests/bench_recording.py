@@ -14,7 +14,8 @@ import numpy as np
 from twin.hardware.gige_camera import GigeCamera
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
-from uwlts.hardware.camera import Camera, open_camera
+from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.library import load_sensor
 from uwlts.live_view import images_of

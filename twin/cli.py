@@ -184,7 +184,7 @@ def serve(
     nominal = load_sensor(sensor)
     built = _built(as_built, nominal, sensor)
     use_variant(variant)
-    from twin.hardware.faults import parse_fault
+    from twin.hardware.bench import parse_fault
     from twin.hardware.serve import serve as serve_twin
     from twin.hardware.serve import wait_for_end
 

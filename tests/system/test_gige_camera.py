@@ -14,8 +14,8 @@ from twin.hardware.gige_camera import PORT, GigeCamera
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import list_aravis_cameras
-from uwlts.hardware.camera import Region, open_camera
-from uwlts.hardware.frame_check import FrameStatus
+from uwlts.hardware.camera import FrameStatus, Region
+from uwlts.hardware.camera_addresses import open_camera
 from uwlts.sensor import Sensor
 
 WIDTH, HEIGHT = 1280, 1024

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.system.in_process import uwlts
-from twin.hardware.faults import NAMES, parse_fault
+from twin.hardware.bench import NAMES, parse_fault
 from twin.hardware.serve import ServedTwin, serve
 from twin.options import Options
 from twin.scene import Scene, load_scene

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.hardware.bench import Track
-from twin.hardware.faults import NAMES, Fault, parse_fault
+from twin.hardware.bench import NAMES, Fault, Track, parse_fault
 from twin.hardware.serve import ServedTwin, serve, wait_for_end
 from twin.options import Options
 from twin.scene import Scene, load_scene
 from twin.simulate import simulate
 from uwlts.capture import Capture
 from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
-from uwlts.hardware.camera import Camera, open_camera
+from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.library import load_sensor
 from uwlts.sensor import Sensor

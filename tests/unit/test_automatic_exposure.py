@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from uwlts.hardware.exposure import brightness, settled_exposure
-from uwlts.hardware.laser_watch import shows_laser, spread
+from uwlts.hardware.rig import brightness, settled_exposure
+from uwlts.hardware.scan_watch import shows_laser, spread
 from uwlts.sensor import Sensor
 
 LIT = slice(300, 700)

@@ -17,8 +17,8 @@ import pytest
 from uwlts import aravis_library
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import HardwareError, ImageError, SetupError
-from uwlts.hardware.camera import Camera, Region, open_camera
-from uwlts.hardware.frame_check import FrameCheck, FrameCounts, FrameStatus
+from uwlts.hardware.camera import Camera, FrameCheck, FrameCounts, FrameStatus, Region
+from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.sensor import Sensor
 
@@ -71,7 +71,7 @@ def test_after_an_unanswered_trigger_the_count_may_begin_anew():
 
 @pytest.mark.parametrize("address", ["", "gige", "usb:1", "genicam:", "replay:", "0"])
 def test_an_unknown_address_lists_the_known_ones(address):
-    with pytest.raises(HardwareError, match=r"(?s)no address of a camera.*gige:NAME.*genicam:.*replay:PATH"):
+    with pytest.raises(HardwareError, match=r"(?s)not the address of a camera.*gige:NAME.*genicam:.*replay:PATH"):
         open_camera(address)
 
 

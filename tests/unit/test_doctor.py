@@ -19,9 +19,8 @@ import pytest
 from packaging.requirements import Requirement
 
 from twin.hardware.grbl_controller import BENCH_SETTINGS, GrblController
-from uwlts.doctor import devices, libraries, machine, trials
-from uwlts.doctor.finding import Finding
-from uwlts.doctor.renderer import examine_renderer
+from uwlts.doctor import devices, libraries, machine
+from uwlts.doctor.machine import Finding, examine_renderer
 
 ROOT = Path(__file__).resolve().parents[2]
 NOBODY = 65534
@@ -298,21 +297,21 @@ def images(folder: Path, grey: int, count: int = 12) -> str:
 
 
 def test_ten_frames_are_taken_and_judged(tmp_path):
-    (good,) = trials.try_camera(images(tmp_path / "good", 51))
+    (good,) = devices.try_camera(images(tmp_path / "good", 51))
     assert good.status == "ok" and "64 x 48 px of 8 bit" in good.found
     # 51 of 255.
     assert "10 frames" in good.found and good.found.endswith("mean grey value 20.0 % of full scale")
-    (white,) = trials.try_camera(images(tmp_path / "white", 255))
+    (white,) = devices.try_camera(images(tmp_path / "white", 255))
     assert white.status == "warning" and "saturated" in white.advice
-    (black,) = trials.try_camera(images(tmp_path / "black", 0))
+    (black,) = devices.try_camera(images(tmp_path / "black", 0))
     assert black.status == "warning" and "lens cap" in black.advice
 
 
 def test_a_camera_that_does_not_give_ten_frames_is_missing(tmp_path):
-    (short,) = trials.try_camera(images(tmp_path / "few", 51, count=9))
+    (short,) = devices.try_camera(images(tmp_path / "few", 51, count=9))
     assert short.status == "missing" and "all 9 images" in short.found
-    (unknown,) = trials.try_camera("webcam:0")
-    assert unknown.status == "missing" and "is no address of a camera" in unknown.found
+    (unknown,) = devices.try_camera("webcam:0")
+    assert unknown.status == "missing" and "is not the address of a camera" in unknown.found
     assert "genicam:PRODUCER.cti" in unknown.advice
 
 
@@ -333,14 +332,14 @@ def test_the_settings_are_those_of_the_documentation():
     rows = [line for line in text.splitlines() if line.startswith("| `$")]
     documented = {int(number): float(value) for row in rows for number, value in re.findall(r"`\$(\d+)=(\d+)`", row)}
     assert len(documented) > 15
-    examined = {number: value for number, (value, _) in trials.BEHAVIOUR.items()} | trials.MECHANICS
+    examined = {number: value for number, (value, _) in devices.BEHAVIOUR.items()} | devices.MECHANICS
     assert examined == documented
-    assert trials.judge_settings(BENCH_SETTINGS)[0].status == "ok"
+    assert devices.judge_settings(BENCH_SETTINGS)[0].status == "ok"
 
 
 def test_a_stage_as_documented_is_in_order():
     with unmoved() as controller:
-        build, settings, state = trials.try_stage(controller.port)
+        build, settings, state = devices.try_stage(controller.port)
     assert build.found == f"{controller.port}: Grbl 1.1h, options V"
     assert [each.status for each in (build, settings, state)] == ["ok"] * 3
     assert state.found == "locked until it is homed, as after every start"
@@ -348,7 +347,7 @@ def test_a_stage_as_documented_is_in_order():
 
 def test_settings_that_contradict_the_documentation_are_named():
     with unmoved(settings={1: 25, 32: 0, 100: 250}) as controller:
-        _, behaviour, mechanics, _ = trials.try_stage(controller.port)
+        _, behaviour, mechanics, _ = devices.try_stage(controller.port)
     assert behaviour.status == mechanics.status == "warning"
     assert behaviour.found.startswith("$1 is 25, not 255") and "$32 is 0, not 1" in behaviour.found
     assert behaviour.advice.endswith(": $1=255 $32=1")
@@ -357,22 +356,22 @@ def test_settings_that_contradict_the_documentation_are_named():
 
 def test_a_stage_without_a_switch_is_told_what_that_means():
     with unmoved(settings={20: 0, 22: 0}) as controller:
-        _, settings, state = trials.try_stage(controller.port)
+        _, settings, state = devices.try_stage(controller.port)
     assert "without a limit switch" in settings.advice
     assert (state.status, state.found) == ("ok", "idle")
 
 
 def test_an_alarm_silence_and_a_firmware_that_cannot_switch_the_laser_are_missing():
     with unmoved(options="") as controller:
-        assert "without V" in trials.try_stage(controller.port)[0].found
+        assert "without V" in devices.try_stage(controller.port)[0].found
     with unmoved() as controller:
         controller.mute()
-        (silent,) = trials.try_stage(controller.port)
+        (silent,) = devices.try_stage(controller.port)
     assert silent.status == "missing" and "nothing answers" in silent.found
     assert "docs/hardware-stage.md" in silent.advice
 
 
 def test_a_pressed_switch_is_a_warning():
     with GrblController(position_mm=-0.1, boot_s=0.1) as controller:
-        state = trials.try_stage(controller.port)[-1]
+        state = devices.try_stage(controller.port)[-1]
     assert state.status == "warning" and "X are active" in state.found and "limit switch is pressed" in state.advice

@@ -16,8 +16,7 @@ from uwlts.capture import Capture, CaptureWriter, Frame
 from uwlts.cloud import PointCloud, read_cloud, write_cloud
 from uwlts.console import run
 from uwlts.errors import OutputError, SetupError
-from uwlts.exporting import CLOUD_FORMATS, export_capture, export_cloud
-from uwlts.exporting.clouds import LAZ_STEP_M
+from uwlts.exporting import CLOUD_FORMATS, LAZ_STEP_M, export_capture, export_cloud
 from uwlts.importing import import_folder
 
 

@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 
 from twin.hardware.grbl_controller import GrblController
-from twin.hardware.grbl_gcode import GrblError, parse_block
+from twin.hardware.grbl_firmware import GrblError, parse_block
 from twin.hardware.grbl_motion import Axis, Ramp
 from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.grbl_protocol import (
+from uwlts.hardware.grbl_line import (
     Alarm,
     Banner,
     Garbage,

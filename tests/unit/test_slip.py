@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.hardware.slip import Place, SlipWatch
+from uwlts.hardware.scan_watch import Place, SlipWatch
 
 LINES = 400
 NOISE_PX = 0.1

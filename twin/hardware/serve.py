@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.hardware.bench import Bench, FrameRates, Track
-from twin.hardware.faults import Fault
+from twin.hardware.bench import Bench, Fault, FrameRates, Track
 from twin.hardware.gige_camera import GigeCamera
 from twin.hardware.grbl_controller import GrblController
 from twin.options import Options

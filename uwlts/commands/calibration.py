@@ -274,8 +274,7 @@ def _led_through(
 ) -> tuple[tuple[Path, ...], tuple[Path, ...], tuple[Path, ...], Literal["stage-normal", "stage", "free"]]:
     """Record a guided calibration: captures of the target in air or in water, of steps, and how the poses are tied."""
     from uwlts.calibration.intrinsics import CameraOptions
-    from uwlts.hardware.guided.operator import Operator
-    from uwlts.hardware.guided.page import GuidedPage
+    from uwlts.hardware.guided.operator import GuidedPage, Operator
     from uwlts.hardware.guided.plan import load_guided_plan
     from uwlts.hardware.guided.recording import record_guided
 

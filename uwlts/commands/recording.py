@@ -57,7 +57,7 @@ def scan(
     from contextlib import ExitStack
 
     from uwlts.calibration.polynomial_model import read_any_calibration
-    from uwlts.hardware.camera import open_camera
+    from uwlts.hardware.camera_addresses import open_camera
     from uwlts.hardware.grbl import GrblStage
     from uwlts.hardware.page_beside import PageBeside
     from uwlts.hardware.scan_plan import load_plan

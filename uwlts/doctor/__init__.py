@@ -1,16 +1,15 @@
-"""What this machine lacks for rendering, calibrating and scanning, and what to do about it.
+"""Examination of this machine: what rendering, calibrating and scanning lack, and what to do about it.
 
-Nothing here moves the stage, lights the laser, or keeps what it writes. Each part of the examination gives findings of
-its own; one that cannot be carried out, because a library is broken, becomes a finding too.
+Nothing here moves the stage, switches the laser on, or keeps what it writes. A part of the examination that cannot be
+carried out because a library is broken becomes a finding itself.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from uwlts.doctor import devices, machine, trials
-from uwlts.doctor.finding import Finding, print_findings
-from uwlts.doctor.renderer import examine_renderer
+from uwlts.doctor import devices, machine
+from uwlts.doctor.machine import Finding, print_findings
 
 __all__ = ["Finding", "examine", "print_findings"]
 
@@ -33,16 +32,20 @@ def examine(
     stage
         Serial port of a stage to talk to. Opening it restarts an Arduino Uno: home before the next scan.
     progress
-        Called with the parts that are done and their number.
+        Called with the number of parts that are done and of all parts.
     """
     parts: list[Callable[[], Sequence[Finding]]] = [
-        _examine_libraries, examine_renderer, partial(machine.examine, folder), devices.examine_cameras,
-        devices.examine_producers, devices.examine_ports,
-    ]  # fmt: skip
+        _examine_libraries,
+        machine.examine_renderer,
+        partial(machine.examine, folder),
+        devices.examine_cameras,
+        devices.examine_producers,
+        devices.examine_ports,
+    ]
     if camera is not None:
-        parts.append(partial(trials.try_camera, camera))
+        parts.append(partial(devices.try_camera, camera))
     if stage is not None:
-        parts.append(partial(trials.try_stage, stage))
+        parts.append(partial(devices.try_stage, stage))
     findings: list[Finding] = []
     for done, part in enumerate(parts):
         progress(done, len(parts))
@@ -57,7 +60,7 @@ def examine(
 
 
 def _examine_libraries() -> list[Finding]:
-    # It needs a library itself, whose absence is a finding as well.
+    # This module needs the library packaging, whose absence is a finding as well.
     from uwlts.doctor import libraries
 
     return libraries.examine()

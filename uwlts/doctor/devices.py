@@ -1,4 +1,8 @@
-"""Cameras that answer, the driver libraries of others, and serial ports."""
+"""Findings about cameras, driver libraries, serial ports, and a camera and a stage tried for real.
+
+A stage is not moved and the laser stays off: only questions are sent, and Ctrl-X at the end, at which Grbl switches the
+laser's pin off.
+"""
 
 import grp
 import os
@@ -6,11 +10,12 @@ import pwd
 import shlex
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
-from uwlts.doctor.finding import Finding
-from uwlts.errors import SetupError
+from uwlts.doctor.machine import Finding
+from uwlts.errors import HardwareError, SetupError, UwltsError
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
 # Aravis waits a second for answers; drivers of broken USB devices may take for ever.
@@ -132,3 +137,145 @@ def _group_name(number: int) -> str:
         return grp.getgrgid(number).gr_name
     except KeyError:
         return str(number)
+
+
+FRAMES, _FRAME_S = 10, 5.0
+_BRIGHTEST_MEDIAN, _DARKEST_MEAN = 0.9, 0.002
+
+BEHAVIOUR = {
+    1: (255, "else the motor leaves its step at rest"),
+    10: (1, "machine positions in the reports"),
+    13: (0, "mm"),
+    20: (1, "soft limits"),
+    21: (0, "else noise on the switch's line ends a scan"),
+    22: (1, "homing, and locked until it is done"),
+    23: (1, "the switch is at the lower end"),
+    30: (1000, "S1000 is full power"),
+    31: (0, "S0 is none"),
+    32: (1, "laser mode fails to the dark side"),
+}
+"""Settings of docs/hardware-stage.md on which the laser, the limits and the reports depend, and their reasons."""
+
+MECHANICS = {0: 10, 24: 60, 25: 600, 26: 25, 27: 2, 100: 80, 110: 900, 120: 50, 130: 750}
+"""Settings of docs/hardware-stage.md that follow from the thesis's bench; another stage has others."""
+
+
+def try_camera(address: str) -> list[Finding]:
+    """Open a camera, take ten frames as fast as it gives them, and let go of it."""
+    import numpy as np
+
+    from uwlts.hardware.camera_addresses import open_camera
+
+    try:
+        with open_camera(address) as camera:
+            info, settings = camera.info, camera.configure()
+            camera.start(faults="skip")
+            frames = [camera.grab(_FRAME_S) for _ in range(FRAMES)]
+            counts = camera.counts
+    except UwltsError as error:
+        reason, _, advice = str(error).partition("\n")
+        return [Finding("camera", "missing", f"{address}: {reason}", advice or "check power, cable, and the address")]
+    took_s = frames[-1].time_s - frames[0].time_s
+    rate = f"{(frames[-1].frame_id - frames[0].frame_id) / took_s:.1f} frames/s" if took_s > 0 else "all at once"
+    full, images = 2**settings.bits - 1, [frame.image for frame in frames]
+    median, mean = float(np.median(images)) / full, float(np.mean(images)) / full
+    exposure = "" if settings.exposure_ms is None else f", exposure {settings.exposure_ms:g} ms"
+    size = f"{info.width_px} x {info.height_px} px of {settings.bits} bit{exposure}"
+    found = (
+        f"{address}: {info.name} {info.serial}, {size}: {FRAMES} frames, {rate}, mean grey value {100 * mean:.1f} % of "
+        "full scale"
+    )
+    faults = ", ".join(f"{number} {name}" for name, number in asdict(counts).items() if number and name != "ok")
+    advice = []
+    if faults:
+        found += f"; of the frames {faults}"
+        advice.append("frames are lost or late: lower the frame rate, use jumbo packets, end other programs")
+    if median > _BRIGHTEST_MEDIAN:
+        advice.append("most of the image is saturated: shorten the exposure, close the aperture, shade the tank")
+    if mean < _DARKEST_MEAN:
+        advice.append("the images are black: right in the dark without a laser, else check lens cap and exposure")
+    return [Finding("camera", "warning" if advice else "ok", found, "\n".join(advice))]
+
+
+def try_stage(port: str) -> list[Finding]:
+    """Ask a Grbl controller for its version, settings and state."""
+    from uwlts.hardware.grbl_line import GrblLine, Message, Setting
+
+    line, failed = None, None
+    try:
+        line = GrblLine(port)
+        settings = {each.number: each.value for each in line.command("$$") if isinstance(each, Setting)}
+        built = [each.text for each in line.command("$I") if isinstance(each, Message)]
+        report, version = line.status(), line.version
+    except HardwareError as error:
+        failed = error
+    finally:
+        if line is not None:
+            try:
+                line.close(failed)
+            except HardwareError as error:
+                failed = error
+    if failed is not None:
+        advice = "see 'In case of trouble' in docs/hardware-stage.md"
+        if "no permission" in str(failed):
+            advice = "sudo usermod -aG dialout $USER\nthen log out and in again"
+        return [Finding("stage", "missing", str(failed), advice)]
+    return [
+        _judge_build(f"{port}: Grbl {version}", built), *judge_settings(settings),
+        _judge_state(report.state, report.pins, homing=settings.get(22, 0) != 0),
+    ]  # fmt: skip
+
+
+def _judge_build(who: str, built: list[str]) -> Finding:
+    options = next((text.removeprefix("OPT:").split(",")[0] for text in built if text.startswith("OPT:")), "")
+    found = f"{who}, options {options or 'not told'}"
+    if "V" not in options:
+        return Finding("stage", "missing", f"{found}, without V: it cannot switch the laser",
+                       "flash a Grbl with VARIABLE_SPINDLE, see docs/hardware-stage.md")  # fmt: skip
+    return Finding("stage", "ok", found)
+
+
+def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
+    """What differs from docs/hardware-stage.md in the answer to ``$$``, given by number."""
+    unsafe = {number: wanted for number, (wanted, _) in BEHAVIOUR.items() if settings.get(number) != wanted}
+    other = {number: wanted for number, wanted in MECHANICS.items() if settings.get(number) != wanted}
+    findings = []
+    if unsafe:
+        found = "; ".join(
+            f"{_is(settings, number)}, not {unsafe[number]} ({BEHAVIOUR[number][1]})" for number in unsafe
+        )
+        advice = f"send, one line each, what docs/hardware-stage.md asks for: {_lines(unsafe)}"
+        if {20, 22} & unsafe.keys():
+            advice += "\n$20=0 and $22=0 are right for a stage without a limit switch"
+        findings.append(Finding("stage settings", "warning", found, advice))
+    if other:
+        found = f"other than the thesis's bench: {', '.join(_is(settings, number) for number in other)}"
+        advice = f"right if your mechanics are other ones; for the thesis's bench send {_lines(other)}"
+        findings.append(Finding("stage mechanics", "warning", found, advice))
+    return findings or [Finding("stage settings", "ok", "as docs/hardware-stage.md asks for")]
+
+
+def _is(settings: Mapping[int, float], number: int) -> str:
+    return f"${number} is {settings[number]:g}" if number in settings else f"${number} is not there"
+
+
+def _lines(wanted: Mapping[int, float]) -> str:
+    return " ".join(f"${number}={value:g}" for number, value in wanted.items())
+
+
+def _judge_state(state: str, pins: str, *, homing: bool) -> Finding:
+    """The state after opening: locked by homing, unless the board's reset is disabled."""
+    advice = []
+    if "X" in pins:
+        advice.append("the limit switch is pressed: right at the end of the travel, else check its wiring and $5")
+    if others := pins.replace("X", ""):
+        advice.append(f"the inputs {others} are active (Y, Z: limits, P: probe, D, H, R: buttons): check their wiring")
+    if state == "Alarm" and homing:
+        found = "locked until it is homed, as after every start"
+    elif state == "Idle":
+        found = "idle"
+    else:
+        found = f"{state}"
+        advice.append("restart the controller; then home the stage, or unlock it where it has no limit switch")
+    found += f", inputs {pins} are active" if pins else ""
+    return Finding("stage state", "warning" if advice else "ok", found, "\n".join(advice))

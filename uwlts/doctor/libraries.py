@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from uwlts.doctor.finding import Finding
+from uwlts.doctor.machine import Finding
 
 PROJECT = "uwlts"
 OPTIONAL = {

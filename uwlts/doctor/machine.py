@@ -1,13 +1,43 @@
-"""Whether folder, network buffers, processors, memory and clock carry a scan at 60 frames/s."""
+"""Findings about this machine: folder, network buffer, processors, memory, clock and renderer, and their table."""
 
 import os
+import shlex
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
-from uwlts.doctor.finding import Finding
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+Status = Literal["ok", "warning", "missing"]
+
+_STYLES = {"ok": "green", "warning": "yellow", "missing": "bold red"}
+_WIDTH = 110
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found.
+
+    ``status`` is "missing" for what is required, or was asked for, and is not there or does not work; "warning" for
+    what limits some of the work. Both come with ``advice``, one thing to do for each line.
+    """
+
+    subject: str
+    status: Status
+    found: str
+    advice: str = ""
+
 
 FRAME_BYTES, FRAMES_PER_S = 1280 * 1024, 60
 _TRIAL_BYTES = 64_000_000
@@ -111,3 +141,51 @@ def examine_clock(files: Path | None = None) -> Finding:
 
 def _date(seconds: float) -> str:
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+_RENDERER_S = 330
+
+
+def examine_renderer() -> list[Finding]:
+    """Whether the twin's renderer finds a libLLVM and can run a kernel with it; the twin is asked, as a program."""
+    subject = "libLLVM"
+    if find_spec("twin") is None:
+        return [Finding(subject, "ok", "not needed: the twin is not installed")]
+    command = [sys.executable, "-m", "twin.llvm"]
+    try:
+        asked = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_RENDERER_S)
+    except subprocess.TimeoutExpired:
+        return [Finding(subject, "warning", f"no answer within {_RENDERER_S} s", f"try: {shlex.join(command)}")]
+    chosen = [line.removeprefix("chosen: ") for line in asked.stdout.splitlines() if line.startswith("chosen: ")]
+    if asked.returncode == 0 and chosen:
+        return [Finding(subject, "ok", f"{chosen[0]}; a trial kernel ran")]
+    said = asked.stderr.strip().splitlines() or [f"it ended with status {asked.returncode}"]
+    # An own error says most in its first line, a traceback in its last.
+    reason = said[0].removeprefix("error: ") if said[0].startswith("error: ") else said[-1]
+    advice = f"only for rendering by the twin:\n{shlex.join(command)} --install"
+    return [Finding(subject, "warning", f"the twin cannot render: {reason}", advice)]
+
+
+def print_findings(findings: Sequence[Finding], *, console: Console | None = None) -> None:
+    """Print a table of the findings and, below it, what to do, in lines that can be copied."""
+    if console is None:
+        usual = Console()
+        console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("", "examined", "found"):
+        table.add_column(heading, no_wrap=heading == "", overflow="fold")
+    for each in findings:
+        # Text, so that names from files are never taken for markup.
+        table.add_row(Text(each.status, _STYLES[each.status]), Text(each.subject), Text(each.found))
+    console.print(table)
+    advised = [each for each in findings if each.advice]
+    if advised:
+        console.print("what to do", style="bold")
+    for each in advised:
+        lines = "".join(f"\n      {line}" for line in each.advice.splitlines())
+        # Not wrapped: a command that is broken over two lines cannot be copied.
+        console.print(Text(f"  {each.subject}:{lines}"), soft_wrap=True)
+    missing = [each.subject for each in findings if each.status == "missing"]
+    warnings = sum(each.status == "warning" for each in findings)
+    said = f"missing: {', '.join(missing)}" if missing else "nothing that is required is missing"
+    console.print(Text(f"{said}; {warnings} warning{'' if warnings == 1 else 's'}"), soft_wrap=True)

@@ -1,28 +1,121 @@
-"""The camera as the rest of the software sees it, whatever it is connected by, and the addresses cameras are opened by.
+"""Interface of all cameras: settings, frames, and the check of every frame, whatever the camera is connected by.
 
-A driver implements the methods with an underscore; this class keeps the order of the calls, checks every frame and says
-what went wrong. One thread uses a camera.
+A driver implements the methods with an underscore; `Camera` keeps the order of the calls, checks every frame and
+reports what went wrong. `uwlts.hardware.camera_addresses.open_camera` opens a camera by its address. One thread uses a
+camera.
+
+Cameras count their frames and stamp them with their own clock. What a driver delivers can still lack packets, come
+twice, come late, or leave out frames that were lost in transfer.
 """
 
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import StrEnum
 from types import TracebackType
 from typing import Literal, Self
 
 import numpy as np
 
 from uwlts.errors import HardwareError
-from uwlts.hardware.frame_check import FrameCheck, FrameCounts, FrameStatus
 
 Trigger = Literal["free", "software", "line"]
 
-ADDRESSES = """\
-  gige:NAME or aravis:NAME       GigE Vision or USB3 Vision by Aravis: identifier, serial number or IP address;
-                                 without NAME the only camera there is
-  genicam:PRODUCER.cti[:SERIAL]  any camera with a GenTL producer, such as XIMEA's
-  replay:PATH                    a folder of images, or a capture"""
+# GigE Vision 1.x counts frames in 16 bits and leaves out 0.
+_COUNTER_16_BIT = 2**16 - 1
+
+
+class FrameStatus(StrEnum):
+    """What is wrong with a frame, the worst first where several things are.
+
+    SHORT: parts of the image are missing. DUPLICATED: the previous frame once more, by its number or its time stamp.
+    DROPPED: good, but frames before it are lost. LATE: good, but its time stamp is over a period later than its number
+    says, or it came after a later frame, or after nobody waited for it any more.
+    """
+
+    SHORT = "short"
+    DUPLICATED = "duplicated"
+    DROPPED = "dropped"
+    LATE = "late"
+    OK = "ok"
+
+
+@dataclass(frozen=True)
+class FrameCounts:
+    """How many frames were ok, short, duplicated or late, how many were lost, and how many triggers unanswered."""
+
+    ok: int = 0
+    short: int = 0
+    duplicated: int = 0
+    dropped: int = 0
+    late: int = 0
+    unanswered: int = 0
+
+
+class FrameCheck:
+    """Compares each frame with the one before.
+
+    Parameters
+    ----------
+    period_s : float, optional
+        Time between frames of a free-running camera in s; without it no frame is late by its time stamp.
+    """
+
+    def __init__(self, *, period_s: float | None = None):
+        self._period_s = period_s
+        self._last_id: int | None = None
+        self._last_time_s: float | None = None
+        self._counts = dict.fromkeys(("ok", "short", "duplicated", "dropped", "late", "unanswered"), 0)
+
+    @property
+    def counts(self) -> FrameCounts:
+        """What was found so far."""
+        return FrameCounts(**self._counts)
+
+    def judge(self, *, frame_id: int, time_s: float | None, complete: bool) -> FrameStatus:
+        """Status of the next frame: its number, its time stamp in s (None: it has none), whether nothing is missing."""
+        advance = 1 if self._last_id is None else _advance(self._last_id, frame_id)
+        same_time = time_s is not None and time_s == self._last_time_s
+        self._counts["dropped"] += max(advance - 1, 0)
+        if not complete:
+            status = FrameStatus.SHORT
+        elif advance == 0 or same_time:
+            status = FrameStatus.DUPLICATED
+        elif advance > 1:
+            status = FrameStatus.DROPPED
+        elif advance < 0 or self._is_late(time_s):
+            status = FrameStatus.LATE
+        else:
+            status = FrameStatus.OK
+        # Frames that were lost are counted above, one by one.
+        if status is not FrameStatus.DROPPED:
+            self._counts[status.value] += 1
+        if advance >= 0:
+            self._last_id, self._last_time_s = frame_id, time_s
+        return status
+
+    def _is_late(self, time_s: float | None) -> bool:
+        if self._period_s is None or time_s is None or self._last_time_s is None:
+            return False
+        return time_s - self._last_time_s > 2 * self._period_s
+
+    def missed(self) -> None:
+        """Take note that a trigger was not answered; the acquisition restarts, and the camera may count afresh."""
+        self._counts["unanswered"] += 1
+        self._last_id = self._last_time_s = None
+
+    def unasked(self) -> None:
+        """Take note of a frame that came when nobody waited for it any more, and was thrown away."""
+        self._counts["late"] += 1
+        self._last_id = self._last_time_s = None
+
+
+def _advance(last: int, now: int) -> int:
+    """How many numbers a frame is ahead of the one before: 1 is the next, 0 the same, negative an older one."""
+    wrapped = last <= _COUNTER_16_BIT and last - now > _COUNTER_16_BIT // 2
+    # A counter that does not leave out 0 would seem to stand still there.
+    return max(now - last + _COUNTER_16_BIT, 1) if wrapped else now - last
 
 
 _MEANING = {
@@ -328,36 +421,6 @@ class Camera(ABC):
     @abstractmethod
     def _answers(self) -> None:
         """HardwareError where the camera is gone."""
-
-
-def open_camera(address: str) -> Camera:
-    """Open the camera at an address such as "gige:127.0.0.1"; a context manager that closes it.
-
-    Raises
-    ------
-    HardwareError
-        The address is not understood, or there is no such camera; the message lists what there is.
-    SetupError
-        A library is missing; the message says how to install it.
-    """
-    kind, colon, rest = address.partition(":")
-    if kind in ("gige", "aravis") and colon:
-        from uwlts.hardware.aravis import AravisCamera
-
-        camera: Camera = AravisCamera(rest, address=address)
-    elif kind == "genicam" and rest:
-        from uwlts.hardware.genicam import GenicamCamera
-
-        producer, _, serial = rest.partition(".cti:")
-        camera = GenicamCamera(f"{producer}.cti" if serial else rest, serial=serial or None, address=address)
-    elif kind == "replay" and rest:
-        from uwlts.hardware.replay import ReplayCamera
-
-        camera = ReplayCamera(rest, address=address)
-    else:
-        raise HardwareError(f"'{address}' is no address of a camera; known are\n{ADDRESSES}")
-    camera.open()
-    return camera
 
 
 def _refuse_outside(region: Region, info: CameraInfo) -> None:

@@ -29,8 +29,7 @@ import time
 from types import TracebackType
 
 from uwlts.errors import HardwareError, RangeError
-from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine
-from uwlts.hardware.grbl_protocol import GrblSettings, Message, Setting, Status, parse_settings
+from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, GrblSettings, Message, Setting, Status, parse_settings
 
 # A stage that has not moved by a step in this time, and in that of some steps, stands still.
 _STALL_S, _STALL_STEPS = 1.0, 5

@@ -48,11 +48,11 @@ class StagePlan(Description):
 class ScanPlan(Description):
     """A scan as read from TOML.
 
-    ``camera`` is an address of `uwlts.hardware.camera.open_camera`. At every position the images in ``lights`` are
-    taken in turn: "laser" with the laser on, "lamp" with it off, under whatever other light there is. With
-    ``background`` an image without laser is taken before every laser image and subtracted from it. Exposures are in ms,
-    or "auto". ``laser_power`` is the share of the laser's power. With ``check_steps`` an early place is visited
-    once more at the end, to see whether the stage has lost steps.
+    ``camera`` is an address for `uwlts.hardware.camera_addresses.open_camera`. At every position the images in
+    ``lights`` are taken in turn: "laser" with the laser on, "lamp" with it off, under whatever other light there is.
+    With ``background`` an image without laser is taken before every laser image and subtracted from it. Exposures are
+    in ms, or "auto". ``laser_power`` is the share of the laser's power. With ``check_steps`` an early position is
+    visited again at the end, to see whether the stage has lost steps.
     """
 
     title: str

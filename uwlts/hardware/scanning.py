@@ -15,13 +15,21 @@ import uwlts
 from uwlts.capture import Capture, CaptureWriter, Frame, part_path
 from uwlts.errors import HardwareError
 from uwlts.hardware.camera import Camera
-from uwlts.hardware.exposure import START_MS, Brightness, brightness, settled_exposure
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.laser_watch import LOOKS, LaserWatch, LitPlace, no_light, shows_laser, spread
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.hardware.rig import Rig
+from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, settled_exposure
 from uwlts.hardware.scan_plan import Light, ScanPlan, check_plan
-from uwlts.hardware.slip import Place, SlipWatch, centres_of
+from uwlts.hardware.scan_watch import (
+    LOOKS,
+    LaserWatch,
+    LitPlace,
+    Place,
+    SlipWatch,
+    centres_of,
+    no_light,
+    shows_laser,
+    spread,
+)
 from uwlts.importing.images import without_background
 from uwlts.sensor import Sensor
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe

@@ -21,15 +21,12 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.procedure import CalibrationOptions, calibrate, nominal_window
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, part_path
 from uwlts.errors import DescriptionError, RangeError
-from uwlts.hardware.camera import open_camera
+from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.attempt import Attempts
-from uwlts.hardware.guided.images import GuidedImages
-from uwlts.hardware.guided.operator import HandSwitchedLaser, Operator
-from uwlts.hardware.guided.page import GuidedPage
+from uwlts.hardware.guided.attempt import Attempts, GuidedImages
+from uwlts.hardware.guided.operator import GuidedPage, HandSwitchedLaser, Operator
+from uwlts.hardware.guided.phases import StepJudge, StepPhase, TargetPhase, places_left, recorded_poses, still_missing
 from uwlts.hardware.guided.plan import GuidedPlan, check_positions
-from uwlts.hardware.guided.step import StepJudge, StepPhase
-from uwlts.hardware.guided.target import TargetPhase, places_left, recorded_poses, still_missing
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light
 from uwlts.hardware.scanning import check_camera

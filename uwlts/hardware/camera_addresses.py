@@ -1,0 +1,48 @@
+"""Opens a camera by its address; apart from the interface, because it knows all drivers."""
+
+from uwlts.errors import HardwareError
+from uwlts.hardware.aravis import AravisCamera
+from uwlts.hardware.camera import Camera
+from uwlts.hardware.genicam import GenicamCamera
+from uwlts.hardware.replay import ReplayCamera
+
+ADDRESSES = """\
+  gige:NAME or aravis:NAME       GigE Vision or USB3 Vision by Aravis: identifier, serial number or IP address;
+                                 without NAME the only camera there is
+  genicam:PRODUCER.cti[:SERIAL]  any camera with a GenTL producer, such as XIMEA's
+  replay:PATH                    a folder of images, or a capture"""
+
+
+def open_camera(address: str) -> Camera:
+    """Open the camera at an address such as "gige:127.0.0.1"; a context manager that closes it.
+
+    Parameters
+    ----------
+    address : str
+        "gige:NAME" or "aravis:NAME", "genicam:PRODUCER.cti[:SERIAL]", or "replay:PATH".
+
+    Returns
+    -------
+    Camera
+        Open, not configured.
+
+    Raises
+    ------
+    HardwareError
+        The address is not understood, or there is no such camera; the message lists what there is.
+    SetupError
+        A library is missing; the message says how to install it.
+    """
+    kind, colon, rest = address.partition(":")
+    camera: Camera
+    if kind in ("gige", "aravis") and colon:
+        camera = AravisCamera(rest, address=address)
+    elif kind == "genicam" and rest:
+        producer, _, serial = rest.partition(".cti:")
+        camera = GenicamCamera(f"{producer}.cti" if serial else rest, serial=serial or None, address=address)
+    elif kind == "replay" and rest:
+        camera = ReplayCamera(rest, address=address)
+    else:
+        raise HardwareError(f"'{address}' is not the address of a camera; known are\n{ADDRESSES}")
+    camera.open()
+    return camera
