@@ -23,8 +23,9 @@ from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.library import load_sensor
 from uwlts.metrology.artefacts import evaluate_cloud
-from uwlts.scan import FoundStripes, reconstruct_stripes
+from uwlts.scan import reconstruct_stripes
 from uwlts.sensor import Sensor
+from uwlts.stripe import FoundStripes
 from uwlts.uncertainty.figures import figure_uncertainties
 from uwlts.workers import work_through
 

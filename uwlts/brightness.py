@@ -19,9 +19,10 @@ from uwlts.calibration.model import Calibration
 from uwlts.placement import laser_pose
 from uwlts.reconstruction import reconstruct_profile
 from uwlts.sensor import Laser, Sensor
+from uwlts.stripe.recording import FoundStripes
 from uwlts.stripe.result import FWHM_PER_SIGMA
 
-MOST_BLUR_PX = 0.1
+_MOST_BLUR_PX = 0.1
 """Where blur may move a centre by more, which is as much as speckle does, it is not worth using."""
 
 _REACH_MM = 2.0
@@ -151,6 +152,15 @@ def moved_by_blur_px(
     _, fading = _slopes(row, line, np.log(amplitude), rows, rows=0, columns=_LINES)
     variance = (width_px / FWHM_PER_SIGMA) ** 2 / (1.0 + lean**2)
     return variance * (lean * fading + 0.5 * bend)
+
+
+def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px."""
+    if len(stripes.line) == 0:
+        return np.empty(0, np.intp), np.empty(0)
+    moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
+    sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
+    return sharp, moved[sharp]
 
 
 def _slopes(

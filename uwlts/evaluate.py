@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from uwlts.cloud import PointCloud
 from uwlts.errors import CaptureError, EvaluationError
@@ -28,15 +27,6 @@ class Judgement:
 
     content: dict[str, Any]
     cloud: PointCloud
-
-
-def parse_artefact(table: dict[str, Any]) -> Artefact:
-    """An artefact's description; EvaluationError naming what is wrong with it."""
-    try:
-        return TypeAdapter(Artefact).validate_python(table)
-    except ValidationError as error:
-        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
-        raise EvaluationError(f"the artefact's description is not valid: {details}") from error
 
 
 def judge(cloud: PointCloud, *, artefact: Artefact | None, truth: Truth | None, source: str) -> Judgement:

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import viser
 
+from uwlts.calibration.any_calibration import AnyCalibration
 from uwlts.capture import Capture, part_path
 from uwlts.errors import CaptureError
-from uwlts.scan import AnyCalibration, FoundStripes, reconstruct_stripes
-from uwlts.stripe import extract_stripe
+from uwlts.scan import reconstruct_stripes
+from uwlts.stripe import FoundStripes, extract_stripe
 
 _LONGEST_SIDE_PX = 900
 

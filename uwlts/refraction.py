@@ -47,6 +47,12 @@ class RaysInMedium:
     status: np.ndarray
 
 
+def require_index(index: float) -> None:
+    """Refuse a refractive index relative to air that no medium to measure in has; RangeError."""
+    if not 1 <= index < 2:
+        raise RangeError(f"the refractive index is {index:g}; expected that of a medium relative to air, from 1 to 2")
+
+
 def check_index(name: str, value: float) -> None:
     """Raise RangeError unless a refractive index or a ratio of two is finite and positive."""
     if not (math.isfinite(value) and value > 0):

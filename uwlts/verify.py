@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import AnyCalibration
 from uwlts.calibration.joint.stored import is_joint
 from uwlts.capture import Capture
 from uwlts.errors import EvaluationError
-from uwlts.evaluate import parse_artefact
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.metrology.calibrated import calibrated_quantity
-from uwlts.scan import AnyCalibration, reconstruct_capture
+from uwlts.scan import reconstruct_capture
 from uwlts.uncertainty.figures import figure_uncertainties
 
 

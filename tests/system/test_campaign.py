@@ -19,8 +19,9 @@ from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate
 from uwlts.capture import Capture
-from uwlts.evaluate import Judgement, judge, parse_artefact
+from uwlts.evaluate import Judgement, judge
 from uwlts.library import load_sensor
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.scan import reconstruct_capture
 from uwlts.truth import read_truth, truth_path
 

@@ -18,7 +18,7 @@ from twin.campaign import Campaign, load_campaign
 from twin.reproduce import record_campaigns
 from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
-from uwlts.scan import find_stripes
+from uwlts.stripe import find_stripes
 from uwlts.thesis.evaluation import evaluate_campaign
 from uwlts.thesis.folder import CampaignFolder
 from uwlts.thesis.joint_comparison import compare_campaigns, joint_summary, summary_lines

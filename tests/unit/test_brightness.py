@@ -8,8 +8,8 @@ from uwlts.brightness import beside_sheet, moved_by_blur_px, sheet_sigma_mm, slo
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.placement import camera_from_object, laser_pose
-from uwlts.scan import FoundStripes, reconstruct_stripes
-from uwlts.stripe import extract_stripe
+from uwlts.scan import reconstruct_stripes
+from uwlts.stripe import FoundStripes, extract_stripe
 
 STAGE = 3.0 + np.arange(7.0)
 LINES = np.arange(600, 641)

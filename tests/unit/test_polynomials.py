@@ -9,13 +9,14 @@ from scipy.interpolate import CubicSpline
 
 from tests.oracles.fermat import directions_seen, plate
 from tests.unit.calibration_views import WATER, built_sensor, inside, lattice, lens_of, turn
+from uwlts.calibration.any_calibration import read_any_calibration
 from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.line_polynomials import MOST_SMOOTH, fit_line_polynomials, line_domains
 from uwlts.calibration.model import write_calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.plate_map import fit_plate_map
 from uwlts.calibration.polynomial import calibrate_polynomials, fit_polynomials
-from uwlts.calibration.polynomial_model import read_any_calibration, read_polynomials, write_polynomials
+from uwlts.calibration.polynomial_model import read_polynomials, write_polynomials
 from uwlts.calibration.target_image import TargetImage
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.cli import app

@@ -14,13 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.model import Calibration, write_calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.evaluate import judge, parse_artefact, write_evaluation
+from uwlts.evaluate import judge, write_evaluation
 from uwlts.library import load_sensor
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.report import (
     gather_campaign,
     load_reference,
@@ -37,7 +39,6 @@ from uwlts.report.figures import MOST_POINTS, cloud_figure, histogram_figure
 from uwlts.report.numbers import as_fine_as, fixed, small_length
 from uwlts.report.page import report_page
 from uwlts.report.stripe_picture import StripeView, stripe_picture
-from uwlts.scan import calibration_digest
 from uwlts.sensor import Sensor
 from uwlts.stripe import extract_stripe
 from uwlts.truth import Truth, TruthHeader, write_truth

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.unit.calibration_views import built_sensor, stage_images, stripes_on_target
+from uwlts.calibration.any_calibration import check_fits
 from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.model import read_calibration, write_calibration
 from uwlts.calibration.nominal import nominal_calibration
@@ -14,9 +15,9 @@ from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.library import load_sensor
 from uwlts.reconstruction import reconstruct_profile
-from uwlts.scan import check_fits, find_stripes, reconstruct_capture, reconstruct_stripes
+from uwlts.scan import reconstruct_capture, reconstruct_stripes
 from uwlts.sensor import Medium
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeOptions, find_stripes
 from uwlts.targets import ChessboardTarget
 
 WIDTH, HEIGHT = 160, 120
@@ -147,11 +148,14 @@ def single_viewpoint(medium):
 def test_a_calibration_without_a_window_holds_in_its_own_medium(tmp_path, calibration, medium, refusal):
     with Capture(write(tmp_path / "scan.h5", medium=medium)) as capture:
         if refusal is None:
-            check_fits(capture, calibration)
+            check_fits(capture.header, calibration, source=capture.path.name)
             scan = reconstruct_stripes(capture, find_stripes(capture), calibration)
             assert len(scan.cloud) == scan.rays_by_status["ok"] > 400
             return
-        for use in (check_fits, reconstruct_capture, lambda c, k: reconstruct_stripes(c, find_stripes(c), k)):
+        def fits(c, k):
+            check_fits(c.header, k, source=c.path.name)
+
+        for use in (fits, reconstruct_capture, lambda c, k: reconstruct_stripes(c, find_stripes(c), k)):
             with pytest.raises(CalibrationError, match=refusal):
                 use(capture, calibration)
 
@@ -184,7 +188,7 @@ def test_another_camera_is_refused(path, camera, message):
     other = CALIBRATION.model_copy(update={"camera": CALIBRATION.camera.model_copy(update=camera)})
     other = other if camera else other.model_copy(update={"stripe_along": "height"})
     with Capture(path) as capture, pytest.raises(CalibrationError, match=message):
-        check_fits(capture, other)
+        check_fits(capture.header, other, source=path.name)
 
 
 def test_the_medium_of_the_targets_images_is_kept(tmp_path):

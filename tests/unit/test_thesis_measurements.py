@@ -20,7 +20,8 @@ from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, read_cloud
 from uwlts.errors import EvaluationError
-from uwlts.evaluate import judge, parse_artefact
+from uwlts.evaluate import judge
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.thesis.folder import ScanFile
 from uwlts.thesis.measurements import _figures, _line_length, _range_within, measure_scan
 from uwlts.thesis.methods import METHODS

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.calibration.model import Calibration, read_calibration, require_plain_json
+from uwlts.calibration.model import require_plain_json
 from uwlts.files import written_aside
 from uwlts.json_file import described, read_json
 from uwlts.sensor import Description, Medium, Positive
@@ -76,6 +76,10 @@ class PolynomialCalibration(Description):
         require_plain_json(self.residuals, self.provenance)
         return self
 
+    def index_of(self, medium: Medium) -> float:
+        """Refractive index of a medium at the laser's wavelength, relative to air; RangeError where it has none."""
+        return medium.refractive_index(self.wavelength_nm)
+
     def domains(self) -> np.ndarray:
         """``domains_px`` as an array (L, 2), NaN for None."""
         return np.array([(np.nan, np.nan) if domain is None else domain for domain in self.domains_px])
@@ -95,9 +99,3 @@ def read_polynomials(path: str | Path) -> PolynomialCalibration:
         read_json(path, called="calibration"), PolynomialCalibration, path=path, format=FORMAT, version=VERSION,
         called="polynomial calibration", foreign="no polynomial calibration",
     )  # fmt: skip
-
-
-def read_any_calibration(path: str | Path) -> Calibration | PolynomialCalibration:
-    """Read a calibration of either kind, told by its "format"; CaptureError as from `read_calibration`."""
-    kind = read_json(path, called="calibration").get("format")
-    return read_polynomials(path) if kind == FORMAT else read_calibration(path)

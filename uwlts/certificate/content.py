@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import uwlts
+from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.joint.next_shot import Outlook, next_shots
 from uwlts.calibration.joint.quantities import quantity_of
 from uwlts.calibration.joint.stored import is_joint
@@ -17,7 +18,6 @@ from uwlts.calibration.model import Calibration
 from uwlts.calibration.sources import sha256_of
 from uwlts.certificate.lengths import InUse, in_use, index_name, worth_of_lengths
 from uwlts.certificate.seal import FORMAT, VERSION, sealed
-from uwlts.scan import calibration_digest
 
 _BEST_SHOTS = 3
 NOT_JOINT = "the calibration was not estimated jointly: what lengths measured by it are worth is not known"

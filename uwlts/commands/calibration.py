@@ -98,7 +98,7 @@ def calibrate(
     from uwlts.calibration.procedure import calibrate as solve
     from uwlts.capture import Capture
     from uwlts.inventory import calibration_lines
-    from uwlts.scan import require_index
+    from uwlts.refraction import require_index
     from uwlts.stripe import StripeOptions
 
     if index is not None:
@@ -188,7 +188,7 @@ def refresh(
     from uwlts.calibration.model import read_calibration, write_calibration
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.capture import Capture
-    from uwlts.scan import require_index
+    from uwlts.refraction import require_index
     from uwlts.stripe import StripeOptions
 
     if index is not None:

@@ -43,8 +43,8 @@ def reconstruct(
     overwrite
         Replace an existing file.
     """
+    from uwlts.calibration.any_calibration import read_any_calibration
     from uwlts.calibration.joint.stored import is_joint
-    from uwlts.calibration.polynomial_model import read_any_calibration
     from uwlts.capture import Capture
     from uwlts.cloud import write_cloud
     from uwlts.scan import reconstruct_capture
@@ -99,8 +99,9 @@ def evaluate(
         Replace existing files.
     """
     from uwlts.cloud import read_cloud, write_cloud
-    from uwlts.evaluate import judge, parse_artefact, write_evaluation
+    from uwlts.evaluate import judge, write_evaluation
     from uwlts.inventory import evaluation_lines
+    from uwlts.metrology.artefact_descriptions import parse_artefact
     from uwlts.truth import read_truth
 
     for path in (out, coloured):

@@ -56,7 +56,7 @@ def scan(
     """
     from contextlib import ExitStack
 
-    from uwlts.calibration.polynomial_model import read_any_calibration
+    from uwlts.calibration.any_calibration import read_any_calibration
     from uwlts.hardware.camera_addresses import open_camera
     from uwlts.hardware.grbl import GrblStage
     from uwlts.hardware.page_beside import PageBeside
@@ -119,7 +119,7 @@ def watch(capture: Path, *, calibration: Path | None = None, host: str = "127.0.
     port
         Port of the page; the next free one is taken where it is in use.
     """
-    from uwlts.calibration.polynomial_model import read_any_calibration
+    from uwlts.calibration.any_calibration import read_any_calibration
     from uwlts.live_view import LiveView
     from uwlts.live_view import watch as show
 

@@ -61,7 +61,7 @@ def models(
     )
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.capture import Capture
-    from uwlts.scan import require_index
+    from uwlts.refraction import require_index
     from uwlts.stripe import StripeOptions
 
     if index is not None:
@@ -170,7 +170,7 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
     limit
         Largest permissible error in mm.
     """
-    from uwlts.calibration.polynomial_model import read_any_calibration
+    from uwlts.calibration.any_calibration import read_any_calibration
     from uwlts.capture import Capture
     from uwlts.verify import verify as measured
 

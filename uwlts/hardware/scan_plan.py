@@ -8,8 +8,8 @@ from pydantic import Field, field_validator
 
 from uwlts.capture import CaptureHeader
 from uwlts.errors import DescriptionError, DesignError, RangeError
-from uwlts.evaluate import parse_artefact
 from uwlts.library import load_sensor, read_table, validated
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.placement import check_design
 from uwlts.sensor import Description, NotNegative, Positive, Sensor, Vector
 from uwlts.targets import parse_target

@@ -8,9 +8,9 @@ from pydantic import Field, model_validator
 
 from uwlts.capture import CaptureHeader
 from uwlts.errors import DescriptionError
-from uwlts.evaluate import parse_artefact
 from uwlts.importing.intrinsics import read_intrinsics, with_intrinsics
 from uwlts.library import find, load_sensor, merged, read_table, validated
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.sensor import Description, NotNegative, Sensor, Vector
 from uwlts.targets import parse_target
 

@@ -1,9 +1,10 @@
-"""What was measured: artefacts with their calibrated sizes, told apart by `kind`."""
+"""Descriptions of artefacts with their calibrated sizes, distinguished by `kind`."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from uwlts.errors import EvaluationError
 from uwlts.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6
@@ -64,3 +65,12 @@ class Pipe(Description):
 
 
 Artefact = Annotated[SphereStandard | PlaneStandard | StepStandard | Pipe, Field(discriminator="kind")]
+
+
+def parse_artefact(table: dict[str, Any]) -> Artefact:
+    """An artefact's description; EvaluationError naming what is wrong with it."""
+    try:
+        return TypeAdapter(Artefact).validate_python(table)
+    except ValidationError as error:
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
+        raise EvaluationError(f"the artefact's description is not valid: {details}") from error

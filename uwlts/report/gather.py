@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.capture import Capture, CaptureHeader
 from uwlts.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.errors import CaptureError
 from uwlts.report.judged import Judged, read_judged
-from uwlts.scan import calibration_digest
 from uwlts.sensor import Sensor
 from uwlts.truth import read_truth
 

@@ -8,6 +8,17 @@ why there is none.
 
 from uwlts.stripe.absence import why_no_stripe
 from uwlts.stripe.extract import extract_stripe
+from uwlts.stripe.recording import FoundStripes, find_stripes
 from uwlts.stripe.result import PeakRule, Stripe, StripeMethod, StripeOptions, StripeStatus
 
-__all__ = ["PeakRule", "Stripe", "StripeMethod", "StripeOptions", "StripeStatus", "extract_stripe", "why_no_stripe"]
+__all__ = [
+    "FoundStripes",
+    "PeakRule",
+    "Stripe",
+    "StripeMethod",
+    "StripeOptions",
+    "StripeStatus",
+    "extract_stripe",
+    "find_stripes",
+    "why_no_stripe",
+]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import AnyCalibration
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.polynomial_model import PolynomialCalibration
@@ -18,7 +19,7 @@ from uwlts.calibration.procedure import CalibrationOptions, gather
 from uwlts.capture import Capture
 from uwlts.errors import CaptureError
 from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
-from uwlts.scan import AnyCalibration, reconstruct_capture
+from uwlts.scan import reconstruct_capture
 from uwlts.thesis.budget import spacing_budget
 from uwlts.thesis.folder import MEDIA, CampaignFolder, ScanFile
 from uwlts.thesis.kept_results import keep, kept, up_to_date

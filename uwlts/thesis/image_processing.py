@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from uwlts.capture import Capture
-from uwlts.scan import FoundStripes
+from uwlts.stripe import FoundStripes
 
 _SIZE_PX = 5
 _SEARCHED_PX = 8

@@ -15,9 +15,10 @@ from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.capture import Capture
 from uwlts.design import speckle_limit_um
 from uwlts.design_table import nominal_setup
-from uwlts.evaluate import parse_artefact
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.metrology.artefacts import evaluate_cloud
-from uwlts.scan import find_stripes, reconstruct_stripes
+from uwlts.scan import reconstruct_stripes
+from uwlts.stripe import find_stripes
 from uwlts.thesis.folder import CampaignFolder, ScanFile
 from uwlts.thesis.kept_results import keep, kept, up_to_date
 from uwlts.thesis.methods import PROPOSED, TWO, calibrations

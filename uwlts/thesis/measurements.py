@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import AnyCalibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
-from uwlts.evaluate import Judgement, judge, parse_artefact
+from uwlts.evaluate import Judgement, judge
+from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
-from uwlts.scan import AnyCalibration, find_stripes, reconstruct_stripes
+from uwlts.scan import reconstruct_stripes
+from uwlts.stripe import find_stripes
 from uwlts.thesis.folder import ScanFile
 from uwlts.thesis.image_processing import thesis_stripes
 from uwlts.thesis.methods import METHODS, PROPOSED

@@ -14,12 +14,12 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
+from uwlts.calibration.any_calibration import AnyCalibration, read_any_calibration
 from uwlts.calibration.model import Calibration, write_calibration
 from uwlts.calibration.polynomial import calibrate_polynomials
-from uwlts.calibration.polynomial_model import PolynomialCalibration, read_any_calibration, write_polynomials
+from uwlts.calibration.polynomial_model import PolynomialCalibration, write_polynomials
 from uwlts.calibration.procedure import CalibrationOptions, calibrate
 from uwlts.capture import Capture
-from uwlts.scan import AnyCalibration
 from uwlts.thesis.folder import CampaignFolder
 
 PROPOSED, TWO, POLYNOMIALS, SINGLE = "proposed", "two refractions", "polynomials", "single viewpoint"

@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import AnyCalibration
 from uwlts.capture import Capture
 from uwlts.metrology.artefact_descriptions import SphereStandard
 from uwlts.metrology.sphere_evaluation import evaluate_spheres
 from uwlts.metrology.sphere_fit import fit_sphere
-from uwlts.scan import AnyCalibration, find_stripes, reconstruct_stripes
+from uwlts.scan import reconstruct_stripes
+from uwlts.stripe import find_stripes
 
 
 @dataclass(frozen=True, eq=False)

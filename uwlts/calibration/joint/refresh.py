@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import check_fits
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.joint.contradictions import Findings, findings
 from uwlts.calibration.joint.earlier import EarlierEstimate
@@ -23,7 +24,6 @@ from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.calibration.sources import captures_in
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.scan import check_fits
 from uwlts.sensor import Medium, Sensor
 
 _AIR = Medium(kind="air")
@@ -186,7 +186,7 @@ def _earlier(calibration: Calibration) -> StoredEstimate:
 
 
 def _refuse_unsuitable(capture: Capture, calibration: Calibration) -> None:
-    check_fits(capture, calibration)
+    check_fits(capture.header, calibration, source=capture.path.name)
     header, name = capture.header, capture.path.name
     if header.sensor.name != calibration.sensor_name:
         raise CalibrationError(

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.joint.account import evidence_figures, outline
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.figures import joint_figures
@@ -13,7 +14,6 @@ from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.model import Calibration, KnownMedium, KnownStage
 from uwlts.calibration.procedure import sources_of
 from uwlts.calibration.sheet import object_frame
-from uwlts.scan import calibration_digest
 
 
 def refreshed_calibration(

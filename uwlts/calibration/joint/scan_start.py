@@ -5,21 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.brightness import beside_sheet, slopes_of_brightness
+from uwlts.brightness import beside_sheet, sharp_lines, slopes_of_brightness
 from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence, across_of
 from uwlts.calibration.joint.surfaces import Cylinder, Plane, Spheres, Surface
 from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
-from uwlts.evaluate import parse_artefact
-from uwlts.metrology.artefact_descriptions import Pipe, PlaneStandard, SphereStandard
+from uwlts.metrology.artefact_descriptions import Pipe, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.metrology.sphere_evaluation import SphereEvaluation, evaluate_spheres
 from uwlts.metrology.surface_evaluation import PipeEvaluation, PlaneEvaluation, evaluate_pipe, evaluate_plane
 from uwlts.reconstruction import reconstruct_pixels
-from uwlts.scan import find_stripes, sharp_lines
 from uwlts.sensor import Sensor
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeOptions, find_stripes
 
 Scanned = SphereStandard | PlaneStandard | Pipe
 _EVALUATION = {SphereStandard: evaluate_spheres, PlaneStandard: evaluate_plane, Pipe: evaluate_pipe}
