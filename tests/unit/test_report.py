@@ -23,22 +23,17 @@ from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.evaluate import judge, write_evaluation
 from uwlts.library import load_sensor
 from uwlts.metrology.artefact_descriptions import parse_artefact
-from uwlts.report import (
-    gather_campaign,
-    load_reference,
-    print_table,
-    summary,
-    summary_table,
-    write_pictures,
-    write_report,
-    write_summary,
-)
 from uwlts.report.cloud_picture import cloud_picture
 from uwlts.report.colours import PLAIN, UNKNOWN, colour_limit_mm, coloured
 from uwlts.report.figures import MOST_POINTS, cloud_figure, histogram_figure
+from uwlts.report.gather import gather_campaign
 from uwlts.report.numbers import as_fine_as, fixed, small_length
-from uwlts.report.page import report_page
+from uwlts.report.page import report_page, write_report
+from uwlts.report.pictures import write_pictures
+from uwlts.report.published import load_reference
 from uwlts.report.stripe_picture import StripeView, stripe_picture
+from uwlts.report.summary_file import summary, write_summary
+from uwlts.report.table import print_table, summary_table
 from uwlts.sensor import Sensor
 from uwlts.stripe import extract_stripe
 from uwlts.truth import Truth, TruthHeader, write_truth

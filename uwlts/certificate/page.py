@@ -20,8 +20,8 @@ from uwlts.certificate.lengths import Worth, in_use
 from uwlts.certificate.pictures import correlation_picture, heat_map, image_residuals, length_chart
 from uwlts.errors import OutputError
 from uwlts.files import refuse_unsuitable, written_aside
-from uwlts.report.numbers import MISSING, fixed
-from uwlts.report.template import rendered
+from uwlts.report.numbers import fixed
+from uwlts.report.page_toolkit import MISSING, render_page
 
 _WORST_IMAGES = 5
 
@@ -75,7 +75,7 @@ def certificate_page(
     """
     if before is not None:
         require_same_sensor(calibration, before[1])
-    return rendered(
+    return render_page(
         "uwlts.certificate",
         "template.html.j2",
         c=content,

@@ -10,7 +10,7 @@ from uwlts.calibration.joint.quantities import quantity_of
 from uwlts.certificate.lengths import Worth
 from uwlts.report.canvas import ticks
 from uwlts.report.colours import coloured
-from uwlts.report.numbers import typographic
+from uwlts.report.page_toolkit import typographic
 from uwlts.report.svg_plot import COLOURS, FAINT, INK, Curve, Panel, svg
 
 _WIDTH, _LEFT, _TOP, _BOTTOM, _BAR = 356, 52, 30, 42, 74

@@ -151,15 +151,12 @@ def report(
     overwrite
         Replace an existing report, summary and pictures.
     """
-    from uwlts.report import (
-        gather_campaign,
-        load_reference,
-        print_table,
-        summary_table,
-        write_pictures,
-        write_report,
-        write_summary,
-    )
+    from uwlts.report.gather import gather_campaign
+    from uwlts.report.page import write_report
+    from uwlts.report.pictures import write_pictures
+    from uwlts.report.published import load_reference
+    from uwlts.report.summary_file import write_summary
+    from uwlts.report.table import print_table, summary_table
 
     campaign = gather_campaign(folder)
     published = load_reference(reference) if reference else None

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,8 @@ import numpy as np
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.report.gather import Campaign, GatheredCalibration
-from uwlts.report.numbers import MISSING, fixed, is_number, plain, unit_of, words_of
+from uwlts.report.numbers import fixed, is_number, plain, unit_of, words_of
+from uwlts.report.page_toolkit import MISSING, Comparison
 
 SHORT_LIST = 3
 """Lists up to this length are written out; longer ones are drawn."""
@@ -18,16 +18,8 @@ SHORT_LIST = 3
 _STD_NAMES = {"fx_px": ("fx", "f"), "fy_px": ("fy", "f"), "cx_px": ("cx",), "cy_px": ("cy",)}
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A table: one column per calibration (and, for a twin, one of the true values), one row per quantity."""
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, str, tuple[str, ...]], ...]
-
-
 def parameter_table(campaign: Campaign) -> Comparison:
-    """All parameters with their units and, where known, standard deviations."""
+    """All parameters with their units and, where known, standard deviations; a last column of a twin's true values."""
     columns = [found.name for found in campaign.calibrations]
     parameters = [_parameters(found.calibration) for found in campaign.calibrations]
     if campaign.true_sensor is not None:

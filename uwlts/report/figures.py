@@ -8,7 +8,8 @@ import plotly.graph_objects as go
 from uwlts.cloud import PointCloud
 from uwlts.report.cloud_picture import view_direction
 from uwlts.report.colours import LIMIT_STD, PLAIN, UNKNOWN, colour_limit_mm, plotly_scale
-from uwlts.report.numbers import as_fine_as, typographic, unit_for
+from uwlts.report.numbers import as_fine_as, unit_for
+from uwlts.report.page_toolkit import typographic
 
 MOST_POINTS = 15_000
 INK, FAINT, BLUE, RED = "#2b3440", "#dde2e8", "#3573b1", "#b5303c"

@@ -1,10 +1,10 @@
 """What the report says first: what was measured with, and the key figures in plain words."""
 
-from dataclasses import dataclass
 from typing import Any
 
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement
 from uwlts.report.numbers import fixed, is_number, small_length
+from uwlts.report.page_toolkit import Tile
 from uwlts.report.published import Reference
 from uwlts.report.summary_file import summary
 from uwlts.report.table import Row
@@ -42,16 +42,6 @@ _PUBLISHED = (
 )
 
 
-@dataclass(frozen=True)
-class Tile:
-    """A key figure: its name, value, what it covers, and what was published."""
-
-    name: str
-    value: str
-    note: str
-    published: str | None
-
-
 def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile]:
     """The key figures that the campaign has."""
     content = summary(campaign, reference)
@@ -67,18 +57,21 @@ def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile
             theirs = None if mean is None else small_length(mean)
             if theirs and covered < count:
                 theirs += f" for {covered} of them"
-            tiles.append(Tile(name, small_length(found["mean_abs"]), note, theirs))
+            tiles.append(Tile(name, small_length(found["mean_abs"]), _with_published(note, reference, theirs)))
     if content["truth"]["share_within_tolerance"] is not None:
         tiles.append(_truth_tile(content["truth"]))
     window = content["window_distance_mm"]
     if window["estimated"] is not None:
         true = "" if window["true"] is None else f"true {fixed(window['true'])} mm"
         values = published.get("window_distance_mm") or []
-        tiles.append(
-            Tile("Window distance", f"{fixed(window['estimated'])} mm", true,
-                 ", ".join(f"{value:g} mm" for value in values) or None)
-        )  # fmt: skip
+        theirs = ", ".join(f"{value:g} mm" for value in values)
+        note = _with_published(true, reference, theirs)
+        tiles.append(Tile("Window distance", f"{fixed(window['estimated'])} mm", note))
     return tiles
+
+
+def _with_published(note: str, reference: Reference | None, theirs: str | None) -> str:
+    return f"{note}\n{reference.title}: {theirs}" if reference is not None and theirs else note
 
 
 def _truth_tile(truth: dict[str, Any]) -> Tile:
@@ -89,7 +82,7 @@ def _truth_tile(truth: dict[str, Any]) -> Tile:
     if fitted:
         note += f" after a best-fit motion; in the sensor's own coordinates {small_length(truth['rms_mm'])}"
     name = f"Points within {1e3 * truth['tolerance_mm']:g} µm of the truth"
-    return Tile(name, f"{100 * shown['share_within_tolerance']:.2f} %", note, None)
+    return Tile(name, f"{100 * shown['share_within_tolerance']:.2f} %", note)
 
 
 def introduction(campaign: Campaign) -> list[tuple[str, str]]:

@@ -4,7 +4,8 @@ import math
 import re
 from typing import Any
 
-MISSING = "-"
+from uwlts.report.page_toolkit import MISSING
+
 _UNITS = {"px": "px", "mm": "mm", "deg": "°", "rad": "rad", "nm": "nm"}
 
 
@@ -52,13 +53,6 @@ def words_of(name: str) -> str:
 def is_number(value: Any) -> bool:
     """Whether a value from JSON is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def typographic(text: str) -> str:
-    """A number as text with a proper minus sign; a dash for what is missing."""
-    if text == MISSING:
-        return "\N{EN DASH}"
-    return "\N{MINUS SIGN}" + text[1:] if text.startswith("-") else text
 
 
 def unit_for(spread_mm: float) -> tuple[str, float]:

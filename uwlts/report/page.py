@@ -2,27 +2,29 @@
 
 import json
 import platform
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from plotly.offline import get_plotlyjs
-
 import uwlts
-from uwlts.files import written_aside
 from uwlts.report.calibration_figures import residual_figures, seconds_figure, window_curve_figure
-from uwlts.report.calibration_table import Comparison, parameter_table, residual_table
+from uwlts.report.calibration_table import parameter_table, residual_table
 from uwlts.report.figures import Drawn, along_stripe_figure, cloud_figure, histogram_figure
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement
 from uwlts.report.headline import explanations, headline_tiles, introduction
 from uwlts.report.judged import ArtefactFigures, TruthComparisons, TruthFigures
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
-from uwlts.report.pictures import cloud_png, data_uri, stripe_png
+from uwlts.report.page_toolkit import (
+    Comparison,
+    FigureCollector,
+    InteractiveFigure,
+    png_data_uri,
+    render_page,
+    write_page,
+)
+from uwlts.report.pictures import cloud_png, stripe_png
 from uwlts.report.published import Reference
 from uwlts.report.table import Row, summary_table, true_window_distance
-from uwlts.report.template import rendered
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "plotly")
 
@@ -39,72 +41,49 @@ def write_report(
     CaptureError
         An image of a capture is damaged.
     """
-    text = report_page(campaign, reference)
-    with written_aside(path, overwrite=overwrite) as aside:
-        # A file name may hold bytes that are no text.
-        aside.write_text(text, encoding="utf-8", errors="replace")
+    write_page(path, report_page(campaign, reference), overwrite=overwrite)
 
 
 def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
     """The page as text."""
-    collected = _Figures()
+    collected = FigureCollector()
     rows = summary_table(campaign, reference)
-    return rendered(
+    return render_page(
         "uwlts.report",
-        "template.html.j2",
+        "campaign.html.j2",
+        interactive=collected,
         title=campaign.folder.resolve().name,
         introduction=introduction(campaign),
-        tiles=headline_tiles(campaign, reference),
+        key_figures=headline_tiles(campaign, reference),
         groups=_grouped(rows),
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
         measurements=[_measurement(measurement, collected) for measurement in campaign.measurements],
         calibration=_calibration(campaign, collected),
-        seconds=collected.add(seconds_figure(campaign.seconds)),
+        seconds=_add(collected, seconds_figure(campaign.seconds)),
         provenance=_provenance(campaign),
-        figures=collected.scripts,
-        plotly=_script(get_plotlyjs()),
     )
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """A figure's place in the page."""
-
-    number: int
-    caption: str
-    solid: bool
-    height: int
+def _add(collected: FigureCollector, drawn: Drawn | None, still: bytes | None = None) -> InteractiveFigure | None:
+    if drawn is None:
+        return None
+    address = None if still is None else png_data_uri(still)
+    return collected.add(drawn.figure, drawn.caption, webgl=drawn.solid, still=address)
 
 
-class _Figures:
-    """Hands out numbers to figures and keeps their JSON for the end of the page."""
-
-    def __init__(self) -> None:
-        self.scripts: list[Markup] = []
-
-    def add(self, drawn: Drawn | None) -> _Shown | None:
-        if drawn is None:
-            return None
-        text = drawn.figure.to_json(validate=False)
-        # Within a script element nothing is escaped, and nothing may look like its end.
-        self.scripts.append(Markup(text.replace("<", "\\u003c")))
-        return _Shown(len(self.scripts) - 1, drawn.caption, drawn.solid, int(drawn.figure.layout.height))
-
-
-def _measurement(measurement: Measurement, collected: _Figures) -> dict[str, Any]:
+def _measurement(measurement: Measurement, collected: FigureCollector) -> dict[str, Any]:
     cloud, judged, capture = measurement.cloud, measurement.judged, measurement.capture
     coloured = cloud is not None and cloud.deviation_mm is not None
     stripe, still = stripe_png(measurement), cloud_png(measurement)
     return {
         "name": measurement.name,
         "facts": _facts(measurement),
-        "stripe": None if stripe is None else data_uri(stripe),
+        "stripe": None if stripe is None else png_data_uri(stripe),
         "no_stripe": "no image of its capture shows a stripe" if capture else "its capture is not in the folder",
-        "cloud": None if cloud is None else collected.add(cloud_figure(cloud)),
-        "still": None if still is None else data_uri(still),
-        "histogram": collected.add(histogram_figure(cloud.deviation_mm)) if coloured else None,
-        "along": collected.add(along_stripe_figure(cloud)) if coloured else None,
+        "cloud": None if cloud is None else _add(collected, cloud_figure(cloud), still),
+        "histogram": _add(collected, histogram_figure(cloud.deviation_mm)) if coloured else None,
+        "along": _add(collected, along_stripe_figure(cloud)) if coloured else None,
         "deviation_from": "the artefact's fitted surface" if judged and judged.evaluation else "the true surface",
         "figures": None if judged is None or judged.evaluation is None else _figure_table(judged.evaluation),
         "truth": None if judged is None or judged.truth is None else _truth_table(judged.truth),
@@ -166,7 +145,7 @@ def _figure_table(evaluation: ArtefactFigures) -> Comparison:
     return Comparison(("value",), tuple(rows))
 
 
-def _calibration(campaign: Campaign, collected: _Figures) -> dict[str, Any] | None:
+def _calibration(campaign: Campaign, collected: FigureCollector) -> dict[str, Any] | None:
     if not campaign.calibrations:
         return None
     return {
@@ -175,9 +154,10 @@ def _calibration(campaign: Campaign, collected: _Figures) -> dict[str, Any] | No
         "warnings": [
             (found.name, text) for found in campaign.calibrations for text in _warnings(found.calibration.provenance)
         ],
-        "curve": collected.add(window_curve_figure(campaign.calibrations, true_window_distance(campaign))),
+        "curve": _add(collected, window_curve_figure(campaign.calibrations, true_window_distance(campaign))),
         "groups": [
-            (found.name, [collected.add(drawn) for drawn in residual_figures(found)]) for found in campaign.calibrations
+            (found.name, [_add(collected, drawn) for drawn in residual_figures(found)])
+            for found in campaign.calibrations
         ],
     }
 
@@ -225,8 +205,3 @@ def _value(value: Any) -> str:
     if is_number(value):
         return f"{value:g}" if isinstance(value, float) else str(value)
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-
-
-def _script(source: str) -> Markup:
-    """Source of a script, with nothing in it that looks like the script's end."""
-    return Markup(source.replace("</script", "<\\/script"))

@@ -1,6 +1,5 @@
 """Pictures as PNG files, or inside a page."""
 
-import base64
 from pathlib import Path
 
 import cv2
@@ -25,11 +24,6 @@ def stripe_png(measurement: Measurement) -> bytes | None:
 def cloud_png(measurement: Measurement) -> bytes | None:
     """Picture of a measurement's cloud; None without one."""
     return None if measurement.cloud is None else png(cloud_picture(measurement.cloud))
-
-
-def data_uri(png: bytes) -> str:
-    """A PNG as an address that holds the picture itself."""
-    return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
 def write_pictures(folder: str | Path, campaign: Campaign, *, overwrite: bool = False) -> list[Path]:

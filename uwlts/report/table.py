@@ -12,7 +12,8 @@ from rich.text import Text
 from uwlts.metrology.artefact_descriptions import Artefact
 from uwlts.metrology.calibrated import calibrated_quantity
 from uwlts.report.gather import Campaign, Measurement
-from uwlts.report.numbers import MISSING, fixed
+from uwlts.report.numbers import fixed
+from uwlts.report.page_toolkit import MISSING
 from uwlts.report.published import CALIBRATION, Reference
 
 _QUANTITIES = {

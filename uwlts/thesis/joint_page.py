@@ -10,8 +10,8 @@ from markupsafe import Markup
 
 import uwlts
 from uwlts.files import written_aside
+from uwlts.report.page_toolkit import render_page
 from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
-from uwlts.report.template import rendered
 from uwlts.thesis.joint_comparison import DIAMETERS, JOINT, ONE_REFRACTION, SPACING, TWO_REFRACTIONS, joint_summary
 
 _WORDS = {ONE_REFRACTION: "one refraction", TWO_REFRACTIONS: "two refractions", JOINT: "joint"}
@@ -39,7 +39,7 @@ def write_joint_comparison(
 def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
     """The page as text, from the results of `compare_campaigns` and their `joint_summary`."""
     media = [medium for medium in ("water", "air") if any(summary[medium]["spacing_error_mm"].values())]
-    return rendered(
+    return render_page(
         "uwlts.thesis", "joint.html.j2",
         software=f"uwlts {uwlts.__version__}", campaigns=summary["campaigns"], solve_s=max(summary["solve_s"]),
         media=[

@@ -11,9 +11,9 @@ import uwlts
 from uwlts.capture import Capture
 from uwlts.cloud import read_cloud
 from uwlts.report.cloud_picture import cloud_picture
-from uwlts.report.pictures import data_uri, png
+from uwlts.report.page_toolkit import png_data_uri, render_page
+from uwlts.report.pictures import png
 from uwlts.report.stripe_picture import stripe_picture, stripe_view
-from uwlts.report.template import rendered
 from uwlts.thesis.differences import differences, far_off
 from uwlts.thesis.figures import (
     comparison_figure,
@@ -58,7 +58,7 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
         if row.table == "Figure 66" and row.quantity == "STD" and row.row.endswith("thesis image processing")
         and FORGOTTEN not in row.row
     ]  # fmt: skip
-    return rendered(
+    return render_page(
         "uwlts.thesis",
         "template.html.j2",
         published=published.title,
@@ -126,6 +126,6 @@ def _pictures(folder: Path) -> list[tuple[str, str, str]]:
         name = cloud.stem.removesuffix("-proposed")
         with Capture(campaign.path / f"{name}.h5") as capture:
             view = stripe_view(capture)
-        stripe = "" if view is None else data_uri(png(stripe_picture(view)))
-        found.append((name, stripe, data_uri(png(cloud_picture(read_cloud(cloud))))))
+        stripe = "" if view is None else png_data_uri(png(stripe_picture(view)))
+        found.append((name, stripe, png_data_uri(png(cloud_picture(read_cloud(cloud))))))
     return found

@@ -9,7 +9,8 @@ from uwlts.calibration.model_choice.comparison import Comparison
 from uwlts.calibration.model_choice.held_out import INSIDE, OUTSIDE
 from uwlts.calibration.model_choice.scores import POINTS, STRIPES
 from uwlts.calibration.model_choice.verdicts import adds, verdicts
-from uwlts.report.numbers import MISSING, fixed, small_length
+from uwlts.report.numbers import fixed, small_length
+from uwlts.report.page_toolkit import MISSING
 
 
 def content_of(comparison: Comparison) -> dict[str, Any]:

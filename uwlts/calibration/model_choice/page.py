@@ -9,8 +9,8 @@ from markupsafe import Markup
 from uwlts.calibration.model_choice.held_out import INSIDE, OUTSIDE
 from uwlts.errors import OutputError
 from uwlts.files import refuse_unsuitable, written_aside
+from uwlts.report.page_toolkit import render_page
 from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
-from uwlts.report.template import rendered
 
 
 def refuse_unsuitable_outputs(page: Path, *, overwrite: bool) -> None:
@@ -35,7 +35,7 @@ def write_models(page: Path, content: dict[str, Any], *, overwrite: bool = False
 
 def models_page(content: dict[str, Any]) -> str:
     """The page as text."""
-    return rendered(
+    return render_page(
         "uwlts.calibration.model_choice", "template.html.j2", c=content, ways=(INSIDE, OUTSIDE),
         picture=_picture(content),
     )  # fmt: skip

@@ -1,0 +1,232 @@
+"""Templates, style, figures and files shared by all HTML pages.
+
+A page is a Jinja template that extends ``base.html.j2`` and imports what it needs from ``components.html.j2``::
+
+    {% extends "base.html.j2" %}
+    {% from "components.html.j2" import tiles, facts, comparison, picture, chart %}
+    {% block title %}Measurement report{% endblock %}
+    {% block content %}{{ tiles(key_figures) }} ... {{ chart(cloud) }}{% endblock %}
+
+    figures = FigureCollector()
+    text = render_page("uwlts.report", "campaign.html.j2", interactive=figures,
+                       histogram=svg_of(static), cloud=figures.add(interactive, "All points."))
+    write_page(path, text, overwrite=overwrite)
+
+Pages contain everything that they show and load nothing from the network. This module computes nothing and imports
+nothing of the measurement software, so the twin may use it, too.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader
+from markupsafe import Markup
+
+from uwlts.errors import OutputError
+from uwlts.files import refuse_unsuitable, written_aside
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MISSING = "-"
+"""What stands for a missing value in tables of text."""
+
+INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b5303c"
+"""Colours of text, notes, grid lines, and of the main and the contrasting line; those of ``style.css``."""
+
+COLOURS = (BLUE, "#d9822b", "#2e8b57", RED, "#7b4fa3", "#5b6770", "#12a3a8", "#a0722a")
+"""Colours of the lines of one figure, in order."""
+
+_STYLE = {
+    "font.size": 9.0, "axes.edgecolor": INK, "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK,
+    "ytick.color": INK, "axes.titlesize": 10.0, "axes.titleweight": "bold", "axes.titlelocation": "left",
+    "axes.grid": True, "axes.axisbelow": True, "grid.color": FAINT, "axes.spines.top": False,
+    "axes.spines.right": False, "legend.frameon": False, "axes.prop_cycle": None,
+}  # fmt: skip
+# Text stays text, and the same figure gives the same file.
+_SVG = {"svg.fonttype": "none", "svg.hashsalt": "page"}
+
+
+def render_page(package: str, template: str, /, *, interactive: FigureCollector | None = None, **values: Any) -> str:
+    """Return the page that a template makes of values.
+
+    Parameters
+    ----------
+    package
+        Package whose folder, or whose ``templates`` folder, holds the template.
+    template
+        File name of the template, which extends ``base.html.j2``.
+    interactive
+        The page's interactive figures; scripts are allowed and embedded only if there are any.
+    **values
+        Variables of the template.
+    """
+    folders = [PackageLoader(package, ""), PackageLoader("uwlts.report", "templates")]
+    environment = Environment(loader=ChoiceLoader(folders), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["minus"] = typographic
+    scripts = [] if interactive is None else interactive.scripts
+    return environment.get_template(template).render(
+        page_style=Markup((Path(__file__).with_name("templates") / "style.css").read_text(encoding="utf-8")),
+        page_figures=scripts,
+        page_plotly=_plotly_source() if scripts else "",
+        **values,
+    )
+
+
+def write_page(path: str | Path, text: str, *, beside: str | None = None, overwrite: bool = False) -> None:
+    """Write a page, and a JSON text beside it if one is given, each whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
+    """
+    with ExitStack() as stack:
+        if beside is not None:
+            aside = stack.enter_context(written_aside(json_beside(Path(path)), overwrite=overwrite))
+            aside.write_text(beside, encoding="utf-8")
+        aside = stack.enter_context(written_aside(path, overwrite=overwrite))
+        # A file name on the page may hold bytes that are no text.
+        aside.write_text(text, encoding="utf-8", errors="replace")
+
+
+def json_beside(page: Path) -> Path:
+    """Where the JSON of a page is written."""
+    return page.with_suffix(".json")
+
+
+def refuse_unsuitable_page(page: Path, *, example: str, overwrite: bool) -> None:
+    """Raise OutputError if a page, or the JSON beside it, cannot be written; ``example`` is a suitable name."""
+    if page.suffix == ".json":
+        raise OutputError(f"{page} is the page, which is HTML, and its JSON goes beside it; give a name like {example}")
+    for path in (page, json_beside(page)):
+        refuse_unsuitable(path, overwrite=overwrite)
+
+
+@dataclass(frozen=True)
+class InteractiveFigure:
+    """Place of an interactive figure in a page.
+
+    ``still`` is the address of a picture that replaces a ``webgl`` figure in print.
+    """
+
+    number: int
+    caption: str
+    height: int
+    webgl: bool = False
+    still: str | None = None
+
+
+class FigureCollector:
+    """Numbers the interactive figures of a page and keeps their JSON for the page's end."""
+
+    def __init__(self) -> None:
+        self.scripts: list[Markup] = []
+
+    def add(
+        self, figure: go.Figure, caption: str = "", *, webgl: bool = False, still: str | None = None
+    ) -> InteractiveFigure:
+        """Keep a plotly figure with a height in its layout; the result is what the ``chart`` component shows.
+
+        Figures with ``webgl`` are drawn only near the screen, as browsers keep few of them.
+        """
+        # Within a script element nothing is escaped, and nothing may look like its end.
+        text = figure.to_json(validate=False) or ""
+        self.scripts.append(Markup(text.replace("<", "\\u003c")))
+        return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height), webgl, still)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A key figure of the ``tiles`` component: its name, its value, and lines of notes below."""
+
+    name: str
+    value: str
+    note: str = ""
+    accent: bool = False
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A table of the ``comparison`` component: columns of values, and rows of words, unit and one value per column."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, str, tuple[str, ...]], ...]
+
+
+def new_figure(
+    width: float = 5.6, height: float = 3.2, *, rows: int = 1, columns: int = 1
+) -> tuple[Figure, Sequence[Axes]]:
+    """Return an empty matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_STYLE | {"axes.prop_cycle": matplotlib.cycler(color=COLOURS)}):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def legend_below(figure: Figure, *, columns: int = 4) -> None:
+    """One legend below all axes of a figure, each label once."""
+    entries = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if entries:
+        figure.legend(
+            entries.values(), entries.keys(), loc="outside lower left", ncols=columns, fontsize=9, frameon=False,
+            labelcolor=INK,
+        )  # fmt: skip
+
+
+def svg_of(figure: Figure) -> Markup:
+    """A matplotlib figure as an SVG element to stand in a page."""
+    import matplotlib
+
+    text = io.StringIO()
+    with matplotlib.rc_context(_SVG):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    drawn = text.getvalue()
+    # Ids of groups would occur in every figure, and nothing refers to them; within HTML, SVG needs no namespaces.
+    drawn = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", drawn, flags=re.S)
+    return Markup(drawn[drawn.index("<svg") :].replace("xlink:href", "href"))
+
+
+def png_of(figure: Figure, *, dpi: int = 130) -> bytes:
+    """A matplotlib figure as PNG."""
+    data = io.BytesIO()
+    # The software's name with its version would change the file.
+    figure.savefig(data, format="png", dpi=dpi, metadata={"Software": None})
+    return data.getvalue()
+
+
+def png_data_uri(picture: Figure | bytes, *, dpi: int = 130) -> str:
+    """A matplotlib figure, or the bytes of a PNG, as an address that holds the whole picture."""
+    data = picture if isinstance(picture, bytes) else png_of(picture, dpi=dpi)
+    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
+
+
+def typographic(text: str) -> str:
+    """A number as text with a proper minus sign; a dash for what is missing."""
+    if text == MISSING:
+        return "\N{EN DASH}"
+    return "\N{MINUS SIGN}" + text[1:] if text.startswith("-") else text
+
+
+def _plotly_source() -> Markup:
+    """Plotly's script, with nothing in it that looks like the script's end."""
+    from plotly.offline import get_plotlyjs
+
+    return Markup(get_plotlyjs().replace("</script", "<\\/script"))
