@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from twin.study.agreement import Candidate, Verification, verified
 from twin.study.description import Study
 from twin.study.parameters import followed, parameters_of
+from twin.study.verification import Candidate, Verification, verified
 from twin.variant import CPU
 from uwlts.library import load_sensor, merged, validated
 from uwlts.sensor import Sensor

@@ -7,10 +7,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from twin.study.crew import crew
 from twin.study.description import Study, load_study
-from twin.study.results import read_parts, write_part
-from twin.study.screening import Batch, judged_part
+from twin.study.executor import crew
+from twin.study.screening import Batch, judged_part, read_parts, write_part
 
 WORKERS = 2
 BATCHES, BATCH = 40, 1000

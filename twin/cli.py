@@ -321,8 +321,8 @@ def sweep(
     variant
         Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    from twin.study.crew import crew
     from twin.study.description import load_study
+    from twin.study.executor import crew
     from twin.study.sweep import clear, outcome_lines
     from twin.study.sweep import sweep as run_sweep
 

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered
-from twin.study.agreement import Candidate, Verification, compared, render, verified
-from twin.study.crew import crew
 from twin.study.description import Study
 from twin.study.designs import Design, built
+from twin.study.executor import crew
 from twin.study.figures import scatter_at
 from twin.study.parameters import parameters_of
-from twin.study.verification import Rendered
+from twin.study.verification import Candidate, Rendered, Verification, compared, render, verified
 from twin.variant import CPU
 
 

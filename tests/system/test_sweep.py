@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.study.crew import crew
 from twin.study.description import load_study
-from twin.study.results import parts, read_parts
-from twin.study.screening import screen
+from twin.study.executor import crew
+from twin.study.screening import parts, read_parts, screen
 from uwlts.library import load_sensor
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from twin.study.crew import Lost, crew
+from twin.study.executor import Lost, crew
 from uwlts.errors import SetupError
 
 GUILTY = 7

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from twin.study.description import Study, load_study
-from twin.study.designs import Design, built, described, judged, row_of, sensor_of
+from twin.study.designs import Design, built, described, designs_of, judged, number_of_designs, row_of, sensor_of
 from twin.study.figures import FIGURES
-from twin.study.results import as_part, read_parts, write_csv, write_part
-from twin.study.sampling import designs_of, number_of_designs
+from twin.study.screening import as_part, read_parts, write_csv, write_part
 from uwlts.errors import CaptureError, DescriptionError, DesignError
 from uwlts.library import load_sensor, names
 

@@ -7,9 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 from tests.virtual_sensors import altered
-from twin.study.figures import Figures, figures_of
+from twin.study.figures import CLASS_NAMES, Figures, figures_of
 from twin.study.parameters import followed, parameters_of
-from twin.study.safety import CLASS_NAMES
 from uwlts.media import water_absorption_per_m, water_scattering_per_m
 from uwlts.placement import view_of_sheet
 from uwlts.sensor import Sensor

@@ -10,19 +10,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from twin.study.choice import pareto
 from twin.study.description import Study, load_study
 from twin.study.designs import Design, Marked, built, described, judged, row_of
 from twin.study.figures import FIGURES, figures_of
 from twin.study.parameters import parameters_of
-from twin.study.pareto import pareto
-from twin.study.report.charts import Point, parallel_chart, pareto_chart, sample, trade_off
-from twin.study.report.contours import map_of
-from twin.study.report.curves import bars, curves
-from twin.study.report.names import FIGURE_NAMES, label_of, number_text, rounded, value_text, without_numbers, words_of
+from twin.study.report.charts import Point, bars, curves, map_of, parallel_chart, pareto_chart, sample, trade_off
+from twin.study.report.drawing import views_of
 from twin.study.report.page import page_text, write_page
-from twin.study.report.rendered import agreement
-from twin.study.report.side_view import views_of
-from twin.study.report.table import Judged, misses
+from twin.study.report.tables import (
+    FIGURE_NAMES,
+    Judged,
+    agreement,
+    label_of,
+    misses,
+    number_text,
+    rounded,
+    value_text,
+    without_numbers,
+    words_of,
+)
 from uwlts.errors import DesignError, EvaluationError, RangeError
 from uwlts.sensor import Sensor
 

@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from twin.study.agreement import Candidate, render
 from twin.study.choice import choose
-from twin.study.crew import Crew
 from twin.study.description import Study
 from twin.study.designs import Marked
+from twin.study.executor import Crew
 from twin.study.report.page import write_page
-from twin.study.results import read_parts, write_csv
-from twin.study.screening import PARTS, PLAN, Progress, screen
-from twin.study.search import JOURNAL
+from twin.study.screening import JOURNAL, PARTS, PLAN, Progress, read_parts, screen, write_csv
+from twin.study.verification import Candidate, render
 from uwlts.files import written_aside
 
 PAGE, TABLE, WINNER, SUMMARY = "report.html", "designs.csv", "winner.toml", "summary.json"

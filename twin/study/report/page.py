@@ -16,15 +16,28 @@ from plotly.offline import get_plotlyjs
 import uwlts
 from twin.study.description import Study
 from twin.study.designs import Marked
-from twin.study.report.charts import Drawn, Point, parallel_chart, pareto_chart, verification_chart
-from twin.study.report.contours import contours
-from twin.study.report.curves import bars, curves
-from twin.study.report.drawing import Drawing, draw
-from twin.study.report.headline import Tile, introduction, tiles
-from twin.study.report.names import label_of, value_text, words_of
-from twin.study.report.rendered import agreement, verification_rows
-from twin.study.report.side_view import views_of
-from twin.study.report.table import Judged
+from twin.study.report.charts import (
+    Drawn,
+    Point,
+    bars,
+    contours,
+    curves,
+    parallel_chart,
+    pareto_chart,
+    verification_chart,
+)
+from twin.study.report.drawing import Drawing, draw, views_of
+from twin.study.report.tables import (
+    Judged,
+    Tile,
+    agreement,
+    introduction,
+    label_of,
+    tiles,
+    value_text,
+    verification_rows,
+    words_of,
+)
 from uwlts.errors import UwltsError
 from uwlts.files import written_aside
 

@@ -1,4 +1,4 @@
-"""Who does the work of a sweep: processes of this machine, or the workers of a Dask cluster, by the same calls."""
+"""Executors of a sweep's jobs: processes of this machine, or the workers of a Dask cluster, by the same calls."""
 
 from __future__ import annotations
 
