@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 from stripe_cases import FACING, PLATE, Case, step_per_px
 
-from twin.detector import electrons_per_ms, grey_values
-from twin.effects import ALL
-from twin.fixed_pattern import fixed_pattern
-from twin.options import Options
+from twin.detector import electrons_per_ms, fixed_pattern, grey_values
+from twin.options import ALL, Options
 from twin.renderer import LaserFrame
 from twin.scene import Scene, load_scene
 from twin.speckle import Speckle, coherence

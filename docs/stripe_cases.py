@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.polynomial import polynomial
 
-from twin.effects import ALL, NONE, Effects
-from twin.options import Options
+from twin.options import ALL, NONE, Effects, Options
 from twin.scene import Scene, load_scene
 from uwlts.library import load_sensor
 from uwlts.metrology.robust_fit import MAD_TO_STD

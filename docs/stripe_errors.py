@@ -13,7 +13,7 @@ from stripe_cases import CROSSING, FILTERED, MASS, VERTEX, Frames, measure
 from stripe_plan import NAME_CORE, PLACES, Plan
 from stripe_tables import table, write_tables
 
-from twin.variant import use_variant
+from twin.options import use_variant
 from uwlts.console import progress_bar
 from uwlts.report.numbers import fixed
 

@@ -18,7 +18,7 @@ from method_shots import LEVELS, Place, Spread, places, render, round_to_zero, s
 from stripe_cases import FILTERED, MASS, METHODS
 from stripe_tables import table, write_tables
 
-from twin.variant import use_variant
+from twin.options import use_variant
 from uwlts.console import progress_bar
 from uwlts.stripe import StripeMethod, StripeOptions, extract_stripe
 

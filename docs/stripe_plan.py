@@ -2,7 +2,7 @@
 
 from stripe_cases import Case
 
-from twin.effects import ALL, NONE, Effects
+from twin.options import ALL, NONE, Effects
 from uwlts.library import load_sensor
 
 PLACES = {

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from twin.options import CPU
 from twin.study.description import Study
 from twin.study.parameters import followed, parameters_of
 from twin.study.verification import Candidate, Verification, verified
-from twin.variant import CPU
 from uwlts.library import load_sensor, merged, validated
 from uwlts.sensor import Sensor
 

@@ -58,10 +58,9 @@ def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: i
 
 def rendering() -> list[Row]:
     """Time of a full-size laser frame and a lamp frame of the thesis's sensor."""
-    from twin.variant import use_variant
+    from twin.options import NONE, use_variant
 
     use_variant()
-    from twin.effects import NONE
     from twin.renderer import Renderer
     from twin.scene import load_scene
     from uwlts.library import load_sensor

@@ -13,8 +13,7 @@ import numpy as np
 
 from tests.stock_mitsuba import fog, stock_scene
 from tests.virtual_sensors import altered
-from twin.effects import NONE
-from twin.options import Options
+from twin.options import NONE, Options
 from twin.renderer import Renderer
 from twin.scene import load_scene
 from twin.simulate import simulate

@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from twin.variant import use_variant
+from twin.options import use_variant
 from uwlts.library import load_sensor
 from uwlts.sensor import Sensor
 

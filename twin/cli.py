@@ -9,10 +9,8 @@ from cyclopts import App, Parameter
 
 import uwlts
 from twin.campaign import campaign_names, load_campaign
-from twin.effects import ALL, NONE
-from twin.options import Options
+from twin.options import ALL, CPU, NONE, Options, use_variant
 from twin.scene import load_scene, scene_names
-from twin.variant import CPU, use_variant
 from uwlts.console import progress_bar, run
 from uwlts.errors import DescriptionError
 from uwlts.library import load_sensor, names

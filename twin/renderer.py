@@ -20,16 +20,23 @@ import mitsuba as mi
 import numpy as np
 
 from twin.arrays import to_jit
-from twin.cells import NODE_SPACING_PX, any_corner, corner_extremes, corner_mean, near_sheet, widened
-from twin.effects import ALL, Effects
-from twin.legs import Leg, legs
+from twin.camera import Bundle, RaySegment, View, ray_segments
+from twin.image_sampling import (
+    NODE_SPACING_PX,
+    any_corner,
+    corner_extremes,
+    corner_mean,
+    lattice,
+    near_sheet,
+    pupil_shifts,
+    widened,
+)
 from twin.light import Light, Source, lights
 from twin.objects import build_objects
+from twin.options import ALL, Effects
 from twin.pose import SensorPose, Travel
-from twin.samples import lattice, pupil_shifts
 from twin.scene import Scene
 from twin.sheet import Sheet
-from twin.view import Bundle, View
 from twin.walk import Walker
 from twin.water import Scattering, single_scattering
 from uwlts.placement import camera_from_object, check_design
@@ -138,36 +145,38 @@ class Renderer:
         """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
         bundle, shape = self.view.grid(NODE_SPACING_PX)
         direct, _ = lights(self._sources[:1], pose)
-        near = [near_sheet(self._sigmas(light, next(self._legs(moment, bundle, None))).numpy().reshape(shape))
+        near = [near_sheet(self._sigmas(light, next(self._segments(moment, bundle, None))).numpy().reshape(shape))
                 for moment, (light, *_) in self._moments(pose, direct)]  # fmt: skip
         return self._pixels_of(np.any(near, axis=0))
 
     def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None = None) -> mi.Float:
         """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
         direct, _ = lights(self._sources[:1], pose)
-        leg = next(self._legs(pose, bundle, travel_mm))
-        return leg.weight * self._radiance(pose, leg, direct, travel_mm)
+        segment = next(self._segments(pose, bundle, travel_mm))
+        return segment.weight * self._radiance(pose, segment, direct, travel_mm)
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
-    def _legs(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None) -> Iterator[Leg]:
+    def _segments(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
-        return legs(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
+        return ray_segments(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
 
-    def _sigmas(self, light: Light, leg: Leg) -> mi.Float:
-        """The light's distance across at the legs' ends in standard deviations; infinity where there is no surface."""
-        here = light.at(leg.end())
-        return dr.select(leg.valid, here.distance_mm / here.sigma_mm, dr.inf)
+    def _sigmas(self, light: Light, segment: RaySegment) -> mi.Float:
+        """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
+        here = light.at(segment.end())
+        return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
-    def _radiance(self, pose: SensorPose, leg: Leg, sources: list[Light], travel_mm: mi.Float | None) -> mi.Float:
-        """Radiance in W/mm2/sr that lit surfaces send back along legs, as it arrives at their beginning."""
-        radiance, end, bsdf = mi.Float(0.0), leg.end(), leg.si.bsdf()
+    def _radiance(
+        self, pose: SensorPose, segment: RaySegment, sources: list[Light], travel_mm: mi.Float | None
+    ) -> mi.Float:
+        """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
+        radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
             here = light.at(end, travel_mm)
-            lit = light.reaches(self.objects.scene, end, here, travel_mm, leg.valid & (here.irradiance > 0))
-            towards = leg.si.to_local(pose.direction(-here.direction))
-            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), leg.si, towards, lit)[0] * here.irradiance, 0.0)
-        return radiance * dr.exp(-self.scattering.extinction * dr.select(leg.valid, leg.si.t, 0.0))
+            lit = light.reaches(self.objects.scene, end, here, travel_mm, segment.valid & (here.irradiance > 0))
+            towards = segment.si.to_local(pose.direction(-here.direction))
+            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
+        return radiance * dr.exp(-self.scattering.extinction * dr.select(segment.valid, segment.si.t, 0.0))
 
     # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
 
@@ -180,14 +189,14 @@ class Renderer:
         reach = np.zeros_like(lit, np.float32)
         for moment, sources in self._moments(pose, direct + mirrored):
             haze = mi.Float(0.0)
-            for index, leg in enumerate(self._legs(moment, bundle, None)):
-                across = [self._sigmas(light, leg) for light in sources]
-                straight = mi.Point3f(bundle.origin + bundle.direction * (leg.way + leg.si.t))
-                depth = dr.select(leg.valid, self.view.depth_mm(straight), dr.nan)
+            for index, segment in enumerate(self._segments(moment, bundle, None)):
+                across = [self._sigmas(light, segment) for light in sources]
+                straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
+                depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self.effects.haze and self.scattering.coefficient > 0:
                     for light, sigmas in zip(sources, across, strict=True):
-                        haze += bundle.weight * self._haze(light, leg, sigmas)
-                reached = [light.may_reach(leg.end(), light.at(leg.end())) for light in sources]
+                        haze += bundle.weight * self._haze(light, segment, sigmas)
+                reached = [light.may_reach(segment.end(), light.at(segment.end())) for light in sources]
                 dr.eval(depth, haze, *across, *reached)
                 near = np.zeros_like(lit)
                 for sigmas, there in zip(across, reached, strict=True):
@@ -210,17 +219,19 @@ class Renderer:
                 direct, mirrored = lights(self._sources, moved, self._mirrors)
                 yield moved, direct + mirrored
 
-    def _haze(self, light: Light, leg: Leg, sigmas: mi.Float) -> mi.Float:
+    def _haze(self, light: Light, segment: RaySegment, sigmas: mi.Float) -> mi.Float:
         """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
 
         ``sigmas`` is the sheet's distance where the rays end on a surface, in standard deviations.
         """
-        origin, direction = light.in_own_frame(leg.origin, leg.direction)
+        origin, direction = light.in_own_frame(segment.origin, segment.direction)
         t, here = light.crossing(origin, direction)
-        end = dr.select(leg.valid, sigmas * dr.sign(dr.dot(direction, here.normal)), dr.inf)
+        end = dr.select(segment.valid, sigmas * dr.sign(dr.dot(direction, here.normal)), dr.inf)
         scattered = single_scattering(self.scattering, here, direction=direction, surface_sigmas=end)
         # A surface just before the sheet's middle cuts the sheet's light, but does not shadow what lies before it.
-        place = mi.Point3f(leg.origin + leg.direction * dr.minimum(t, dr.select(leg.valid, leg.si.t, dr.inf)))
+        place = mi.Point3f(
+            segment.origin + segment.direction * dr.minimum(t, dr.select(segment.valid, segment.si.t, dr.inf))
+        )
         reached = light.reaches(self.objects.scene, place, light.at(place), None, (t > 0) & (scattered > 0))
         return dr.select(reached, scattered * dr.exp(-self.scattering.extinction * t), 0.0)
 
@@ -264,8 +275,8 @@ class Renderer:
         """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
         bundle, shape = self.view.grid(1)
         value = self._evenly_lit(pose, bundle, None, ambient=ambient)
-        leg = next(self._legs(pose, bundle, None))
-        depth = dr.select(leg.valid, self.view.depth_mm(leg.end()), dr.nan)
+        segment = next(self._segments(pose, bundle, None))
+        depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
         low, high = corner_extremes(nodes)
@@ -294,15 +305,15 @@ class Renderer:
         is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
         extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
         """
-        leg = next(self._legs(pose, bundle, travel_mm))
+        segment = next(self._segments(pose, bundle, travel_mm))
         lamp = self.sensor.lamp
         level = 1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2)
-        left = dr.exp(-self.scattering.extinction * dr.select(leg.valid, leg.si.t, dr.inf))
-        radiance = dr.select(leg.valid, self.objects.albedo(leg.si) * left, 0.0)
+        left = dr.exp(-self.scattering.extinction * dr.select(segment.valid, segment.si.t, dr.inf))
+        radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += scattered / self.scattering.extinction * (1 - left)
-        return leg.weight * level * radiance
+        return segment.weight * level * radiance
 
     # --- pixels -------------------------------------------------------------------------------------------------------
 
@@ -311,11 +322,11 @@ class Renderer:
     ) -> tuple[mi.Float, mi.Float, mi.Float]:
         """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        for leg in self._legs(pose, bundle, travel_mm):
-            value = leg.weight * self._radiance(pose, leg, sources, travel_mm)
+        for segment in self._segments(pose, bundle, travel_mm):
+            value = segment.weight * self._radiance(pose, segment, sources, travel_mm)
             total += value
-            polarised += value * self.objects.polarisation(leg.si)
-            rough += value * self.objects.roughness_um(leg.si)
+            polarised += value * self.objects.polarisation(segment.si)
+            rough += value * self.objects.roughness_um(segment.si)
         return total, polarised, rough
 
     def _fine(

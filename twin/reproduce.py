@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from twin.campaign import Campaign, Take, takes
-from twin.options import Options
-from twin.variant import CPU, use_variant
+from twin.options import CPU, Options, use_variant
 from uwlts.capture import part_path
 from uwlts.errors import DescriptionError, OutputError, UwltsError
 from uwlts.files import written_aside

@@ -4,6 +4,9 @@ Everything is in the sensor's object coordinate system (OCS), in which the nomin
 stripe and Z along the laser's axis. A fan ray is the straight line Y = y0(m) + m Z, X = x0(m) + k(m) Z, with its slope
 m = dY/dZ as the parameter of the surface. A tilted window or a bow curve the surface; across it, along its normal, the
 light is a Gaussian.
+
+The fan's own frame has x along the sheet's normal, y along the fan and z along the laser's axis. A fan ray is named by
+the angle in rad that its projection along x makes with the axis.
 """
 
 from __future__ import annotations
@@ -16,15 +19,24 @@ import mitsuba as mi
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.fan import PowerTable, directions, half_angle, lit_angles, power_per_angle
+from twin.arrays import to_jit
 from twin.windows import WindowFaces, frame_about
 from uwlts.errors import DesignError
 from uwlts.placement import camera_from_object, laser_pose
 from uwlts.sensor import Laser, Medium, Sensor
 
-_RAYS, _NODES, _NEWTON_STEPS = 1025, 4097, 3
-_LARGEST_DEGREE, _LARGEST_MISS_MM = 27, 1e-3
-_SERIES_MM, _SERIES_SLOPE = 5e-5, 1e-7
+_RAYS = 1025
+"""Fan rays traced through the window; many more than the series have terms."""
+_NODES = 4097
+"""Nodes of the power along the fan: finer than the traced rays."""
+_NEWTON_STEPS = 3
+"""Lead to the rounding of 32 bits, as the start is the ray of a fan without a window."""
+_LARGEST_DEGREE = 27
+"""Degree of the series before their ends are cut; enough for fans that fill their window."""
+_LARGEST_MISS_MM = 1e-3
+"""By how much the series may miss a traced ray 1 m behind the window."""
+_SERIES_MM = 5e-5
+_SERIES_SLOPE = 1e-7
 """What the terms left out of a series may sum up to: about the roundings of the traced rays."""
 _SMALLEST_SPREAD_MM = 1e-3
 """Rays closer to where the fan begins are taken as if so far from it."""
@@ -178,8 +190,8 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindo
         laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
     )
     # Denser towards the edges, where a series would otherwise swing.
-    angle = -half_angle(laser) * np.cos(np.linspace(0, math.pi, _RAYS))
-    fan = mi.Vector3f(rotation @ directions(laser, angle))
+    angle = -_fan_half_angle(laser) * np.cos(np.linspace(0, math.pi, _RAYS))
+    fan = mi.Vector3f(rotation @ _fan_directions(laser, angle))
     path = faces.through(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
     if not bool(dr.all(path.valid)):
         raise DesignError(
@@ -194,12 +206,12 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindo
 
 def _power_along(laser: Laser, slope: np.ndarray, fan: _FanBehindWindow) -> tuple[PowerTable, float]:
     """Power behind the window per slope, and in total in W."""
-    lit = lit_angles(laser)
+    lit = _fan_lit_angles(laser)
     nodes = np.linspace(*np.interp(lit[[0, -1]], fan.angle, slope), _NODES)
     angle_of, passes = _series(slope, fan.angle, _SERIES_SLOPE), _series(slope, fan.transmitted, 1e-6)
-    density = power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
+    density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
     between = np.union1d(lit, fan.angle[(fan.angle > lit[0]) & (fan.angle < lit[-1])])
-    total = np.trapezoid(power_per_angle(laser, between) * np.interp(between, fan.angle, fan.transmitted), between)
+    total = np.trapezoid(_power_per_angle(laser, between) * np.interp(between, fan.angle, fan.transmitted), between)
     return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=float(total)), float(total)
 
 
@@ -220,3 +232,84 @@ def _value(series: Chebyshev, t: mi.Float) -> mi.Float:
 
 def _standard_normal(u: mi.Float) -> mi.Float:
     return math.sqrt(2.0) * dr.erfinv(dr.clip(2 * u - 1, -1 + 1e-7, 1 - 1e-7))
+
+
+def _fan_half_angle(laser: Laser) -> float:
+    """Angle of the fan's edge in rad."""
+    return math.radians(laser.fan_angle_deg / 2)
+
+
+def _fan_lit_angles(laser: Laser) -> np.ndarray:
+    """Angles (K,) in rad between which the power per angle is smooth; outside the first and the last it is zero."""
+    if isinstance(laser.fan_profile, str):
+        return np.array([-_fan_half_angle(laser), _fan_half_angle(laser)])
+    return np.radians([angle for angle, _ in laser.fan_profile])
+
+
+def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
+    """Unit directions (3, N) of fan rays in the laser's frame.
+
+    A beam that enters line optics tilted by alpha leaves them as a cone, whose distance from a straight sheet is
+    z tan(alpha) (1 / cos(angle) - 1); the ray in the middle keeps the laser's axis.
+    """
+    bow = math.tan(math.radians(laser.bow_deg))
+    along = np.stack([bow * (1 / np.cos(angle) - 1), np.tan(angle), np.ones_like(angle)])
+    return along / np.linalg.norm(along, axis=0)
+
+
+def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
+    """Power in W/rad at lit angles (N,), before the window. Its integral over the fan is the laser's power."""
+    half = _fan_half_angle(laser)
+    if laser.fan_profile == "flat":
+        relative, total = np.ones_like(angle), 2 * half
+    elif laser.fan_profile == "gaussian":
+        relative, total = np.exp(-2 * (angle / half) ** 2), half * math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))
+    else:
+        nodes, powers = _fan_lit_angles(laser), [power for _, power in laser.fan_profile]
+        relative, total = np.interp(angle, nodes, powers), np.trapezoid(powers, nodes)
+    return 1e-3 * laser.power_mw * relative / total
+
+
+class PowerTable:
+    """Power per unit of a coordinate along the fan: linear between even nodes, zero outside them.
+
+    The values lie in arrays, not in the kernel: every profile is looked up, and drawn from, by the same few steps.
+
+    Parameters
+    ----------
+    nodes
+        (N,), evenly spaced and increasing.
+    density
+        (N,), relative power per unit of the coordinate at the nodes, smooth or not.
+    power_w
+        What the density is scaled to in total.
+    """
+
+    def __init__(self, nodes: np.ndarray, density: np.ndarray, *, power_w: float):
+        self._low, self._step, self._cells = float(nodes[0]), float(nodes[1] - nodes[0]), len(nodes) - 1
+        share = density / np.trapezoid(density)
+        below = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]))])
+        self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
+        self._power_per_step = power_w / self._step
+
+    def at(self, x: mi.Float) -> mi.Float:
+        """Power in W per unit of the coordinate."""
+        place = (x - self._low) / self._step
+        # What is not a number becomes no index that clipping alone would keep within the table.
+        cell = dr.minimum(mi.UInt32(dr.clip(place, 0.0, self._cells - 1.0)), self._cells - 1)
+        share = dr.lerp(*self._ends(cell), place - mi.Float(cell))
+        return dr.select((place >= 0) & (place <= self._cells), self._power_per_step * share, 0.0)
+
+    def draw(self, u: mi.Float) -> mi.Float:
+        """The coordinate below which the share ``u`` of the power lies: even ``u`` give places as dense as the power.
+
+        Within a cell the share a t + (b - a) t^2 / 2 of its ends' densities a and b is solved for t, 0 to 1.
+        """
+        cell = dr.binary_search(0, self._cells - 1, lambda i: dr.gather(mi.Float, self._below, i + 1) <= u)
+        rest = u - dr.gather(mi.Float, self._below, cell)
+        a, b = self._ends(cell)
+        t = 2 * rest / dr.maximum(a + dr.safe_sqrt(a * a + 2 * (b - a) * rest), 1e-30)
+        return self._low + self._step * (mi.Float(cell) + dr.clip(t, 0.0, 1.0))
+
+    def _ends(self, cell: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        return dr.gather(mi.Float, self._share, cell), dr.gather(mi.Float, self._share, cell + 1)

@@ -9,8 +9,7 @@ from typing import Literal
 import mitsuba as mi
 import numpy as np
 
-from twin.detector import electrons_per_ms, grey_values
-from twin.fixed_pattern import fixed_pattern
+from twin.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.options import Options
 from twin.pattern import shift_circles
 from twin.pose import Travel

@@ -24,11 +24,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.effects import Effects
+from twin.camera import Bundle
 from twin.light import Light
 from twin.objects import Objects
+from twin.options import Effects
 from twin.pose import SensorPose
-from twin.view import Bundle
 from twin.water import Scattering
 
 _STEPS = 64

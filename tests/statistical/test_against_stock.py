@@ -16,7 +16,7 @@ from scipy import stats
 
 from tests.stock_mitsuba import blocks, fog, opened_from_its_origin, per_radiance, stock_irradiance
 from tests.virtual_sensors import altered, camera_axes, laser_origin, plate, scene_of, sensor_at
-from twin.effects import ALL
+from twin.options import ALL
 from twin.renderer import WALK_CELL_PX, Renderer
 from twin.scene import Scene
 from uwlts.sensor import Medium, Sensor

@@ -9,8 +9,7 @@ from pydantic import ValidationError
 from scipy import stats
 
 from twin import detector as detector_module
-from twin.detector import electrons_per_ms, grey_values
-from twin.fixed_pattern import fixed_pattern
+from twin.detector import electrons_per_ms, fixed_pattern, grey_values
 from uwlts.errors import ImageError
 from uwlts.sensor import Detector, Sensor
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.detector import grey_values
-from twin.fixed_pattern import FixedPattern, fixed_pattern
+from twin.detector import FixedPattern, fixed_pattern, grey_values
 from uwlts.errors import ImageError
 from uwlts.sensor import Detector
 

@@ -25,8 +25,8 @@ from tests.virtual_sensors import (
     sensor_at,
 )  # fmt: skip
 from twin.arrays import to_jit
-from twin.cells import NODE_SPACING_PX
-from twin.effects import NONE
+from twin.image_sampling import NODE_SPACING_PX
+from twin.options import NONE
 from twin.renderer import Renderer
 from twin.water import Scattering
 from uwlts.sensor import Medium, Sensor

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, plate, scene_of, sensor_at
-from twin.effects import NONE
+from twin.options import NONE
 from twin.renderer import Renderer
 from twin.truth import true_stripe
 from uwlts.sensor import Medium, Sensor

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.poisson import LARGEST_MEAN, STEP, poisson_numbers
+from twin.detector import LARGEST_MEAN, POISSON_STEP, poisson_numbers
 
 MEANS = (
-    *(0.002, 0.06, STEP, 0.249, 0.7, 1.0, 2.8, 5.06, 9.99, 16.0, 24.3, LARGEST_MEAN - 0.01),
+    *(0.002, 0.06, POISSON_STEP, 0.249, 0.7, 1.0, 2.8, 5.06, 9.99, 16.0, 24.3, LARGEST_MEAN - 0.01),
     *(LARGEST_MEAN, LARGEST_MEAN + 0.01, 60.0, 900.0),
 )
 DRAWS = 250_000
@@ -48,12 +48,12 @@ def test_mean_and_variance_are_the_same(drawn, mean):
     assert drawn[mean].mean(dtype=float) == pytest.approx(mean, abs=5 * spread)
     assert drawn[mean].var(dtype=float) == pytest.approx(mean, abs=5 * np.sqrt((2 * mean**2 + mean) / DRAWS))
     # Half a step of the table would be noticed.
-    assert mean >= LARGEST_MEAN or 5 * spread < STEP / 2
+    assert mean >= LARGEST_MEAN or 5 * spread < POISSON_STEP / 2
 
 
 def test_the_distributions_neighbours_would_be_noticed(drawn):
     for mean in (0.249, 0.7, 1.0, 2.8):
-        assert p_value(drawn[mean], mean + STEP / 2) < 1e-12
+        assert p_value(drawn[mean], mean + POISSON_STEP / 2) < 1e-12
         rounded_normal = np.rint(np.random.default_rng(1).normal(mean, np.sqrt(mean), DRAWS)).clip(0)
         assert p_value(rounded_normal, mean) < 1e-12
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
-from twin.effects import NONE
+from twin.image_sampling import golden_step
+from twin.options import NONE
 from twin.renderer import Renderer
-from twin.samples import golden_step
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ from tests.virtual_sensors import (
     window_transmittance,
 )  # fmt: skip
 from twin.arrays import to_jit, to_numpy
-from twin.fan import PowerTable
-from twin.sheet import Sheet
+from twin.sheet import PowerTable, Sheet
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.library import validated
 from uwlts.placement import camera_from_object

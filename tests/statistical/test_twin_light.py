@@ -25,7 +25,7 @@ from tests.virtual_sensors import (
     window_transmittance,
 )  # fmt: skip
 from twin.arrays import to_jit
-from twin.effects import NONE
+from twin.options import NONE
 from twin.renderer import Renderer
 from twin.sheet import Sheet
 from twin.windows import WindowFaces

@@ -23,8 +23,8 @@ from tests.virtual_sensors import (
     sensor_at,
 )  # fmt: skip
 from twin.arrays import to_jit
-from twin.effects import NONE
 from twin.light import lights
+from twin.options import NONE
 from twin.pose import SensorPose
 from twin.renderer import Renderer
 from twin.scene import Scene

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered
+from twin.options import CPU
 from twin.study.description import Study
 from twin.study.designs import Design, built
 from twin.study.executor import crew
 from twin.study.figures import scatter_at
 from twin.study.parameters import parameters_of
 from twin.study.verification import Candidate, Rendered, Verification, compared, render, verified
-from twin.variant import CPU
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.effects import ALL, NONE
-from twin.options import Options
+from twin.options import ALL, NONE, Options
 from twin.scene import load_scene
 from twin.simulate import simulate
 from uwlts.calibration.model import Calibration

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin.blooming import spilled
-from twin.detector import grey_values
+from twin.detector import grey_values, spilled
 from uwlts.sensor import Detector
 
 FULL = 1000.0

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
-from twin.effects import NONE
-from twin.options import Options
+from twin.options import NONE, Options
 from twin.pattern import printed_shifts
 from twin.renderer import Renderer
 from twin.scene import CirclePlate, Motion, Scene, Shot

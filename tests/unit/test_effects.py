@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
-from twin.effects import ALL, NONE, Effects
-from twin.options import Options
+from twin.options import ALL, NONE, Effects, Options
 from twin.renderer import Renderer
 from twin.simulate import Studio
 from uwlts.errors import DescriptionError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import block, clear, image_of, plate, scene_of, sensor_at
-from twin.effects import NONE
+from twin.options import NONE
 from twin.renderer import Renderer
 from twin.scene import Scene
 from twin.truth import true_stripe

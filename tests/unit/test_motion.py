@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
-from twin.effects import NONE
-from twin.options import Options
+from twin.options import NONE, Options
 from twin.pose import Travel
 from twin.renderer import Renderer
 from twin.simulate import Studio

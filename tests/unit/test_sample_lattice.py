@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.effects import NONE
+from twin.image_sampling import lattice, pupil_shifts
+from twin.options import NONE
 from twin.renderer import Renderer
-from twin.samples import lattice, pupil_shifts
 
 BLURRED = replace(NONE, defocus=True)
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, plate, scene_of
-from twin.effects import NONE
-from twin.options import Options
+from twin.options import NONE, Options
 from twin.scene import Scene
 from twin.simulate import simulate
 from uwlts.capture import Capture

@@ -19,7 +19,7 @@ from tests.virtual_sensors import (
     scene_of,
     sensor_at,
 )  # fmt: skip
-from twin.effects import NONE
+from twin.options import NONE
 from twin.renderer import Renderer
 from twin.truth import FrameTruth, depth_map, true_stripe
 from uwlts.sensor import Medium, Sensor

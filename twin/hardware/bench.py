@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin.detector import electrons_per_ms, grey_values
-from twin.fixed_pattern import fixed_pattern
+from twin.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.hardware.gige_camera import GigeCamera
 from twin.hardware.grbl_controller import GrblController, StageState
 from twin.scene import Motion, Shot

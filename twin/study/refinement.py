@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from twin.options import use_variant
 from twin.study.description import Study
 from twin.study.designs import Design, sensor_of
 from twin.study.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
 from twin.study.geometry import Array
 from twin.study.parameters import Parameters, followed, parameters_of
-from twin.variant import use_variant
 
 PARAMETER_OF: dict[str, tuple[str, float]] = {
     "laser.baseline_mm": ("baseline_mm", 1.0),

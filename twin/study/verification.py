@@ -24,14 +24,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from plyfile import PlyData, PlyParseError
 
-from twin.options import Options
+from twin.options import CPU, Options, use_variant
 from twin.study.description import Study
 from twin.study.executor import Crew, Lost
 from twin.study.figures import figures_of, scatter_at
 from twin.study.parameters import parameters_of
 from twin.study.screening import made_folder
 from twin.study.verification_scenes import Recording, recordings
-from twin.variant import CPU, use_variant
 from uwlts.capture import Capture, part_path
 from uwlts.errors import (
     CalibrationError,

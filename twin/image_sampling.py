@@ -1,15 +1,21 @@
-"""Where in a pixel, on the pupil and during the exposure the samples of a pixel are taken: one lattice for all pixels.
+"""Which pixels are rendered finely, and where in a pixel, on the pupil and during the exposure samples are taken.
 
-A rank-1 lattice is evenly spaced along every axis, so that a smooth stripe is integrated as by the midpoint rule,
-without the noise of random samples. Its points come in pairs about the middle, so that neither the pixel's nor the
-pupil's few samples shift what they see.
+Cells of a coarse grid of camera rays show where the stripe is. All pixels share one rank-1 lattice of samples: it is
+evenly spaced along every axis, so that a smooth stripe is integrated as by the midpoint rule, without the noise of
+random samples. Its points come in pairs about the middle, so that neither the pixel's nor the pupil's few samples shift
+what they see.
 """
 
 import math
 from functools import cache
 
+import cv2
 import numpy as np
 
+NODE_SPACING_PX = 2
+"""Pixels from one ray of the coarse grid to the next, and side of its cells."""
+LIT_SIGMAS = 4.5
+"""The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
 _CANDIDATES = 64
 """How many generators are tried for every further axis; more improve the lattice by a few percent."""
 
@@ -59,3 +65,42 @@ def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 def _kernel(x: np.ndarray) -> np.ndarray:
     return 1 + 2 * math.pi**2 * (x * x - x + 1 / 6)
+
+
+def corner_mean(nodes: np.ndarray) -> np.ndarray:
+    """Mean (rows - 1, columns - 1) of the four corners of every grid cell."""
+    beside = nodes[:, :-1] + nodes[:, 1:]
+    return 0.25 * (beside[:-1] + beside[1:])
+
+
+def corner_extremes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest (rows - 1, columns - 1) of the four corners of every grid cell."""
+    low, high = np.minimum(nodes[:, :-1], nodes[:, 1:]), np.maximum(nodes[:, :-1], nodes[:, 1:])
+    return np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
+
+
+def any_corner(nodes: np.ndarray) -> np.ndarray:
+    """Cells (rows - 1, columns - 1) of which some corner is True."""
+    beside = nodes[:, :-1] | nodes[:, 1:]
+    return beside[:-1] | beside[1:]
+
+
+def near_sheet(across: np.ndarray) -> np.ndarray:
+    """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes.
+
+    ``across`` is the sheet's distance at the nodes in standard deviations, infinity where there is no surface.
+    """
+    seen = np.isfinite(across)
+    return any_corner(np.abs(across) < LIT_SIGMAS) | any_corner(seen & (across < 0)) & any_corner(seen & (across > 0))
+
+
+def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:
+    """Marked cells and all within each one's radius in px; radii are rounded up to one of eight."""
+    radius = np.where(cells, radius_px, 0) / cell_px
+    step = max(1.0, radius.max(initial=0) / 8)
+    level = np.ceil(radius / step).astype(int)
+    wide = cells.copy()
+    for k in np.unique(level[level > 0]):
+        away = cv2.distanceTransform((level != k).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        wide |= away <= k * step
+    return wide
