@@ -11,7 +11,7 @@ from twin.options import Options
 from twin.scene import CirclePlate, load_scene
 from uwlts.library import load_sensor
 from uwlts.sensor import Sensor
-from uwlts.targets import find_circles
+from uwlts.targets.detection import find_circles
 
 STAGE_MM = {"near": 85.0, "middle": -20.0, "far": -130.0}
 NEIGHBOURHOOD_PX = 65

@@ -15,8 +15,7 @@ from uwlts.calibration.procedure import CalibrationOptions, calibrate
 from uwlts.capture import Capture
 from uwlts.importing import import_folder
 from uwlts.placement import camera_from_object, laser_pose
-from uwlts.targets.charuco import charuco_board
-from uwlts.targets.description import CharucoTarget, ChessboardTarget
+from uwlts.targets import CharucoTarget, ChessboardTarget
 
 SENSOR = coarse_sensor(window_mounted=False)
 SIZE = SENSOR.camera.width_px, SENSOR.camera.height_px
@@ -31,7 +30,7 @@ def printed(target) -> tuple[np.ndarray, np.ndarray]:
     """Reflectance (h, w) from 0 to 1 of the board with a white rim, and where its first pixel's corner is, mm."""
     if isinstance(target, CharucoTarget):
         size = PX_PER_MM * 15 * np.array([target.columns, target.rows])
-        board = charuco_board(target).generateImage(tuple(size.tolist())) / 255.0
+        board = target.board().generateImage(tuple(size.tolist())) / 255.0
         corner = np.zeros(2)
     else:
         dark = np.add.outer(np.arange(target.rows + 1), np.arange(target.columns + 1)) % 2

@@ -15,7 +15,7 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.capture import Capture
 from uwlts.importing import import_folder
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
-from uwlts.targets.lattice import detect_lattice
+from uwlts.targets.detection import detect_lattice
 
 PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "shared" / "real" / "ciclop"
 pytestmark = pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason=f"the real images are not here: {PHOTOGRAPHS}")

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from uwlts.targets import ellipses, find_circles
+from uwlts.targets.detection import ellipses, find_circles
 
 DARK, BRIGHT = 40.0, 200.0
 SPACING, COLUMNS, ROWS = 70, 6, 5

@@ -16,7 +16,7 @@ from twin.simulate import Studio, simulate, with_window
 from twin.truth import depth_map
 from uwlts.capture import Capture
 from uwlts.sensor import Sensor
-from uwlts.targets import find_circles
+from uwlts.targets.detection import find_circles
 from uwlts.truth import TruthStatus, read_truth, truth_path
 
 COLUMNS, ROWS, ORIGIN = 7, 5, (2, 3)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.unit.calibration_views import STEP_MM, WATER, inside, lens_of, step_profile, through_window
 from tests.unit.drawn_target import drawn_lamp, drawn_laser, target_pose
-from uwlts.calibration.guidance.candidates import candidates, target_points, working_range_mm
+from uwlts.calibration.guidance.candidates import candidates, working_range_mm
 from uwlts.calibration.guidance.coverage import coverage_of, empty_coverage, place_words, spread_of, tilts_rad
 from uwlts.calibration.guidance.quality import (
     QualityLimits,
@@ -37,7 +37,7 @@ from uwlts.errors import TargetError
 from uwlts.library import merged
 from uwlts.metrology.artefact_descriptions import StepStandard
 from uwlts.sensor import Sensor
-from uwlts.targets import ChessboardTarget, CircleTarget, TargetView, detect_target
+from uwlts.targets import ChessboardTarget, CircleTarget, TargetView
 
 FULL = 255
 SMALL = {
@@ -65,7 +65,7 @@ def setting(thesis_as_built: Sensor) -> Setting:
 
 def seen(setting: Setting, pose: np.ndarray, rng: np.random.Generator) -> TargetView:
     """What a camera as built finds of a target at a pose."""
-    points = target_points(setting.target)
+    points = setting.target.points_mm
     columns, rows = np.meshgrid(np.arange(setting.target.columns), np.arange(setting.target.rows))
     pixels = lens_of(setting.sensor).pixels(points @ pose[:3, :3].T + pose[:3, 3])
     here = inside(pixels, setting.sensor)
@@ -81,7 +81,7 @@ def recorded(setting: Setting, poses, rng: np.random.Generator) -> list[Recorded
 
 
 def judged(small: Sensor, image: np.ndarray):
-    return judge_target(image, detect_target(image, PLATE), PLATE, full_dn=FULL)
+    return judge_target(image, PLATE.detect(image), PLATE, full_dn=FULL)
 
 
 def test_a_good_image_is_accepted(small):
@@ -111,7 +111,7 @@ def test_saturation_and_faintness_are_refused(small):
 def test_light_explains_why_no_target_is_found(small, gain, says):
     image = drawn_lamp(small, PLATE, target_pose(), gain=gain)
     with pytest.raises(TargetError) as error:
-        detect_target(image, PLATE)
+        PLATE.detect(image)
     assert why_not_found(image, str(error.value), full_dn=FULL).startswith(says)
 
 
@@ -124,20 +124,20 @@ def test_a_partial_target_is_refused(small):
     target = PLATE.model_copy(update={"columns": 31, "rows": 29, "origin": (15, 14)})
     image = drawn_lamp(small, PLATE, target_pose(middle_mm=(0.0, 0.0, 300.0)))
     image[:, :230] = image[:, 410:] = image[:190] = image[330:] = 60
-    quality = judge_target(image, detect_target(image, target), target, full_dn=FULL)
+    quality = judge_target(image, target.detect(image), target, full_dn=FULL)
     assert any(reason.startswith("partial") for reason in quality.reasons), quality
 
 
 def test_motion_and_sameness_are_told_in_pixels(small):
-    first = detect_target(drawn_lamp(small, PLATE, target_pose()), PLATE)
-    again = detect_target(drawn_lamp(small, PLATE, target_pose(), seed=1), PLATE)
+    first = PLATE.detect(drawn_lamp(small, PLATE, target_pose()))
+    again = PLATE.detect(drawn_lamp(small, PLATE, target_pose(), seed=1))
     # f of about 1220 px at 378 mm: 1 mm is 3.2 px.
-    shifted = detect_target(drawn_lamp(small, PLATE, target_pose(middle_mm=(1.0, 0.0, 378.0))), PLATE)
+    shifted = PLATE.detect(drawn_lamp(small, PLATE, target_pose(middle_mm=(1.0, 0.0, 378.0))))
     assert way_px(first, again) < 0.1 and judge_motion(first, again) == ()
     assert way_px(first, shifted) == pytest.approx(lens_of(small).f / 378, rel=0.03)
     assert judge_motion(first, shifted)[0].startswith("moved: the target went 3.")
     assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: 0.")
-    moved = detect_target(drawn_lamp(small, PLATE, target_pose(tilt_deg=(20, 0))), PLATE)
+    moved = PLATE.detect(drawn_lamp(small, PLATE, target_pose(tilt_deg=(20, 0))))
     assert judge_novelty(moved, [first, shifted]) == ()
     none_in_common = replace(first, indices=first.indices + 100)
     assert way_px(first, none_in_common) == np.inf and judge_motion(first, none_in_common)
@@ -145,7 +145,7 @@ def test_motion_and_sameness_are_told_in_pixels(small):
 
 def test_the_stripe_counts_where_it_lies_on_the_target(small):
     pose = target_pose(middle_mm=(0.0, 0.0, 378.0))
-    view = detect_target(drawn_lamp(small, PLATE, pose), PLATE)
+    view = PLATE.detect(drawn_lamp(small, PLATE, pose))
 
     def stripe(image):
         return judge_stripe(image, view, PLATE, stripe_along="width", full_dn=FULL)
@@ -296,7 +296,7 @@ def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setti
     right = RecordedPose(seen(setting, wish.candidate.pose, rng), NO_STRIPE, 9.0)
     assert judge_residual(state.solution, state_of([*state.recorded, right], setting).solution) == ()
     # A plate that is bent by 1 mm over its width.
-    points = target_points(BOARD)
+    points = BOARD.points_mm
     bent = points - np.column_stack([np.zeros((len(points), 2)), ((points[:, 0] - 60) / 60) ** 2])
     pixels = lens_of(setting.sensor).pixels(bent @ wish.candidate.pose[:3, :3].T + wish.candidate.pose[:3, 3])
     wrong = RecordedPose(replace(right.view, pixels=pixels), NO_STRIPE, 9.0)
@@ -309,7 +309,7 @@ def test_in_a_medium_the_camera_seems_longer(thesis):
     air = nominal_camera(Setting(thesis, BOARD, thesis.medium("air"), "free"))
     assert water.fx_px == pytest.approx(1.3312 * air.fx_px, rel=1e-3)
     pose = target_pose(tilt_deg=(10, 5), middle_mm=(-20, 10, 350.0))
-    points = target_points(BOARD)
+    points = BOARD.points_mm
     pixels = cv2.projectPoints(points, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3], air.matrix(), None)[0][:, 0]
     view = TargetView(pixels, points, np.zeros((len(points), 2), int), {})
     np.testing.assert_allclose(pose_of(view, air), pose, atol=1e-4)
@@ -318,7 +318,7 @@ def test_in_a_medium_the_camera_seems_longer(thesis):
 def test_limits_can_be_chosen(small):
     image = drawn_lamp(small, PLATE, target_pose(), blur_px=1.5)
     strict = QualityLimits(largest_blur_px=1.0)
-    assert judge_target(image, detect_target(image, PLATE), PLATE, full_dn=FULL, limits=strict).reasons
+    assert judge_target(image, PLATE.detect(image), PLATE, full_dn=FULL, limits=strict).reasons
 
 
 # The step standard

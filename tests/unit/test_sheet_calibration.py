@@ -5,7 +5,6 @@ import pytest
 
 from tests.unit.calibration_views import built_sensor, lattice, lens_of, stage_images, stripes_on_target
 from uwlts.calibration.model import CameraModel, SheetModel
-from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.sheet import fit_sheet, object_frame, points_on_target
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.placement import camera_from_object, laser_pose
@@ -147,10 +146,10 @@ def test_the_plates_extent_follows_its_description():
     circles = parse_target(
         {"kind": "circles", "diameter_mm": 6, "marker_diameter_mm": 2, "columns": 5, "rows": 4, "origin": (1, 1)}
     )
-    np.testing.assert_allclose(plate_extent(circles)[[0, 2]], [[-9.375, -9.372], [28.125, 18.744]])
-    assert lattice_spacing(circles) == 9.372
+    np.testing.assert_allclose(circles.extent_mm[[0, 2]], [[-9.375, -9.372], [28.125, 18.744]])
+    assert circles.spacing_mm == 9.372
     board = parse_target({"kind": "chessboard", "columns": 5, "rows": 4, "square_mm": 10})
-    np.testing.assert_allclose(plate_extent(board)[[0, 2]], [[0, 0], [40, 30]])
+    np.testing.assert_allclose(board.extent_mm[[0, 2]], [[0, 0], [40, 30]])
     charuco = parse_target({"kind": "charuco", "columns": 5, "rows": 4, "square_mm": 10, "marker_mm": 7})
-    np.testing.assert_allclose(plate_extent(charuco)[[0, 2]], [[0, 0], [50, 40]])
-    assert lattice_spacing(board) == lattice_spacing(charuco) == 10
+    np.testing.assert_allclose(charuco.extent_mm[[0, 2]], [[0, 0], [50, 40]])
+    assert board.spacing_mm == charuco.spacing_mm == 10

@@ -15,13 +15,10 @@ from uwlts.targets import (
     ChessboardTarget,
     CircleTarget,
     circle_centre_bias,
-    detect_lattice,
-    detect_target,
-    find_circles,
-    label_lattice,
     parse_target,
 )
-from uwlts.targets.blobs import _ellipse_like
+from uwlts.targets.detection import detect_lattice, find_circles, label_lattice
+from uwlts.targets.detection.blobs import _ellipse_like
 
 PLATE = CircleTarget(
     spacing_x_mm=9.375, spacing_y_mm=9.372, diameter_mm=5.0, marker_diameter_mm=2.0, columns=15, rows=13, origin=(6, 5)
@@ -143,7 +140,7 @@ POSES = [
 @pytest.mark.parametrize(("turn", "shift", "bright", "k"), POSES)
 def test_circles_are_numbered_and_located_in_every_pose(turn, shift, bright, k):
     camera = Camera(turn, shift, k=k)
-    view = detect_target(photograph(render_plate(camera, bright=bright), noise=2.0), PLATE)
+    view = PLATE.detect(photograph(render_plate(camera, bright=bright), noise=2.0))
     places = {tuple(place) for place in view.indices.tolist()}
     assert len(places) == len(view.indices) >= 20
     # Every circle well in view is found; circles at the very border may be found as well.
@@ -163,7 +160,7 @@ def test_circles_are_numbered_and_located_in_every_pose(turn, shift, bright, k):
 @pytest.mark.parametrize("bright", [True, False])
 def test_centres_of_a_noise_free_image_have_almost_no_bias(bright):
     camera = Camera((25, 30, 15), (2, 3, 300), k=(-0.2, 0.05))
-    view = detect_target(photograph(render_plate(camera, bright=bright, samples=10)), PLATE)
+    view = PLATE.detect(photograph(render_plate(camera, bright=bright, samples=10)))
     assert view.quality["radius_px"].min() > 6
     # Rounding to whole grey levels is noise of 0.29 grey: 0.29/2.0 of what 2.0 does above, under 0.002 px. 10 x 10
     # samples misplace an edge by 0.05 px at most and at random: 0.03 / sqrt(pi 20) = 0.004 px in the mean of a rim.
@@ -176,14 +173,14 @@ def test_centres_of_a_noise_free_image_have_almost_no_bias(bright):
 def test_without_the_perspective_bias_the_centres_are_wrong():
     # The same measure must be able to fail: at 45 deg and 160 mm the ellipse's centre is off by a tenth of a pixel.
     camera = Camera((0, 45, 0), (0, 0, 160))
-    view = detect_target(photograph(render_plate(camera)), PLATE)
+    view = PLATE.detect(photograph(render_plate(camera)))
     assert rms(view.pixels - camera.project(view.points_mm)) > 5 * rms(errors_px(view, camera))
 
 
 def test_small_circles_of_six_pixels():
     # 5 mm at 1200 px / 1000 mm is 6 px.
     camera = Camera((5, -5, 10), (0, 0, 1000))
-    view = detect_target(photograph(render_plate(camera), noise=2.0), PLATE)
+    view = PLATE.detect(photograph(render_plate(camera), noise=2.0))
     assert len(view.pixels) == PLATE.columns * PLATE.rows
     assert np.median(view.quality["radius_px"]) < 3.4
     # 0.033 sqrt(2 / (pi 6)) = 0.011 px, twice for blur, which flattens the whole of so small a circle.
@@ -194,7 +191,7 @@ def test_uneven_light_of_a_factor_of_three():
     camera = Camera((10, 20, 5), (0, 0, 300))
     levels = render_plate(camera)
     gain = np.linspace(0.35, 1.05, levels.shape[1]) * np.linspace(1.0, 0.9, levels.shape[0])[:, None]
-    view = detect_target(photograph(levels * gain, noise=1.0), PLATE)
+    view = PLATE.detect(photograph(levels * gain, noise=1.0))
     assert places_in_view(camera) <= {tuple(place) for place in view.indices.tolist()}
     # Left uncorrected, a slope of 0.3 % per px pulls the centroid by slope r^2 / 4 = 0.08 px at 10 px radius. Noise 1
     # on the lowest contrast of 50 is worth 3 on 150: 0.01 px at 20 px diameter.
@@ -205,7 +202,7 @@ def test_uneven_light_of_a_factor_of_three():
 
 def test_a_mark_does_not_pull_its_circle():
     camera = Camera((30, 30, 15), (0, 0, 250))
-    view = detect_target(photograph(render_plate(camera, samples=10)), PLATE)
+    view = PLATE.detect(photograph(render_plate(camera, samples=10)))
     steps = view.indices - PLATE.origin
     marked = np.isin(steps @ (100, 1), np.array(MARKS) @ (100, 1))
     assert marked.sum() == 3
@@ -220,7 +217,7 @@ def test_circles_cut_by_a_stripe_are_left_out(bright):
     levels = render_plate(camera, bright=bright)
     v, u = np.mgrid[: levels.shape[0], : levels.shape[1]]
     line = 470 + 0.05 * v
-    view = detect_target(photograph(levels + 150 * np.exp(-0.5 * ((u - line) / 1.5) ** 2), noise=2.0), PLATE)
+    view = PLATE.detect(photograph(levels + 150 * np.exp(-0.5 * ((u - line) / 1.5) ** 2), noise=2.0))
     distance = np.abs(view.pixels[:, 0] - (470 + 0.05 * view.pixels[:, 1]))
     whole = places_in_view(camera)
     found = {tuple(place) for place in view.indices.tolist()}
@@ -251,7 +248,7 @@ def test_missing_circles_and_stray_blobs_do_not_confuse_the_numbering():
             strays += 1
     assert strays >= 10
     cv2.putText(canvas, "0o8 Q.", (20, 500), cv2.FONT_HERSHEY_SIMPLEX, 1, int(BRIGHT), 2, cv2.LINE_AA)
-    view = detect_target(canvas, PLATE)
+    view = PLATE.detect(canvas)
     found = {tuple(place) for place in view.indices.tolist()}
     gone = {(i + PLATE.origin[0], j + PLATE.origin[1]) for i, j in missing}
     assert not found & gone
@@ -263,8 +260,8 @@ def test_missing_circles_and_stray_blobs_do_not_confuse_the_numbering():
 def test_sixteen_bit_images_give_the_same_points():
     camera = Camera((10, 20, 5), (0, 0, 300))
     levels = render_plate(camera)
-    eight = detect_target(np.rint(levels).astype(np.uint8), PLATE)
-    sixteen = detect_target(np.rint(levels * 16).astype(np.uint16), PLATE)
+    eight = PLATE.detect(np.rint(levels).astype(np.uint8))
+    sixteen = PLATE.detect(np.rint(levels * 16).astype(np.uint16))
     np.testing.assert_array_equal(eight.indices, sixteen.indices)
     # Rounding to 8 bit is noise of 0.29 grey: at most some 0.01 px.
     np.testing.assert_allclose(eight.pixels, sixteen.pixels, rtol=0, atol=0.02)
@@ -274,16 +271,16 @@ def test_the_message_counts_the_marks_that_are_missing():
     camera = Camera((10, 20, 5), (0, 0, 300))
     image = photograph(render_plate(camera, marks=MARKS[:2]), noise=2.0)
     with pytest.raises(TargetError, match=r"found \d+ circles, .* but only 2 of 3 marked circles"):
-        detect_target(image, PLATE)
+        PLATE.detect(image)
 
 
 def test_marks_at_other_offsets_and_a_smaller_plate_are_named():
     camera = Camera((10, 20, 5), (0, 0, 330))
     image = photograph(render_plate(camera), noise=2.0)
     with pytest.raises(TargetError, match="check marker_x, marker_y"):
-        detect_target(image, PLATE.model_copy(update={"marker_x": (3, 0)}))
+        PLATE.model_copy(update={"marker_x": (3, 0)}).detect(image)
     with pytest.raises(TargetError, match="check columns, rows and origin"):
-        detect_target(image, PLATE.model_copy(update={"columns": 9}))
+        PLATE.model_copy(update={"columns": 9}).detect(image)
 
 
 BOARD = ChessboardTarget(columns=8, rows=5, square_mm=12.0)
@@ -303,7 +300,7 @@ CHARUCO = CharucoTarget(columns=8, rows=6, square_mm=12.0, marker_mm=9.0)
 @pytest.mark.parametrize("target", [PLATE, BOARD, CHARUCO], ids=["circles", "chessboard", "charuco"])
 def test_images_without_a_target_are_refused(image, target):
     with pytest.raises(TargetError, match="found"):
-        detect_target(image, target)
+        target.detect(image)
 
 
 @pytest.mark.parametrize(
@@ -318,7 +315,7 @@ def test_images_without_a_target_are_refused(image, target):
 @pytest.mark.parametrize("target", [PLATE, BOARD, CHARUCO], ids=["circles", "chessboard", "charuco"])
 def test_foreign_images_are_refused(image, message, target):
     with pytest.raises(ImageError, match=message):
-        detect_target(image, target)
+        target.detect(image)
 
 
 def test_a_lattice_without_marks_is_numbered_under_strong_distortion():
@@ -385,11 +382,11 @@ def test_too_few_circles_form_no_lattice():
 def test_speed_on_a_full_frame():
     camera = Camera((20, 15, 10), (0, 0, 330), size=(1280, 1024), focal=2450.0)
     image = photograph(render_plate(camera, samples=2), noise=2.0)
-    detect_target(image, PLATE)
+    PLATE.detect(image)
     spent = []
     for _ in range(3):
         start = time.process_time()
-        detect_target(image, PLATE)
+        PLATE.detect(image)
         spent.append(time.process_time() - start)
     # 0.15 s measured for 500 circles on one core; this catches an algorithm that went wrong, not a slow machine.
     assert min(spent) < 0.6
@@ -435,7 +432,7 @@ def mapped(homography, points):
 def test_chessboard_corners_and_their_order(quad):
     texture, first = chess_texture(40)
     homography = texture_pose(texture, quad)
-    view = detect_target(photograph_texture(texture, homography), BOARD)
+    view = BOARD.detect(photograph_texture(texture, homography))
     assert len(view.pixels) == BOARD.columns * BOARD.rows
     # The board has an odd and an even side, so the dark first square fixes the order in every turn.
     np.testing.assert_allclose(view.points_mm[:, :2], view.indices * BOARD.square_mm)
@@ -450,7 +447,7 @@ def test_chessboard_corners_and_their_order(quad):
 def test_sixteen_bit_chessboard():
     texture, first = chess_texture(40)
     homography = texture_pose(texture, QUADS["upright"])
-    view = detect_target(photograph_texture(texture, homography).astype(np.uint16) * 16, BOARD)
+    view = BOARD.detect(photograph_texture(texture, homography).astype(np.uint16) * 16)
     assert rms(view.pixels - mapped(homography, first + view.indices * 40.0)) < 0.06
 
 
@@ -459,7 +456,7 @@ def test_a_square_symmetric_board_is_turned_so_that_x_points_right():
     squares = np.add.outer(np.arange(6), np.arange(6)) % 2 * 255
     texture = np.kron(np.pad(squares, 1, constant_values=255), np.ones((40, 40))).astype(np.uint8)
     for quad in QUADS.values():
-        view = detect_target(photograph_texture(texture, texture_pose(texture, quad)), target)
+        view = target.detect(photograph_texture(texture, texture_pose(texture, quad)))
         grid = view.pixels.reshape(5, 5, 2)
         along, down = np.diff(grid, axis=1).mean((0, 1)), np.diff(grid, axis=0).mean((0, 1))
         assert along[0] > abs(down[0])
@@ -476,7 +473,7 @@ def test_charuco_corners_and_their_numbers(quad, hidden):
     image = photograph_texture(texture, homography)
     if hidden:
         image[:, :300] = 120
-    view = detect_target(image, CHARUCO)
+    view = CHARUCO.detect(image)
     total = (CHARUCO.columns - 1) * (CHARUCO.rows - 1)
     assert (8 <= len(view.pixels) < total) if hidden else len(view.pixels) == total
     np.testing.assert_allclose(view.points_mm[:, :2], (view.indices + 1) * CHARUCO.square_mm)

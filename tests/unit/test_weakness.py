@@ -11,7 +11,6 @@ from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.joint.advice import advice_lines
 from uwlts.calibration.joint.next_shot import next_shots
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.joint.shots import target_points
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.joint.volume import Lengths, estimate_in, lengths_over, regions
 from uwlts.calibration.joint.weakness import told, weaknesses
@@ -151,10 +150,10 @@ def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
 
 
 def test_targets_points_are_those_that_are_found():
-    assert np.allclose(target_points(TARGET)[:, :2], lattice()[:, :2])
+    assert np.allclose(TARGET.points_mm[:, :2], lattice()[:, :2])
     board = parse_target({"kind": "charuco", "columns": 5, "rows": 4, "square_mm": 10.0, "marker_mm": 7.0})
-    assert target_points(board).shape == (12, 3)
-    assert target_points(board)[0].tolist() == [10.0, 10.0, 0.0]
+    assert board.points_mm.shape == (12, 3)
+    assert board.points_mm[0].tolist() == [10.0, 10.0, 0.0]
 
 
 def shot(sensor, pose, view, spoilt):

@@ -14,7 +14,7 @@ from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetE
 from uwlts.metrology.artefact_descriptions import StepStandard
 from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
 from uwlts.stripe.absence import has_stripe
-from uwlts.targets import Target, detect_target, parse_target
+from uwlts.targets import Target, parse_target
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the number of images done and the number of all."""
@@ -87,7 +87,7 @@ def air_evidence(
         first = len(images)
         for frame, image in capture.frames(laser_on=False):
             try:
-                view = detect_target(image, targets[0])
+                view = targets[0].detect(image)
                 images.append(TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), number))
                 frames.append((number, frame))
                 stripes.append([])
@@ -195,7 +195,7 @@ def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
 
 def _shows(image: np.ndarray, target: Target) -> bool:
     try:
-        detect_target(image, target)
+        target.detect(image)
     except (TargetError, CalibrationError):
         return False
     return True

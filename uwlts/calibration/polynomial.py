@@ -21,7 +21,6 @@ import numpy as np
 
 from uwlts.calibration.evidence import AirEvidence, Progress, air_evidence
 from uwlts.calibration.line_polynomials import LinePolynomials, fit_line_polynomials, line_domains
-from uwlts.calibration.plate_extent import lattice_spacing
 from uwlts.calibration.plate_map import PlateMap
 from uwlts.calibration.polynomial_evidence import PlateStripes, common_header, object_coordinates, stripes_on_plate
 from uwlts.calibration.polynomial_model import PolynomialCalibration
@@ -201,7 +200,7 @@ def _fit_figures(fit: LinePolynomials, lines: np.ndarray, pose: np.ndarray) -> d
 
 def _fit_warnings(figures: dict[str, Any], evidence: AirEvidence) -> list[str]:
     warnings = []
-    largest = _LARGEST_MAP_SHARE * lattice_spacing(evidence.target)
+    largest = _LARGEST_MAP_SHARE * evidence.target.spacing_mm
     if figures["map"]["rms_mm"] > largest:
         warnings.append(
             f"the target's points scatter by {figures['map']['rms_mm']:.3f} mm about a smooth map of the plate; "

@@ -8,14 +8,12 @@ import numpy as np
 
 from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.nominal import nominal_calibration
-from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.plate_map import PlateMap, fit_plate_map
 from uwlts.capture import Capture, CaptureHeader
 from uwlts.errors import CalibrationError
 from uwlts.placement import laser_pose
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.refraction import RayStatus
-from uwlts.targets import CircleTarget
 
 _SAME_POSITION_MM = 1e-6
 # Cosine of the angle between the stage's direction and the laser's axis.
@@ -109,8 +107,7 @@ def stripes_on_plate(
         There are fewer positions than a polynomial of this degree has coefficients.
     """
     target = evidence.target
-    diameter = target.diameter_mm if isinstance(target, CircleTarget) else None
-    spacing, extent = lattice_spacing(target), plate_extent(target)
+    spacing, extent = target.spacing_mm, target.extent_mm
     along = 0 if header.sensor.camera.stripe_along == "width" else 1
     maps, parts, warnings = [], [], []
     for number, (image, pixels) in enumerate(zip(evidence.images, evidence.stripes, strict=True)):
@@ -118,7 +115,7 @@ def stripes_on_plate(
             warnings.append(f"no stripe at the stage position {image.stage_mm:g} mm, where the target was found")
             continue
         try:
-            plate_map = fit_plate_map(image, circle_diameter_mm=diameter)
+            plate_map = fit_plate_map(image, circle_diameter_mm=target.circle_diameter_mm)
         except CalibrationError as error:
             warnings.append(f"stage position {image.stage_mm:g} mm: left out, {error}")
             continue

@@ -20,7 +20,6 @@ from uwlts.calibration.evidence import (
 )
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.model import Calibration, WindowModel
-from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
 from uwlts.calibration.sources import source_of
 from uwlts.calibration.summary import camera_figures, sheet_figures, window_figures
@@ -31,7 +30,6 @@ from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.placement import camera_from_object, laser_pose
 from uwlts.sensor import Sensor, Window
 from uwlts.stripe import StripeOptions
-from uwlts.targets import CircleTarget, Target
 
 _LARGEST_USUAL_TURN = np.radians(5)
 
@@ -207,9 +205,9 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     camera, unbiased = _camera(evidence, options, start)
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
-    margin = lattice_spacing(found.target) / 2 if options.margin_mm is None else options.margin_mm
+    margin = found.target.spacing_mm / 2 if options.margin_mm is None else options.margin_mm
     stripe_points = points_on_target(
-        camera.model, found.stripes, camera.target_poses, extent_mm=plate_extent(found.target), margin_mm=margin
+        camera.model, found.stripes, camera.target_poses, extent_mm=found.target.extent_mm, margin_mm=margin
     )
     pose = laser_pose(sensor)
     sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
@@ -285,10 +283,10 @@ def _camera(
             approaching=evidence.approaching is not False, options=options.camera, start=better or start,
         )  # fmt: skip
 
-    target: Target = evidence.air.target
-    if not (options.correct_circles and isinstance(target, CircleTarget)):
+    diameter_mm = evidence.air.target.circle_diameter_mm
+    if not options.correct_circles or diameter_mm is None:
         return solved(evidence.air.images, None), None
-    unbiased = solve_without_bias(evidence.air.images, solved, diameter_mm=target.diameter_mm)
+    unbiased = solve_without_bias(evidence.air.images, solved, diameter_mm=diameter_mm)
     return unbiased.solution, unbiased
 
 

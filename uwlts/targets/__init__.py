@@ -1,25 +1,29 @@
-"""Calibration targets: their descriptions, and finding them in images."""
+"""Calibration targets: their descriptions, and how they are found in images.
 
-from uwlts.targets.circles import find_circles
-from uwlts.targets.description import CharucoTarget, ChessboardTarget, CircleTarget, Target, parse_target
-from uwlts.targets.detect import detect_target
+Every module of this package is imported with it, so that the target types defined there are known by their kind. The
+detectors are in the subpackage ``detection``, which is imported when a target is searched for.
+"""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from uwlts.targets.charuco import CharucoTarget
+from uwlts.targets.chessboard import ChessboardTarget
+from uwlts.targets.circles import CircleTarget
 from uwlts.targets.ellipse_bias import circle_centre_bias
-from uwlts.targets.ellipses import Ellipses
-from uwlts.targets.lattice import Lattice, detect_lattice, label_lattice
-from uwlts.targets.view import TargetView
+from uwlts.targets.target import Patch, Target, TargetView, parse_target
 
 __all__ = [
     "CharucoTarget",
     "ChessboardTarget",
     "CircleTarget",
-    "Ellipses",
-    "Lattice",
+    "Patch",
     "Target",
     "TargetView",
     "circle_centre_bias",
-    "detect_lattice",
-    "detect_target",
-    "find_circles",
-    "label_lattice",
     "parse_target",
 ]
+
+for _module in iter_modules(__path__):
+    if not _module.ispkg:
+        import_module(f"{__name__}.{_module.name}")

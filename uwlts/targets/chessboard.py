@@ -1,55 +1,86 @@
-"""The chessboard in an image."""
+"""The chessboard target, found as a whole."""
+
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from uwlts.errors import TargetError
-from uwlts.targets.corners import corner_quality, eight_bit
-from uwlts.targets.description import ChessboardTarget
-from uwlts.targets.view import TargetView
+from uwlts.sensor import Positive
+from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 
-SECTOR_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-QUAD_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-REFINEMENT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+_SECTOR_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+_QUAD_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+_REFINEMENT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
 
-def detect_chessboard(image, target: ChessboardTarget) -> TargetView:
-    """Find all inner corners of a chessboard.
+class ChessboardTarget(Target):
+    """A chessboard, known by its inner corners.
 
-    Raises
-    ------
-    ImageError
-        The image is no grey image of 8 or 16 bit.
-    TargetError
-        Not all inner corners are found.
+    The origin is the top left inner corner. If one of `columns` and `rows` is odd and the other even, the board differs
+    from itself turned by half a turn: the square above and to the left of the origin is dark. Otherwise the turn with X
+    pointing most to the right in the image is taken.
+
+    Attributes
+    ----------
+    columns, rows : number of inner corners along X and along Y
+    square_mm : side of a square
     """
-    grey = eight_bit(image)
-    size = (target.columns, target.rows)
-    found, corners = cv2.findChessboardCornersSB(grey, size, flags=SECTOR_FLAGS)
-    if not found:
-        found, corners = cv2.findChessboardCorners(grey, size, flags=QUAD_FLAGS)
+
+    kind: Literal["chessboard"] = "chessboard"
+    columns: Annotated[int, Field(ge=3)]
+    rows: Annotated[int, Field(ge=3)]
+    square_mm: Positive
+
+    @property
+    def indices(self) -> np.ndarray:
+        return lattice_indices(self.columns, self.rows)
+
+    def points_at(self, indices: np.ndarray) -> np.ndarray:
+        return np.column_stack([indices * self.square_mm, np.zeros(len(indices))])
+
+    @property
+    def spacing_mm(self) -> float:
+        return self.square_mm
+
+    def findable(self, in_view: np.ndarray) -> bool:
+        return bool(in_view.all())
+
+    def patches(self) -> list[Patch]:
+        squares = lattice_indices(self.columns + 1, self.rows + 1)
+        dark = squares[squares.sum(axis=1) % 2 == 0]
+        return [Patch(*corners) for corners in (np.hstack([dark - 1, dark]) * self.square_mm).tolist()]
+
+    def detect(self, image: np.ndarray) -> TargetView:
+        # Imported late: a description alone does not need the detector.
+        from uwlts.targets.detection import corner_quality, eight_bit
+
+        grey = eight_bit(image)
+        size = (self.columns, self.rows)
+        found, corners = cv2.findChessboardCornersSB(grey, size, flags=_SECTOR_FLAGS)
         if not found:
-            raise TargetError(
-                f"found no chessboard of {size[0]} x {size[1]} inner corners; the whole board must be in view with a "
-                "bright rim, and columns and rows count inner corners, not squares"
-            )
-    grid = _refined(image, corners.reshape(-1, 2), size).reshape(target.rows, target.columns, 2).astype(np.float64)
-    pixels = _from_top_left(grey, grid).reshape(-1, 2)
-    indices = np.stack(np.meshgrid(np.arange(target.columns), np.arange(target.rows)), 2).reshape(-1, 2)
-    points = np.column_stack([indices * target.square_mm, np.zeros(len(indices))])
-    return TargetView(pixels, points, indices, corner_quality(image, pixels))
+            found, corners = cv2.findChessboardCorners(grey, size, flags=_QUAD_FLAGS)
+            if not found:
+                raise TargetError(
+                    f"found no chessboard of {size[0]} x {size[1]} inner corners; the whole board must be in view with "
+                    "a bright rim, and columns and rows count inner corners, not squares"
+                )
+        grid = _refined(image, corners.reshape(-1, 2), size).reshape(self.rows, self.columns, 2).astype(np.float64)
+        pixels = _from_top_left(grey, grid).reshape(-1, 2)
+        return TargetView(pixels, self.points_mm, self.indices, corner_quality(image, pixels))
 
 
-def _refined(image, corners, size):
+def _refined(image: np.ndarray, corners: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Corners moved to the saddle of the grey levels, in a window that stays within the squares around them."""
     grid = corners.reshape(size[1], size[0], 2)
     sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
     half = int(np.clip(min(sides) * 0.4, 2, 11))
     grey = image.astype(np.float32)
-    return cv2.cornerSubPix(grey, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), REFINEMENT)
+    return cv2.cornerSubPix(grey, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), _REFINEMENT)
 
 
-def _from_top_left(grey, grid):
+def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """The grid (rows, columns, 2) turned so that it follows the frame of `ChessboardTarget`."""
     along, across = np.diff(grid, axis=1).mean((0, 1)), np.diff(grid, axis=0).mean((0, 1))
     if along[0] * across[1] < along[1] * across[0]:

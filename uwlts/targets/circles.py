@@ -1,60 +1,175 @@
-"""Images of circles: where they are, how good they are, and which of them carry a mark."""
+"""The circle target: a lattice of circles, numbered from three circles with a dot."""
 
-from dataclasses import replace
+from typing import Annotated, Literal, Self
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from uwlts.targets.blobs import find_blobs
-from uwlts.targets.centroids import area_centroids
-from uwlts.targets.edges import rim_directions, sample
-from uwlts.targets.ellipses import fit_ellipses
+from uwlts.errors import TargetError
+from uwlts.sensor import Positive
+from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
+
+Place = tuple[int, int]
+
+# Above the median of all circles, which is below zero where blur lowers the ring of a small circle. A sharp dot has the
+# strength 1, dirt and noise rarely more than 0.1; a dot of two pixels under blur keeps 0.4.
+_MIN_MARK_STRENGTH = 0.3
+
+# Circles outside the described lattice that are taken for outliers: this share of all.
+_MAX_OUTLIERS = 0.02
+
+# Quarter turns from the target's axes to those of the numbering. The target is seen from its front: no reflections.
+_QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 
 
-def find_circles(image):
-    """Find the images of circles of one polarity and similar size, bright on dark or dark on bright.
+class CircleTarget(Target):
+    """A lattice of equal circles, three of them with a centred dot of the opposite brightness.
 
-    Follows G. S. de Matos (UFSC 2017, section 4.5: median filter, background-corrected threshold, hole filling,
-    removal of border and small particles, ellipse fit) up to the blobs; ellipse and centre come from the grey levels.
+    The origin is the centre of the circle at `origin`. Circles may be bright on dark or dark on bright.
 
-    Parameters
+    Attributes
     ----------
-    image : (H, W) uint8 or uint16
-
-    Returns
-    -------
-    Ellipses
-        Centres are centroids of the covered area, in px (u, v); possibly none.
-
-    Raises
-    ------
-    ImageError
-        The image is no grey image of 8 or 16 bit.
+    spacing_x_mm, spacing_y_mm : distance between the centres of neighbours along X and along Y
+    diameter_mm, marker_diameter_mm : of the circles and of the dots in three of them
+    columns, rows : number of circles along X and along Y
+    origin : place (column, row) of the first dotted circle, counted from the top left circle (0, 0)
+    marker_x, marker_y : places of the dotted circles in +X and in +Y direction, counted from `origin`
     """
-    ellipses = fit_ellipses(image, find_blobs(image))
-    centres, agree = area_centroids(image.astype(np.float32), ellipses)
-    return replace(ellipses, centres=centres)[agree]
+
+    kind: Literal["circles"] = "circles"
+    spacing_x_mm: Positive = 9.375
+    spacing_y_mm: Positive = 9.372
+    diameter_mm: Positive
+    marker_diameter_mm: Positive
+    columns: Annotated[int, Field(ge=2)]
+    rows: Annotated[int, Field(ge=2)]
+    origin: Place
+    marker_x: Place = (2, 0)
+    marker_y: Place = (0, 2)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.diameter_mm >= min(self.spacing_x_mm, self.spacing_y_mm):
+            raise ValueError(
+                f"diameter_mm is {self.diameter_mm}; expected less than the spacing of {self.spacing_x_mm} x "
+                f"{self.spacing_y_mm} mm, or the circles touch"
+            )
+        if self.marker_diameter_mm >= self.diameter_mm:
+            raise ValueError(
+                f"marker_diameter_mm is {self.marker_diameter_mm}; expected less than diameter_mm, {self.diameter_mm}"
+            )
+        for name, (di, dj) in (("origin", (0, 0)), ("marker_x", self.marker_x), ("marker_y", self.marker_y)):
+            i, j = self.origin[0] + di, self.origin[1] + dj
+            if not (0 <= i < self.columns and 0 <= j < self.rows):
+                raise ValueError(
+                    f"{name} is at ({i}, {j}); expected a place of the {self.columns} x {self.rows} lattice"
+                )
+        if self.marker_x[0] * self.marker_y[1] == self.marker_x[1] * self.marker_y[0]:
+            raise ValueError(
+                f"marker_x {self.marker_x} and marker_y {self.marker_y} lie on one line with the origin; "
+                "expected two directions, or the marks do not show how the target is turned"
+            )
+        return self
+
+    @property
+    def indices(self) -> np.ndarray:
+        return lattice_indices(self.columns, self.rows)
+
+    def points_at(self, indices: np.ndarray) -> np.ndarray:
+        steps = (indices - np.array(self.origin)) * (self.spacing_x_mm, self.spacing_y_mm)
+        return np.column_stack([steps, np.zeros(len(steps))])
+
+    @property
+    def spacing_mm(self) -> float:
+        return min(self.spacing_x_mm, self.spacing_y_mm)
+
+    @property
+    def circle_diameter_mm(self) -> float | None:
+        return self.diameter_mm
+
+    def marked(self) -> list[Place]:
+        """Places of the three dotted circles: origin, in +X, in +Y."""
+        steps = ((0, 0), self.marker_x, self.marker_y)
+        return [(self.origin[0] + i, self.origin[1] + j) for i, j in steps]
+
+    def findable(self, in_view: np.ndarray) -> bool:
+        return super().findable(in_view) and all(in_view[j * self.columns + i] for i, j in self.marked())
+
+    def patches(self) -> list[Patch]:
+        dots = self.points_at(np.array(self.marked()))
+        return [_disc(point, self.diameter_mm) for point in self.points_mm] + [
+            _disc(point, self.marker_diameter_mm, ink=False) for point in dots
+        ]
+
+    def detect(self, image: np.ndarray) -> TargetView:
+        # Imported late: a description alone does not need the detector.
+        from uwlts.targets.detection import find_circles, label_lattice, mark_strength
+
+        circles = find_circles(image)
+        if len(circles) == 0:
+            raise TargetError("found no circles; check that the target is in view, in focus and well exposed")
+        numbers, labelled = label_lattice(circles.centres, circles.shapes)
+        found = len(circles)
+        circles, numbers = circles[labelled], numbers[labelled]
+        if len(circles) < 4:
+            raise TargetError(
+                f"found {found} circles but they form no lattice; check that the target is in view and sharp"
+            )
+        strength = mark_strength(image, circles, mark_over_circle=self.marker_diameter_mm / self.diameter_mm)
+        origin, turn = _orientation(numbers, strength - np.median(strength), self, found)
+        indices = (numbers - origin) @ turn + np.array(self.origin)
+        inside = ((indices >= 0) & (indices < (self.columns, self.rows))).all(1)
+        if np.count_nonzero(~inside) > _MAX_OUTLIERS * len(indices):
+            low, high = indices.min(0), indices.max(0)
+            exchanged = (indices - np.array(self.origin))[:, ::-1] + np.array(self.origin)
+            fits = ((exchanged >= 0) & (exchanged < (self.columns, self.rows))).all()
+            mirrored = "they fit with columns and rows exchanged, as in a mirrored image"
+            advice = mirrored if fits else "check columns, rows and origin"
+            raise TargetError(
+                f"found circles from place ({low[0]}, {low[1]}) to ({high[0]}, {high[1]}), {np.count_nonzero(~inside)} "
+                f"of {len(indices)} outside the described {self.columns} x {self.rows}; {advice}"
+            )
+        circles, indices = circles[inside], indices[inside]
+        order = np.lexsort((indices[:, 0], indices[:, 1]))
+        circles, indices = circles[order], indices[order]
+        return TargetView(
+            pixels=circles.centres,
+            points_mm=self.points_at(indices),
+            indices=indices,
+            quality={
+                "residual_px": circles.residual_px,
+                "contrast": circles.contrast,
+                "sharpness": circles.sharpness,
+                "radius_px": np.sqrt(np.linalg.det(circles.shapes)),
+            },
+        )
 
 
-def mark_strength(image, circles, *, mark_over_circle):
-    """How strongly each circle shows a centred dot of the opposite brightness.
+def _disc(point: np.ndarray, diameter_mm: float, *, ink: bool = True) -> Patch:
+    (x, y), radius = point[:2].tolist(), diameter_mm / 2
+    return Patch(x - radius, y - radius, x + radius, y + radius, round=True, ink=ink)
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-    circles : Ellipses
-        Of that image.
-    mark_over_circle : float
-        Diameter of the dot over the diameter of the circle, between 0 and 1.
 
-    Returns
-    -------
-    (N,) float64
-        (ring - dot) / contrast: about 0 without a dot, towards 1 with a sharp one.
-    """
-    grey = image.astype(np.float32)
-    rim = rim_directions() @ circles.shapes
-    dot = np.mean(
-        [sample(grey, circles.centres[:, None] + share * mark_over_circle * rim) for share in (0.0, 0.25, 0.5)], (0, 2)
+def _orientation(
+    numbers: np.ndarray, strength: np.ndarray, target: CircleTarget, found: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Number (2,) of the origin circle and the quarter turn (2, 2) from target steps to number steps."""
+    marked = {tuple(number): value for number, value in zip(numbers.tolist(), strength, strict=True)}
+    marked = {number: value for number, value in marked.items() if value > _MIN_MARK_STRENGTH}
+    fits = []
+    for number in marked:
+        for turn in _QUARTER_TURNS:
+            others = [tuple((np.array(number) + turn @ step).tolist()) for step in (target.marker_x, target.marker_y)]
+            if all(other in marked for other in others):
+                fits.append((min(marked[place] for place in (number, *others)), number, turn))
+    if len(fits) == 1:
+        return np.array(fits[0][1]), fits[0][2]
+    seen = f"found {found} circles, {len(numbers)} of them in a lattice"
+    if len(marked) < 3:
+        raise TargetError(
+            f"{seen}, but only {len(marked)} of 3 marked circles; bring all three into view, sharp and unobstructed"
+        )
+    raise TargetError(
+        f"{seen}, with {len(marked)} marked circles, which fit the described offsets {target.marker_x} and "
+        f"{target.marker_y} in {len(fits)} ways; expected one: check marker_x, marker_y and dirt on the circles"
     )
-    ring = sample(grey, circles.centres[:, None] + (1 + mark_over_circle) / 2 * rim).mean(1)
-    return (ring - dot) / circles.contrast * (1.0 if circles.bright else -1.0)

@@ -11,13 +11,12 @@ from uwlts.calibration.model import CameraModel
 from uwlts.calibration.target_placement import Placement, observe
 from uwlts.camera import directions
 from uwlts.sensor import Sensor
-from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
+from uwlts.targets import Target
 
 TILT_RAD = np.radians(25.0)
 _PLACES = (0.2, 0.5, 0.8)
 _DEPTHS = (0.1, 0.5, 0.9)
 _MARGIN_PX = 10.0
-_FEWEST_POINTS, _LEAST_SHARE = 12, 0.15
 # So many of a candidate's points stand for all of them: the others repeat what these tell.
 _SAMPLE = 100
 
@@ -34,23 +33,9 @@ class Candidate:
     information: np.ndarray
 
 
-def target_points(target: Target) -> np.ndarray:
-    """All points (N, 3) of a target in its frame, mm."""
-    if isinstance(target, CircleTarget):
-        columns, rows, first = target.columns, target.rows, -np.array(target.origin, dtype=float)
-        spacing = np.array([target.spacing_x_mm, target.spacing_y_mm])
-    elif isinstance(target, ChessboardTarget):
-        columns, rows, first, spacing = target.columns, target.rows, np.zeros(2), target.square_mm
-    else:
-        columns, rows, first, spacing = target.columns - 1, target.rows - 1, np.ones(2), target.square_mm
-    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-    places = (np.column_stack([x.ravel(), y.ravel()]) + first) * spacing
-    return np.column_stack([places, np.zeros(len(places))])
-
-
 def target_middle(target: Target) -> np.ndarray:
     """Middle (3,) of a target's points in its frame, mm."""
-    return target_points(target).mean(axis=0)
+    return target.points_mm.mean(axis=0)
 
 
 def working_range_mm(sensor: Sensor) -> tuple[float, float]:
@@ -90,7 +75,7 @@ def candidates(
     spin_rad : float
         How the target is turned in the image, from its x axis to the image's.
     """
-    points, middle = target_points(target), target_middle(target)
+    points, middle = target.points_mm, target_middle(target)
     step = max(1, len(points) // _SAMPLE)
     found = []
     for depth, x, y, rotation in product(_DEPTHS, _PLACES, _PLACES, _rotations(spin_rad)):
@@ -103,7 +88,7 @@ def candidates(
         inside = ((pixels > _MARGIN_PX) & (pixels < [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX])).all(
             axis=1
         )
-        if not _findable(target, inside):
+        if not target.findable(inside):
             continue
         sample = np.flatnonzero(inside)[::step]
         tells = information_of(points[sample], pixels[sample], pose, camera, options)
@@ -125,16 +110,3 @@ def _seen(points: np.ndarray, pose: np.ndarray, camera: CameraModel) -> np.ndarr
     pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
     behind = points @ pose[2, :3] + pose[2, 3] <= 0
     return np.where(behind[:, None], -1e6, pixels)
-
-
-def _findable(target: Target, inside: np.ndarray) -> bool:
-    """Whether a target can be found with these (N,) of its points in the image."""
-    if isinstance(target, ChessboardTarget):
-        return bool(inside.all())
-    if inside.sum() < max(min(_FEWEST_POINTS, len(inside)), _LEAST_SHARE * len(inside)):
-        return False
-    if isinstance(target, CharucoTarget):
-        return True
-    marks = [(0, 0), target.marker_x, target.marker_y]
-    places = [(target.origin[0] + i, target.origin[1] + j) for i, j in marks]
-    return all(inside[j * target.columns + i] for i, j in places)

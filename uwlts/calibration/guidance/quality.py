@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.errors import ImageError
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
-from uwlts.targets import CircleTarget, Target, TargetView
+from uwlts.targets import Target, TargetView
 
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast.
 _SLOPE_TIMES_BLUR = 0.4
@@ -83,11 +83,6 @@ class StripeQuality:
         return len(self.pixels)
 
 
-def points_of(target: Target) -> int:
-    """How many points a target has."""
-    return target.columns * target.rows if target.kind != "charuco" else (target.columns - 1) * (target.rows - 1)
-
-
 def judge_target(
     image: np.ndarray, view: TargetView, target: Target, *, full_dn: int, limits: QualityLimits = QualityLimits()
 ) -> TargetQuality:
@@ -98,7 +93,7 @@ def judge_target(
     full_dn : int
         Grey value at which pixels clip.
     """
-    count, of_all = len(view.pixels), points_of(target)
+    count, of_all = len(view.pixels), len(target.indices)
     share = count / of_all
     blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
     contrast = float(np.median(view.quality["contrast"])) / full_dn
@@ -236,6 +231,5 @@ def _within(pixels: np.ndarray, hull: np.ndarray) -> np.ndarray:
 
 def _spacing_px(view: TargetView, target: Target) -> float:
     """Roughly how far apart neighbouring points are in the image."""
-    spacing = target.spacing_x_mm if isinstance(target, CircleTarget) else target.square_mm
     size_px, size_mm = np.ptp(view.pixels, axis=0).max(), np.ptp(view.points_mm[:, :2], axis=0).max()
-    return float(spacing * size_px / max(size_mm, 1e-9))
+    return float(target.spacing_mm * size_px / max(size_mm, 1e-9))

@@ -10,13 +10,12 @@ from uwlts.calibration.camera_poses import CameraSolution, Poses, solve_camera
 from uwlts.calibration.circle_bias import solve_without_bias
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.model import CameraModel
-from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.sheet import SheetSolution, fit_sheet, points_on_target
 from uwlts.calibration.target_image import TargetImage
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.placement import laser_pose
 from uwlts.sensor import Medium, Sensor
-from uwlts.targets import CircleTarget, Target, TargetView
+from uwlts.targets import Target, TargetView
 
 # A residual this many times that of the others, and this much beyond what noise alone may do, contradicts them.
 _CONTRADICTION, _ALLOWANCE_PX = 3.0, 0.1
@@ -87,8 +86,8 @@ def solve_recorded(recorded: Sequence[RecordedPose], setting: Setting) -> Camera
 
     images = [pose.image() for pose in recorded]
     try:
-        if isinstance(setting.target, CircleTarget):
-            return solve_without_bias(images, solved, diameter_mm=setting.target.diameter_mm).solution
+        if (diameter_mm := setting.target.circle_diameter_mm) is not None:
+            return solve_without_bias(images, solved, diameter_mm=diameter_mm).solution
         return solved(images, None)
     except RangeError as error:
         raise CalibrationError(str(error)) from error
@@ -115,8 +114,8 @@ def sheet_of(recorded: Sequence[RecordedPose], solution: CameraSolution, setting
     """The laser sheet by the recorded stripes; CalibrationError where they do not determine it yet."""
     target = setting.target
     points = points_on_target(
-        solution.model, [pose.stripe for pose in recorded], solution.target_poses, extent_mm=plate_extent(target),
-        margin_mm=lattice_spacing(target) / 2,
+        solution.model, [pose.stripe for pose in recorded], solution.target_poses, extent_mm=target.extent_mm,
+        margin_mm=target.spacing_mm / 2,
     )  # fmt: skip
     return fit_sheet(points.points_mm, nominal_normal=laser_pose(setting.sensor).normal)
 

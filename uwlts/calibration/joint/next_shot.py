@@ -18,7 +18,6 @@ from uwlts.calibration.joint.stored import StoredEstimate
 from uwlts.calibration.joint.surfaces import Spheres
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_over, regions
 from uwlts.calibration.model import Calibration
-from uwlts.calibration.plate_extent import plate_extent
 from uwlts.sensor import Uncertainty
 from uwlts.targets import Target, parse_target
 
@@ -181,6 +180,6 @@ def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tupl
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     pose = np.eye(4)
     pose[:3, :3] = about_x @ about_y @ frame[:3, :3]
-    middle = np.append(plate_extent(target).mean(axis=0), 0.0)
+    middle = np.append(target.extent_mm.mean(axis=0), 0.0)
     pose[:3, 3] = frame[:3, 3] + depth_mm * frame[:3, 2] - pose[:3, :3] @ middle
     return pose

@@ -28,7 +28,6 @@ from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.placement import laser_pose
 from uwlts.sensor import Uncertainty
-from uwlts.targets import CircleTarget
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,12 +152,12 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     shared = parameters.start(start.lens)
     own = [*start.own, *(line_start(e, parameters, shared) for e, _ in steps), *(own for _, own in scans)]
     target = gathered.series[0].found.target
-    circles = options.correct_circles and isinstance(target, CircleTarget)
+    diameter_mm = target.circle_diameter_mm if options.correct_circles else None
     sources = gathered.sources(free=free)
     sources += [{e.image: gathered.steps[e.image][0].source} for e, _ in steps]
     sources += [e.sources() for e, _ in scans]
     return JointProblem(
-        parameters, evidence, shared, own, sensor.uncertainty, target.diameter_mm if circles else None, sources,
+        parameters, evidence, shared, own, sensor.uncertainty, diameter_mm, sources,
         warnings,
     )  # fmt: skip
 

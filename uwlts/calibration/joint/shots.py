@@ -13,12 +13,11 @@ from uwlts.calibration.joint.surface_scans import SLOPES, SurfaceScanEvidence
 from uwlts.calibration.joint.surfaces import Spheres
 from uwlts.calibration.joint.volume import pixels_at
 from uwlts.calibration.model import Calibration
-from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.target_placement import Placement
 from uwlts.camera import project_through_window
 from uwlts.sensor import Uncertainty
 from uwlts.sheet_surface import sheet_surface
-from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
+from uwlts.targets import Target
 
 _FEWEST_POINTS, _FEWEST_LINES = 20, 20
 _SAMPLES = 400
@@ -40,30 +39,15 @@ class Shot:
     own_std: np.ndarray
 
 
-def target_points(target: Target) -> np.ndarray:
-    """Points (N, 3) of a target in mm, target frame."""
-    match target:
-        case CircleTarget():
-            spacing, first = (target.spacing_x_mm, target.spacing_y_mm), np.negative(target.origin)
-        case ChessboardTarget():
-            spacing, first = (target.square_mm,) * 2, np.zeros(2)
-        case CharucoTarget():
-            spacing, first = (target.square_mm,) * 2, np.ones(2)
-    inner = 1 if isinstance(target, CharucoTarget) else 0
-    columns, rows = np.meshgrid(np.arange(target.columns - inner), np.arange(target.rows - inner))
-    at = (np.stack([columns.ravel(), rows.ravel()], axis=1) + first) * spacing
-    return np.column_stack([at, np.zeros(len(at))])
-
-
 def target_shot(calibration: Calibration, known: StoredEstimate, target: Target, pose: np.ndarray) -> Shot | None:
     """An image of the target with the stripe on it, at ``T_camera_target`` (4, 4); None where too little is in view."""
-    points = target_points(target)
+    points = target.points_mm
     pixels = _seen(known, points @ pose[:3, :3].T + pose[:3, 3])
     inside = np.isfinite(pixels).all(axis=1)
     lit = _lit(calibration, known, target, pose)
     if inside.sum() < _FEWEST_POINTS or len(lit) < _FEWEST_LINES:
         return None
-    extent = plate_extent(target)
+    extent = target.extent_mm
     middle = extent.mean(axis=0)
     count = int(inside.sum())
     evidence = TargetEvidence(
@@ -169,11 +153,11 @@ def _lit(calibration: Calibration, known: StoredEstimate, target: Target, pose: 
     if np.linalg.norm(along) < 1e-3:
         return np.empty((0, 2))
     along /= np.linalg.norm(along)
-    middle = np.append(plate_extent(target).mean(axis=0), 0.0)
+    middle = np.append(target.extent_mm.mean(axis=0), 0.0)
     rows = np.stack([sheet.normal, facing, along])
     centre = pose[:3, :3] @ middle + pose[:3, 3]
     start = np.linalg.solve(rows, [sheet.offset_mm, facing @ centre, along @ centre])
-    extent, margin = plate_extent(target), lattice_spacing(target) / 2
+    extent, margin = target.extent_mm, target.spacing_mm / 2
     reach = float(np.ptp(extent, axis=0).sum())
     points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
     at = (points - pose[:3, 3]) @ pose[:3, :3]

@@ -15,7 +15,6 @@ from uwlts.calibration.joint.observations import TargetEvidence
 from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.sheet_jets import DescribedSheet
 from uwlts.calibration.model import Calibration, CameraModel, SheetModel, WindowModel
-from uwlts.calibration.plate_extent import lattice_spacing, plate_extent
 from uwlts.calibration.sheet import fit_sheet, object_frame
 from uwlts.calibration.target_placement import Placement, placements, single_images
 from uwlts.camera import directions
@@ -189,8 +188,8 @@ def _evidence(
     image = np.repeat(numbers, [len(found.stripes[number]) for number in numbers])
     stage_mm = np.array([entry.stage_mm for entry in found.images])
     shifts = stage_mm[image] - stage_mm[placement.image[0]] if staged else np.zeros(len(image))
-    extent = plate_extent(found.target)
-    margin = lattice_spacing(found.target) / 2 if margin_mm is None else margin_mm
+    extent = found.target.extent_mm
+    margin = found.target.spacing_mm / 2 if margin_mm is None else margin_mm
     at = _on_target(camera, window, index, pixels, pose, shifts, placement.direction(np.empty(0)))
     hull = ConvexHull(extent).equations
     with np.errstate(invalid="ignore"):

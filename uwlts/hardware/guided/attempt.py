@@ -22,7 +22,7 @@ from uwlts.errors import CalibrationError, TargetError
 from uwlts.hardware.rig import START_MS, Rig, settled_exposure
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.sensor import Sensor
-from uwlts.targets import TargetView, detect_target
+from uwlts.targets import TargetView
 
 
 class GuidedImages:
@@ -138,7 +138,7 @@ class Attempts:
     def find(self, image: np.ndarray) -> Found:
         """The target in a lamp image (H, W), judged."""
         try:
-            view = detect_target(image, self._setting.target)
+            view = self._setting.target.detect(image)
         except TargetError as error:
             return Found(image, None, None, (why_not_found(image, str(error), full_dn=self._full),))
         quality = judge_target(image, view, self._setting.target, full_dn=self._full, limits=self.limits)

@@ -1,9 +1,9 @@
-"""What chessboard and ChArUco detection share: 8-bit images, and how good a corner is."""
+"""Common parts of chessboard and ChArUco detection: 8-bit images, and the quality of corners."""
 
 import cv2
 import numpy as np
 
-from uwlts.targets.blobs import checked_grey
+from uwlts.targets.detection.blobs import checked_grey
 
 # Half the side of the window in which a corner is judged.
 HALF_WINDOW = 5

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from uwlts.errors import TargetError
-from uwlts.targets.circles import find_circles
-from uwlts.targets.consistency import agreeing
-from uwlts.targets.ellipses import Ellipses
+from uwlts.targets.detection.circles import find_circles
+from uwlts.targets.detection.consistency import agreeing
+from uwlts.targets.detection.ellipses import Ellipses
 
 NEIGHBOURS = 16
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from uwlts.targets.edges import REACH_OVER_MINOR_AXIS, rim_directions, sample
+from uwlts.targets.detection.ellipses import REACH_OVER_MINOR_AXIS, rim_directions, sample
 
 PASSES = 2
 

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.targets.blobs import noise_level
-from uwlts.targets.edges import PROFILES, REACH_OVER_MINOR_AXIS, rim_directions, sample
+from uwlts.targets.detection.blobs import noise_level
 
+# Profiles around a blob, and samples on each.
+PROFILES = 48
 SAMPLES = 11
 PASSES = 2
 
@@ -14,6 +15,7 @@ PASSES = 2
 # in focus, six that of one out of focus; inside a small blob half the minor semi-axis is all there is before the
 # opposite edge is felt. The next is tried where this share of the blobs shows no sharp edge.
 REACHES_PX = (2.5, 6.0)
+REACH_OVER_MINOR_AXIS = 0.5
 MISSED_SHARE = 0.2
 
 # Largest rms distance of the edge from its ellipse: as a share of the reach (0.15 px of 2.5 px) and of the mean radius,
@@ -77,7 +79,7 @@ def fit_ellipses(image, blobs):
     centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
     least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the plate's edge show a large residual or
     an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
-    over a longer way.
+    over a longer distance.
 
     Parameters
     ----------
@@ -197,3 +199,22 @@ def _moved(centres, shapes, edge):
     fitted = values[:, 0] > 1.0
     rms = np.sqrt((residual**2).sum(1) / (PROFILES - 5))
     return centres + change[:, :2], shapes, rms, fitted
+
+
+def rim_directions():
+    """Unit vectors (PROFILES, 2) that an ellipse's shape matrix maps to points of its rim."""
+    angle = np.arange(PROFILES) * (2 * np.pi / PROFILES)
+    return np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+def sample(grey, points):
+    """Bilinear grey values (...) at pixel positions (..., 2), which must lie inside the image."""
+    width = grey.shape[1]
+    whole = points.astype(np.int32)
+    part = (points - whole).astype(np.float32)
+    index = whole[..., 1] * width + whole[..., 0]
+    flat = grey.reshape(-1)
+    du, dv = part[..., 0], part[..., 1]
+    top = flat[index] * (1 - du) + flat[index + 1] * du
+    bottom = flat[index + width] * (1 - du) + flat[index + width + 1] * du
+    return top * (1 - dv) + bottom * dv

@@ -1,0 +1,172 @@
+"""Base class of calibration targets: what each target type provides, and how a description is read."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from uwlts.errors import DescriptionError
+from uwlts.sensor import Description
+
+# A target seen in part is found from about a dozen points, or from this share of a larger one: fewer are too likely to
+# miss the marks or markers that number them.
+_FEWEST_POINTS, _SMALLEST_SHARE = 12, 0.15
+
+
+@dataclass(frozen=True)
+class TargetView:
+    """Points of a target found in one image.
+
+    Attributes
+    ----------
+    pixels : (N, 2) float64, px, (u, v), pixel (0, 0) is the centre of the first pixel
+        Centre of the image of a circle (not the image of its centre: see `circle_centre_bias`), or a corner.
+    points_mm : (N, 3) float64, mm, target frame, z = 0
+    indices : (N, 2) int64, place (column, row) of the circle or inner corner, counted from the top left one
+    quality : name to (N,) float64
+        ``contrast``: grey levels between bright and dark at the point; ``sharpness``: steepest slope over contrast,
+        1/px; for circles also ``residual_px``: rms distance of the edge from its ellipse, and ``radius_px``: geometric
+        mean of the ellipse's semi-axes.
+    """
+
+    pixels: np.ndarray
+    points_mm: np.ndarray
+    indices: np.ndarray
+    quality: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A piece of a target's print: a rectangle with sides along x and y, or the ellipse that fits into it.
+
+    Attributes
+    ----------
+    x_min_mm, y_min_mm, x_max_mm, y_max_mm : float, mm, target frame
+    round : whether the patch is the ellipse
+    ink : whether the patch has the brightness of the ink or that of the ground around the pattern
+    """
+
+    x_min_mm: float
+    y_min_mm: float
+    x_max_mm: float
+    y_max_mm: float
+    round: bool = False
+    ink: bool = True
+
+
+class Target(Description, ABC):
+    """Base of calibration targets: a flat pattern of points that are found and numbered in an image.
+
+    Looking at the target, X points right, Y down and Z away from the viewer into the target; all points have z = 0.
+
+    A target type is a subclass with a field ``kind``, whose default is its name in files. Each module of
+    `uwlts.targets` is imported with the package, so a class in a module of its own there is known without further
+    steps; a class elsewhere is known once its module is imported.
+    """
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        super().__pydantic_init_subclass__(**kwargs)
+        if "kind" in cls.model_fields:
+            _KINDS[cls.model_fields["kind"].default] = cls
+
+    @property
+    @abstractmethod
+    def indices(self) -> np.ndarray:
+        """Indices (N, 2) int64 (column, row) of all points."""
+
+    @abstractmethod
+    def points_at(self, indices: np.ndarray) -> np.ndarray:
+        """Points (M, 3) in mm, target frame, with these indices (M, 2)."""
+
+    @property
+    @abstractmethod
+    def spacing_mm(self) -> float:
+        """Distance between neighbouring points, the smaller one."""
+
+    @abstractmethod
+    def patches(self) -> list[Patch]:
+        """The print as seen from the front; a patch covers those before it."""
+
+    @abstractmethod
+    def detect(self, image: np.ndarray) -> TargetView:
+        """Find the points in an image (H, W) of uint8 or uint16.
+
+        Raises
+        ------
+        ImageError
+            The image is no grey image of 8 or 16 bit.
+        TargetError
+            The target is not found completely enough; the message says what was missing.
+        """
+
+    @property
+    def points_mm(self) -> np.ndarray:
+        """All points (N, 3), target frame, in the order of `indices`."""
+        return self.points_at(self.indices)
+
+    @property
+    def circle_diameter_mm(self) -> float | None:
+        """Diameter of the circles whose centres are the points; None if the points are corners."""
+        return None
+
+    @property
+    def extent_mm(self) -> np.ndarray:
+        """Corners (4, 2), target frame, of the rectangle that is covered by the pattern: its outermost points."""
+        points = self.points_mm[:, :2]
+        return rectangle_corners(points.min(axis=0), points.max(axis=0))
+
+    def findable(self, in_view: np.ndarray) -> bool:
+        """Whether `detect` finds the target if these (N,) of its points are in the image, as in `indices`."""
+        return bool(in_view.sum() >= max(min(_FEWEST_POINTS, len(in_view)), _SMALLEST_SHARE * len(in_view)))
+
+
+_KINDS: dict[str, type[Target]] = {}
+
+
+def lattice_indices(columns: int, rows: int) -> np.ndarray:
+    """Indices (columns * rows, 2) int64 (column, row) of a rectangular lattice, row by row."""
+    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=2).reshape(-1, 2)
+
+
+def rectangle_corners(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Corners (4, 2) of a rectangle between two opposite ones (2,)."""
+    return np.array([first, (last[0], first[1]), last, (first[0], last[1])])
+
+
+def parse_target(mapping: Mapping[str, Any]) -> Target:
+    """Make a target description from keys and values, as read from a file.
+
+    Raises
+    ------
+    DescriptionError
+        `kind` is missing or unknown, a key is unknown or missing, or a value is impossible.
+    """
+    if not isinstance(mapping, Mapping):
+        raise DescriptionError(f"the target is a {type(mapping).__name__}; expected a table of keys and values")
+    kind = mapping.get("kind")
+    if not isinstance(kind, str) or kind not in _KINDS:
+        found = f"found {kind!r}" if "kind" in mapping else "kind is missing"
+        raise DescriptionError(
+            f"the target cannot be read: {found} (kind is one of {', '.join(map(repr, sorted(_KINDS)))})"
+        )
+    try:
+        return _KINDS[kind].model_validate(dict(mapping))
+    except ValidationError as error:
+        lines = [_explained(problem) for problem in error.errors()]
+        raise DescriptionError("the target cannot be read: " + "; ".join(lines)) from error
+
+
+def _explained(problem: Any) -> str:
+    name = ".".join(str(part) for part in problem["loc"])
+    text = problem["msg"].removeprefix("Value error, ")
+    match problem["type"]:
+        case "extra_forbidden":
+            return f"{name} is not a key of this kind of target"
+        case "missing":
+            return f"{name} is missing"
+        case _:
+            return f"{name}: {text}, found {problem['input']!r}" if name else text
