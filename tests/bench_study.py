@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 from twin.study.description import Study, load_study
-from twin.study.executor import crew
 from twin.study.screening import Batch, judged_part, read_parts, write_part
+from uwlts.workers import open_workers
 
 WORKERS = 2
 BATCHES, BATCH = 40, 1000
@@ -42,10 +42,10 @@ def screening() -> tuple[float, float]:
     sampling = {"kind": "sobol", "designs": BATCHES * BATCH, "batch": BATCH}
     study = Study.model_validate(study.model_dump() | {"sampling": sampling})
     batches = [Batch(study, None, first, BATCH) for first in range(0, BATCHES * BATCH, BATCH)]
-    with tempfile.TemporaryDirectory() as folder, crew(workers=WORKERS) as hands:
-        list(hands.work(timed, batches[: 2 * WORKERS]))
+    with tempfile.TemporaryDirectory() as folder, open_workers(workers=WORKERS) as pool:
+        list(pool.completed(timed, batches[: 2 * WORKERS]))
         start, judging = time.perf_counter(), 0.0
-        for batch, (seconds, content) in hands.work(timed, batches):
+        for batch, (seconds, content) in pool.completed(timed, batches):
             write_part(Path(folder), batch.first, content)
             judging += seconds
         wall = time.perf_counter() - start

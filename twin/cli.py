@@ -320,9 +320,9 @@ def sweep(
         Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
     from twin.study.description import load_study
-    from twin.study.executor import crew
     from twin.study.sweep import clear, outcome_lines
     from twin.study.sweep import sweep as run_sweep
+    from uwlts.workers import open_workers
 
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
@@ -330,9 +330,9 @@ def sweep(
     folder = out or Path("runs") / Path(study).stem
     if overwrite:
         clear(folder)
-    with crew(workers=workers, scheduler=scheduler) as hands, progress_bar(described.title) as progress:
+    with open_workers(workers=workers, scheduler=scheduler) as pool, progress_bar(described.title) as progress:
         outcome = run_sweep(
-            described, folder, hands, variant=variant, progress=lambda what, done, total: progress(done, total)
+            described, folder, pool, variant=variant, progress=lambda what, done, total: progress(done, total)
         )
     print("\n".join(outcome_lines(described, outcome)))
     print(f"wrote {folder / 'report.html'}, designs.csv, summary.json and winner.toml")

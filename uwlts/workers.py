@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import SetupError, UwltsError
 
@@ -177,20 +177,21 @@ class _Processes(Workers):
     ) -> Iterator[tuple[int, Job, Result | Lost]]:
         """Number, job and result of each job as it is done."""
         waiting = enumerate(jobs)
-        busy: dict[Connection, tuple[_Process, int, Job]] = {}
+        busy: dict[object, tuple[_Process, int, Job]] = {}
         idle = deque(self._processes)
         more = True
         while more or busy:
-            while more and len(busy) < self.count:
-                number, job = next(waiting, (None, None))
-                if number is None:
+            while len(busy) < self.count:
+                try:
+                    number, job = next(waiting)
+                except StopIteration:
                     more = False
                     break
                 process = idle.popleft() if idle else self._started()
                 busy[process.connection] = process, number, job
                 process.give(work, job)
             # Without a connection `wait` would wait for ever.
-            for connection in wait(list(busy)) if busy else ():
+            for connection in wait([process.connection for process, _, _ in busy.values()]) if busy else ():
                 process, number, job = busy[connection]
                 match process.message():
                     case ("told", message):
@@ -203,6 +204,8 @@ class _Processes(Workers):
                     case Lost() as result:
                         self._processes.remove(process)
                         process.end(0.0)
+                    case _ as never:
+                        assert_never(never)
                 del busy[connection]
                 yield number, job, result
 
@@ -247,7 +250,7 @@ class _Process:
                 self._work = work
             self.connection.send(("job", job))
 
-    def message(self) -> tuple[str, Any] | Lost:
+    def message(self) -> tuple[Literal["told", "raised", "done"], Any] | Lost:
         """What the job tells ("told"), its result ("done") or its error ("raised"), or that the process has ended."""
         try:
             return self.connection.recv()

@@ -9,10 +9,10 @@ from tests.virtual_sensors import altered
 from twin.options import CPU
 from twin.study.description import Study
 from twin.study.designs import Design, built
-from twin.study.executor import crew
 from twin.study.figures import scatter_at
 from twin.study.parameters import parameters_of
 from twin.study.verification import Candidate, Rendered, Verification, compared, render, verified
+from uwlts.workers import open_workers
 
 
 @pytest.fixture
@@ -59,11 +59,11 @@ def test_a_disagreement_is_told(study, thesis):
 def test_a_candidate_that_fails_is_kept_with_its_reason_and_tried_again(study, thesis, tmp_path):
     hopeless = altered(thesis, {"volume": {"near_mm": 900.0, "far_mm": 950.0}})
     candidates = [Candidate("hopeless", 3, hopeless)]
-    with crew(workers=1) as hands:
-        (row,) = render(study, tmp_path / "verified", candidates, hands, variant=CPU)
+    with open_workers(workers=1) as pool:
+        (row,) = render(study, tmp_path / "verified", candidates, pool, variant=CPU)
         (path,) = (tmp_path / "verified").iterdir()
         first = path.stat().st_mtime_ns
-        (again,) = render(study, tmp_path / "verified", candidates, hands, variant=CPU)
+        (again,) = render(study, tmp_path / "verified", candidates, pool, variant=CPU)
     assert row["label"] == "hopeless" and not row["agrees"]
     assert "volume" in row["failure"] and again["failure"] == row["failure"]
     assert path.stat().st_mtime_ns > first
@@ -73,15 +73,15 @@ def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkey
     folder: Path = tmp_path / "verified"
     candidates = [Candidate("thesis", -1, thesis)]
     monkeypatch.setattr("twin.study.agreement.verified", _counted)
-    with crew(workers=1) as hands:
+    with open_workers(workers=1) as pool:
         for label in ("thesis", "renamed"):
             candidates = [Candidate(label, -1, thesis)]
-            (row,) = render(study, folder, candidates, hands, variant=CPU)
+            (row,) = render(study, folder, candidates, pool, variant=CPU)
             assert (row["label"], row["ratio"]) == (label, 1.25)
     assert len(list(folder.iterdir())) == 1
     # The worker would have said another ratio the second time.
-    with crew(workers=1) as hands:
-        (other,) = render(study, folder, [Candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], hands,
+    with open_workers(workers=1) as pool:
+        (other,) = render(study, folder, [Candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool,
                           variant=CPU)  # fmt: skip
     assert other["ratio"] == 1.25 and len(list(folder.iterdir())) == 2
 

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from twin.study.description import load_study
-from twin.study.executor import crew
 from twin.study.screening import parts, read_parts, screen
 from uwlts.library import load_sensor
+from uwlts.workers import open_workers
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -59,8 +59,8 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
     """All designs of the study, judged in one go."""
     folder = tmp_path_factory.mktemp("expected")
     (folder / "study.toml").write_text(STUDY, encoding="utf-8")
-    with crew(workers=2) as hands:
-        screen(load_study(folder / "study.toml"), folder / "out", hands)
+    with open_workers(workers=2) as pool:
+        screen(load_study(folder / "study.toml"), folder / "out", pool)
     return read_parts(folder / "out" / "screen")
 
 
@@ -223,19 +223,19 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
         [*module, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
          "--scheduler-file", str(found)], **quiet,
     )  # fmt: skip
-    hands: list[subprocess.Popen[bytes]] = []
+    processes: list[subprocess.Popen[bytes]] = []
     try:
         until(found.is_file)
-        hands += [
+        processes += [
             subprocess.Popen(
                 [*module, "distributed.cli.dask_worker", "--scheduler-file", str(found), "--host", "127.0.0.1",
                  "--nthreads", "1", "--no-nanny", "--no-dashboard"], **quiet,
             )
             for _ in range(workers)
         ]  # fmt: skip
-        yield json.loads(found.read_text())["address"], hands
+        yield json.loads(found.read_text())["address"], processes
     finally:
-        for process in (*hands, scheduler):
+        for process in (*processes, scheduler):
             process.kill()
             process.wait()
 

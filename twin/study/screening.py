@@ -27,9 +27,9 @@ from optuna.trial import Trial, TrialState
 
 from twin.study.description import Study, Variable
 from twin.study.designs import Design, designs_of, judged, number_of_designs
-from twin.study.executor import Crew, Lost
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files import written_aside
+from uwlts.workers import Lost, Workers
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
@@ -190,7 +190,9 @@ def judged_part(batch: Batch) -> bytes:
     return as_part(judged(batch.study, batch.all()))
 
 
-def screen(study: Study, folder: Path, crew: Crew, *, progress: Progress = lambda what, done, total: None) -> None:
+def screen(
+    study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda what, done, total: None
+) -> None:
     """Judge all designs of a study that are not judged yet, into parts below ``folder``.
 
     Raises
@@ -205,7 +207,7 @@ def screen(study: Study, folder: Path, crew: Crew, *, progress: Progress = lambd
     keep_to_plan(study, folder)
     place = made_folder(folder / PARTS)
     if study.sampling.kind == "optimise":
-        _optimise(study, folder, place, crew, progress)
+        _optimise(study, folder, place, workers, progress)
         return
     total, size = number_of_designs(study), study.sampling.batch
     batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
@@ -223,13 +225,13 @@ def screen(study: Study, folder: Path, crew: Crew, *, progress: Progress = lambd
             else:
                 done += batch.count
 
-    for batch, result in crew.work(judged_part, left()):
+    for batch, result in workers.completed(judged_part, left()):
         write_part(place, batch.first, _content(batch, result), lost=isinstance(result, Lost))
         done += batch.count
         progress("screening", done, total)
 
 
-def _optimise(study: Study, folder: Path, place: Path, crew: Crew, progress: Progress) -> None:
+def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
     """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
     search = Search(study, folder)
     known = read_parts(place)
@@ -240,12 +242,12 @@ def _optimise(study: Study, folder: Path, place: Path, crew: Crew, progress: Pro
     while (done := sum(map(rows_in, parts(place)))) < total:
         progress("optimising", done, total)
         asked = search.ask(min(study.sampling.batch, total - done))
-        share = -(-len(asked) // crew.workers)
+        share = -(-len(asked) // workers.count)
         batches = [
             Batch(study, tuple(asked[i : i + share]), asked[i].number, len(asked[i : i + share]))
             for i in range(0, len(asked), share)
         ]
-        for batch, result in crew.work(judged_part, batches):
+        for batch, result in workers.completed(judged_part, batches):
             content = _content(batch, result)
             write_part(place, batch.first, content)
             table = pq.read_table(pa.BufferReader(content))

@@ -20,11 +20,11 @@ import tomli_w
 from twin.study.choice import choose
 from twin.study.description import Study
 from twin.study.designs import Marked
-from twin.study.executor import Crew
 from twin.study.report.page import write_page
 from twin.study.screening import JOURNAL, PARTS, PLAN, Progress, read_parts, screen, write_csv
 from twin.study.verification import Candidate, render
 from uwlts.files import written_aside
+from uwlts.workers import Workers
 
 PAGE, TABLE, WINNER, SUMMARY = "report.html", "designs.csv", "winner.toml", "summary.json"
 RENDERED = "verified"
@@ -41,7 +41,7 @@ class Outcome:
 
 
 def sweep(
-    study: Study, folder: Path, crew: Crew, *, variant: str, progress: Progress = lambda what, done, total: None
+    study: Study, folder: Path, workers: Workers, *, variant: str, progress: Progress = lambda what, done, total: None
 ) -> Outcome:
     """Judge a study's designs, choose the best, render some, and write table, page, winner and summary into a folder.
 
@@ -56,7 +56,7 @@ def sweep(
     SetupError
         The workers' cluster is gone.
     """
-    screen(study, folder, crew, progress=progress)
+    screen(study, folder, workers, progress=progress)
     columns = read_parts(folder / PARTS)
     write_csv(folder / TABLE, columns)
     chosen = choose(study, columns)
@@ -68,7 +68,7 @@ def sweep(
         candidates += [Candidate(m.label, m.row["design"], m.sensor) for m in chosen.marked if m.row["design"] < 0]
         candidates += [Candidate(m.label, m.row["design"], m.sensor) for m in chosen.further]
         rows = render(
-            study, folder / RENDERED, candidates, crew, variant=variant,
+            study, folder / RENDERED, candidates, workers, variant=variant,
             progress=lambda done, total: progress("rendering", done, total),
         )  # fmt: skip
     outcome = Outcome(columns, chosen.marked, tuple(rows), chosen.notes)

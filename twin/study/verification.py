@@ -26,7 +26,6 @@ from plyfile import PlyData, PlyParseError
 
 from twin.options import CPU, Options, use_variant
 from twin.study.description import Study
-from twin.study.executor import Crew, Lost
 from twin.study.figures import figures_of, scatter_at
 from twin.study.parameters import parameters_of
 from twin.study.screening import made_folder
@@ -44,7 +43,7 @@ from uwlts.errors import (
 from uwlts.files import written_aside
 from uwlts.sensor import Sensor
 from uwlts.truth import truth_path
-from uwlts.workers import work_through
+from uwlts.workers import Lost, Workers, work_through
 
 _USER_ERROR = 2
 _FEWEST_POINTS = 20
@@ -365,7 +364,7 @@ def _failed(candidate: Candidate, reason: str) -> dict[str, Any]:
 
 
 def render(
-    study: Study, folder: Path, candidates: Sequence[Candidate], crew: Crew, *, variant: str,
+    study: Study, folder: Path, candidates: Sequence[Candidate], workers: Workers, *, variant: str,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Rows of the candidates' verifications, in their order; each is kept in a file of ``folder``.
@@ -383,11 +382,11 @@ def render(
     paths = [folder / f"{_digest(study, candidate, variant)}.parquet" for candidate in candidates]
     rows = [_row_in(path) for path in paths]
     waiting = [place for place, row in enumerate(rows) if row is None or row["failure"]]
-    each = crew.processes_for(len(waiting))
+    each = workers.processes_for(len(waiting))
     jobs = {place: Verification(study, candidates[place], each, variant) for place in waiting}
     done = len(candidates) - len(waiting)
     progress(done, len(candidates))
-    for job, result in crew.work(verified, jobs.values()):
+    for job, result in workers.completed(verified, jobs.values()):
         place = next(place for place, one in jobs.items() if one is job)
         row = _failed(job.candidate, result.reason) if isinstance(result, Lost) else result
         with written_aside(paths[place], overwrite=True) as aside:

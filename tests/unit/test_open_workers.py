@@ -1,4 +1,4 @@
-"""The workers of a sweep: nothing is lost when processes die, and only the guilty job is blamed."""
+"""Workers for several rounds of jobs: nothing is lost when processes die, and only the job that kills its process."""
 
 import os
 import signal
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from twin.study.executor import Lost, crew
 from uwlts.errors import SetupError
+from uwlts.workers import Lost, open_workers
 
 GUILTY = 7
 
@@ -36,8 +36,8 @@ def unlucky(job: tuple[int, Path]) -> int:
 
 
 def test_all_jobs_are_done_once_by_all_workers(tmp_path):
-    with crew(workers=2) as hands:
-        done = dict(hands.work(squared, ((k, tmp_path) for k in range(30))))
+    with open_workers(workers=2) as pool:
+        done = dict(pool.completed(squared, ((k, tmp_path) for k in range(30))))
     assert {job[0]: result for job, result in done.items()} == {k: k * k for k in range(30)}
     marks = [path.name.split("-") for path in tmp_path.iterdir()]
     assert sorted(int(number) for number, _ in marks) == list(range(30))
@@ -45,18 +45,18 @@ def test_all_jobs_are_done_once_by_all_workers(tmp_path):
 
 
 def test_only_the_job_that_kills_its_process_is_lost(tmp_path):
-    with crew(workers=2) as hands:
-        done = {job[0]: result for job, result in hands.work(deadly, ((k, tmp_path) for k in range(20)))}
+    with open_workers(workers=2) as pool:
+        done = {job[0]: result for job, result in pool.completed(deadly, ((k, tmp_path) for k in range(20)))}
         assert {k for k, result in done.items() if isinstance(result, Lost)} == {GUILTY}
         assert "ended unexpectedly" in done[GUILTY].reason
         assert {k: r for k, r in done.items() if k != GUILTY} == {k: k * k for k in range(20) if k != GUILTY}
-        # The crew goes on working afterwards.
-        assert next(iter(hands.work(squared, [(3, tmp_path)])))[1] == 9
+        # The workers go on afterwards.
+        assert next(iter(pool.completed(squared, [(3, tmp_path)])))[1] == 9
 
 
 def test_a_job_whose_process_was_killed_by_chance_is_done_again(tmp_path):
-    with crew(workers=2) as hands:
-        done = {job[0]: result for job, result in hands.work(unlucky, ((k, tmp_path) for k in range(20)))}
+    with open_workers(workers=2) as pool:
+        done = {job[0]: result for job, result in pool.completed(unlucky, ((k, tmp_path) for k in range(20)))}
     assert done == {k: k * k for k in range(20)}
 
 
@@ -68,8 +68,8 @@ def test_jobs_are_taken_only_shortly_before_they_are_done(tmp_path):
             taken.append(k)
             yield k, tmp_path
 
-    with crew(workers=2) as hands:
-        work = hands.work(squared, jobs())
+    with open_workers(workers=2) as pool:
+        work = pool.completed(squared, jobs())
         next(work)
         assert len(taken) <= 8
         assert sum(1 for _ in work) == 49
@@ -77,12 +77,13 @@ def test_jobs_are_taken_only_shortly_before_they_are_done(tmp_path):
 
 def test_workers_share_the_threads_of_the_machine(tmp_path):
     processors = len(os.sched_getaffinity(0))
-    with crew(workers=processors) as hands:
-        ((_, threads),) = hands.work(os.getenv, ["OMP_NUM_THREADS"])
+    with open_workers(workers=processors) as pool:
+        ((_, threads),) = pool.completed(os.getenv, ["OMP_NUM_THREADS"])
     assert threads == "1"
-    assert hands.processes_for(processors) == 1 and hands.processes_for(1) == processors
+    assert pool.processes_for(processors) == 1 and pool.processes_for(1) == processors
 
 
 def test_no_scheduler_at_an_address():
-    with pytest.raises(SetupError, match="no Dask scheduler"), crew(scheduler="tcp://127.0.0.1:9", patience_s=1.0):
+    nobody = "tcp://127.0.0.1:9"
+    with pytest.raises(SetupError, match="no Dask scheduler"), open_workers(scheduler=nobody, patience_s=1.0):
         pass
