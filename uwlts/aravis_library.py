@@ -77,11 +77,12 @@ def _load_with_companions(place: str) -> ctypes.CDLL:
             return ctypes.CDLL(place)
         except OSError as error:
             missing = re.match(r"([^\s/]+): cannot open shared object file", str(error))
-            beside = _file_of(missing[1], Path(place).parent) if missing and "/" in place else None
+            name = missing[1] if missing and "/" in place else ""
+            beside = _file_of(name, Path(place).parent) if name else None
             # A library that is asked for again although it is loaded will never be accepted.
-            if beside is None or missing[1] in asked:
+            if beside is None or name in asked:
                 raise
-            asked.add(missing[1])
+            asked.add(name)
             _load_with_companions(str(beside))
 
 

@@ -11,7 +11,7 @@ an interrupted recording keeps all its complete frames; closing it gives it its 
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -110,7 +110,7 @@ class CaptureWriter:
                 with self._left_over() as unfinished:
                     self._begin(unfinished)
             else:
-                self._begin(None)
+                self._begin(())
             # Nothing is locked: whoever looks at a running recording must not stop it.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
@@ -139,7 +139,7 @@ class CaptureWriter:
             raise CaptureError(f"{self._part} belongs to another recording; give --overwrite to start afresh")
         return unfinished
 
-    def _begin(self, unfinished: "Capture | None") -> None:
+    def _begin(self, unfinished: "Capture | Sequence[Frame]") -> None:
         """Put a valid part in place, empty or with the complete frames of the one left over.
 
         HDF5 cannot append to a killed writer's file, so a new one is made; it is made aside, so that a run that is
@@ -150,8 +150,8 @@ class CaptureWriter:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
                 self._lay_out()
-                for index in range(len(unfinished) if unfinished else 0):
-                    self._store(unfinished.frame(index))
+                for frame in unfinished:
+                    self._store(frame)
             _cut_to_used(fresh)
             os.replace(fresh, self._part)
         finally:
@@ -171,7 +171,13 @@ class CaptureWriter:
 
     def __len__(self) -> int:
         """Number of complete frames written."""
-        return self._file["time_s"].shape[0]
+        return self._dataset("time_s").shape[0]
+
+    def _dataset(self, name: str) -> h5py.Dataset:
+        dataset = self._file[name]
+        if not isinstance(dataset, h5py.Dataset):
+            raise CaptureError(f"{self._part} is damaged: '{name}' is not a dataset")
+        return dataset
 
     def append(self, frame: Frame) -> None:
         """Store one frame; once this returns, the frame survives the end of the program.
@@ -208,7 +214,7 @@ class CaptureWriter:
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
         for name, value in values.items():
-            dataset = self._file[name]
+            dataset = self._dataset(name)
             dataset.resize(count + 1, axis=0)
             dataset[count] = value
             dataset.flush()
@@ -307,7 +313,7 @@ class Capture:
         columns = {
             name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()
         }
-        self.dtype = images.dtype
+        self._images, self.dtype = images, images.dtype
         self._count = min(len(images), *map(len, columns.values()))
         # HDF5 shows chunks that were never stored as zeros.
         if images.id.get_num_chunks() < self._count:
@@ -346,15 +352,17 @@ class Capture:
         if not 0 <= index < self._count:
             raise IndexError(f"frame {index} of {self._count}")
         try:
-            return self.file["frames"][index]
+            return self._images[index]
         except _DAMAGE as error:
             raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
 
-    def frame(self, index: int) -> Frame:
+    def __getitem__(self, index: int) -> Frame:
         """A frame with everything known about it; raises CaptureError where its data are damaged."""
+        index = index + self._count if index < 0 else index
+        image = self.image(index)
         pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
         return Frame(
-            image=self.image(index), stage_mm=float(self.stage_mm[index]), laser_on=bool(self.laser_on[index]),
+            image=image, stage_mm=float(self.stage_mm[index]), laser_on=bool(self.laser_on[index]),
             exposure_ms=float(self.exposure_ms[index]), time_s=float(self.time_s[index]), pose=pose,
         )  # fmt: skip
 
@@ -363,6 +371,9 @@ class Capture:
         for index in range(self._count):
             if laser_on is None or bool(self.laser_on[index]) == laser_on:
                 yield index, self.image(index)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[index] for index in range(self._count))
 
     def close(self) -> None:
         """Close the file."""
@@ -373,3 +384,34 @@ class Capture:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def open_capture(path: str | Path) -> Capture:
+    """Open a capture for reading.
+
+    Per-frame values are read at once, images when they are asked for. A recording that is still being written can be
+    opened by its name ``NAME.part``; it has the frames that were complete when it was opened.
+
+    Parameters
+    ----------
+    path : str or Path
+        Capture file (HDF5).
+
+    Returns
+    -------
+    Capture
+        A context manager and a sequence of frames: ``capture[12]`` has ``image`` (H, W), ``stage_mm``, ``laser_on``,
+        ``exposure_ms``, ``time_s`` and ``pose``; the arrays ``capture.stage_mm`` (N,), ``capture.laser_on`` (N,) and so
+        on hold the values of all frames, ``capture.header`` the sensor and the medium.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, foreign, truncated, of a newer version, or contradicts itself.
+
+    Examples
+    --------
+    >>> with uwlts.open_capture("spheres.h5") as capture:
+    ...     images = [frame.image for frame in capture if frame.laser_on]
+    """
+    return Capture(path)

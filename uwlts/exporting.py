@@ -52,8 +52,7 @@ def export_capture(
     try:
         aside.mkdir()
         rows = []
-        for index in range(len(capture)):
-            frame = capture.frame(index)
+        for index, frame in enumerate(capture):
             name = f"{index:05d}-{_light(frame)}.{image_format}"
             _, encoded = cv2.imencode(f".{image_format}", frame.image)
             (aside / name).write_bytes(encoded.tobytes())
@@ -181,7 +180,7 @@ def _write_e57(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
         )
     # Rounded before, so that the bounds in the file hold for the numbers in the file.
     columns = (1e-3 * cloud.points_mm).astype(np.float32).astype(np.float64).T
-    data = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
+    data: dict[str, np.ndarray] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
     if not unknown.any():
         data["intensity"] = cloud.intensity
     with written_aside(path, overwrite=overwrite) as aside:

@@ -85,12 +85,12 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
     CalibrationError
         The calibration does not fit the capture.
     """
-    frame = capture.frame(number)
+    frame = capture[number]
     along = capture.header.sensor.camera.stripe_along
-    none, outlook = np.zeros((0, 3)), _outlook(capture, number)
+    none, (planned, left_s) = np.zeros((0, 3)), _outlook(capture, number)
     if not frame.laser_on:
         picture = _picture(frame.image, capture, None)
-        return Seen(number, frame.stage_mm, False, picture, 0, 0, none, (), **outlook)
+        return Seen(number, frame.stage_mm, False, picture, 0, 0, none, (), planned, left_s)
     stripe = extract_stripe(frame.image, stripe_along=along, saturation=capture.header.saturation_dn)
     line = stripe.lines
     points = none
@@ -109,19 +109,21 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
     if len(line) < 0.05 * len(stripe.status):
         remarks.append("hardly any stripe: is the object in the volume?")
     picture = _picture(frame.image, capture, (line, stripe.centre_px[line]))
-    return Seen(number, frame.stage_mm, True, picture, len(line), len(stripe.status), points, tuple(remarks), **outlook)
+    return Seen(
+        number, frame.stage_mm, True, picture, len(line), len(stripe.status), points, tuple(remarks), planned, left_s
+    )
 
 
-def _outlook(capture: Capture, number: int) -> dict[str, float | int]:
+def _outlook(capture: Capture, number: int) -> tuple[int | None, float | None]:
     """How many images a recording will have, and the time in s that is left, by the pace of the latest ones."""
     planned = capture.header.provenance.get("images")
     if not isinstance(planned, int) or planned <= number:
-        return {}
+        return None, None
     first = max(number - _PACE, 0)
     if first == number:
-        return {"planned": planned}
+        return planned, None
     pace_s = (capture.time_s[number] - capture.time_s[first]) / (number - first)
-    return {"planned": planned, "left_s": float(pace_s * (planned - number - 1))}
+    return planned, float(pace_s * (planned - number - 1))
 
 
 def _picture(image: np.ndarray, capture: Capture, stripe: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:

@@ -27,13 +27,15 @@ def laser_pose(sensor: Sensor) -> LaserPose:
     """
     laser = sensor.laser
     towards = np.array([1.0, 0.0, 0.0]) if sensor.camera.stripe_along == "height" else np.array([0.0, -1.0, 0.0])
-    if laser.baseline_mm is not None:
+    if laser.baseline_mm is not None and laser.triangulation_angle_deg is not None:
         angle = math.radians(laser.triangulation_angle_deg)
         origin = laser.baseline_mm * towards
         axis = -math.sin(angle) * towards + np.array([0.0, 0.0, math.cos(angle)])
-    else:
+    elif laser.origin_mm is not None and laser.axis is not None:
         origin = np.array(laser.origin_mm)
         axis = np.array(laser.axis) / np.linalg.norm(laser.axis)
+    else:
+        raise DesignError("the laser is not placed: give baseline and triangulation angle, or origin and axis")
     normal = towards - (towards @ axis) * axis
     if np.linalg.norm(normal) < 1e-6:
         raise DesignError("the laser's axis runs along the baseline: the sheet has no direction across it")

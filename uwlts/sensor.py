@@ -54,9 +54,9 @@ class Window(Description):
 
     def index(self, wavelength_nm: float) -> float:
         """Refractive index of the glass relative to air."""
-        return (
-            self.glass if isinstance(self.glass, float) else media.glass_index(self.glass, wavelength_nm=wavelength_nm)
-        )
+        if isinstance(self.glass, str):
+            return media.glass_index(self.glass, wavelength_nm=wavelength_nm)
+        return self.glass
 
     def absorption_per_mm(self) -> float:
         """Absorption of the glass in 1/mm: the given value, else the named glass's at 635 nm, else none."""

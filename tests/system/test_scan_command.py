@@ -166,7 +166,7 @@ def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_p
         assert scan.laser_on.tolist() == [False, True, False, True]
         assert scan.dtype == np.uint16 and scan.header.saturation_dn == 511
         _, lamp = next(iter(scan.frames()))
-        laser = scan.frame(1).image
+        laser = scan[1].image
         assert lamp.max() < 256
         # Away from the stripe the difference is noise about 256, which stands for none.
         assert np.median(laser) == pytest.approx(256, abs=1) and laser.max() > 300

@@ -91,7 +91,7 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
         assert capture.finished
         assert_holds(capture, 5, dtype)
         for index in range(5):
-            written, found = a_frame(index, dtype, pose=with_pose and index != 2), capture.frame(index)
+            written, found = a_frame(index, dtype, pose=with_pose and index != 2), capture[index]
             assert found.image.dtype == dtype
             assert np.array_equal(found.image, written.image)
             if written.pose is None:
@@ -462,7 +462,7 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def read_all(path: Path) -> None:
     with Capture(path) as capture:
         for index in range(len(capture)):
-            capture.frame(index)
+            capture[index]
 
 
 def refused(path: Path, words: str) -> None:

@@ -5,6 +5,7 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -68,7 +69,8 @@ class Fault:
 
     def inject(self, stage: GrblController, camera: GigeCamera) -> None:
         """Let it happen."""
-        _KINDS[self.name].inject(stage, camera, self.argument)
+        # Kinds without an argument ignore it.
+        _KINDS[self.name].inject(stage, camera, 0.0 if self.argument is None else self.argument)
 
     def __str__(self) -> str:
         return f"{self.name}{'' if self.argument is None else f':{self.argument:g}'} at frame {self.frame}"
@@ -137,7 +139,7 @@ class Track:
         """Stage position of the scene's position 0."""
         return self.start_mm - self.motion.start_mm
 
-    def shot(self, position_mm: float, light: str) -> Shot:
+    def shot(self, position_mm: float, light: Literal["lamp", "laser"]) -> Shot:
         """The shot at a position of the stage; errors of the stage between the scan's positions are interpolated."""
         scene_mm, motion = position_mm - self.offset_mm, self.motion
         error_mm = 0.0
@@ -237,10 +239,12 @@ class Bench:
         day = self._light("day", state)
         return day + np.float32(state.power) * np.maximum(laser - day, 0)
 
-    def _light(self, light: str, state: StageState) -> np.ndarray:
+    def _light(self, light: Literal["lamp", "laser", "day"], state: StageState) -> np.ndarray:
         if light not in self._seen:
-            shot = self._track.shot(state.position_mm, light)
-            self._seen[light] = self._daylight(shot) if light == "day" else self._rendered(shot)
+            if light == "day":
+                self._seen[light] = self._daylight(self._track.shot(state.position_mm, "lamp"))
+            else:
+                self._seen[light] = self._rendered(self._track.shot(state.position_mm, light))
         return self._seen[light]
 
     def _rendered(self, shot: Shot) -> np.ndarray:

@@ -278,10 +278,14 @@ class GigeCamera:
             self._faults = replace(faults, drop=max(faults.drop - 1, 0), cut=max(faults.cut - 1, 0))
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
             host, port, packet_bytes = map(self._read, names)
-            region = tuple(self._read(name) for name in _REGION)
+            x, y, width, height = map(self._read, _REGION)
         if not faults.drop:
             packets = image_packets(
-                shot.image, time_ns=shot.time_ns, number=self._number, region=region, packet_bytes=packet_bytes & 0xFFFF
+                shot.image,
+                time_ns=shot.time_ns,
+                number=self._number,
+                region=(x, y, width, height),
+                packet_bytes=packet_bytes & 0xFFFF,
             )
             if faults.cut:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
@@ -297,9 +301,8 @@ class GigeCamera:
             if answer is not None or self._server is None:
                 return answer
             before = self._making
-            if before is None or triggered:
-                self._making = self._maker_thread.submit(self._make, exposure_ms)
-            making = self._making
+            making = self._maker_thread.submit(self._make, exposure_ms) if before is None or triggered else before
+            self._making = making
         if before is not None and before is not making:
             before.cancel()
         if not wait([making], timeout=_LONGEST_WAIT_S).done:

@@ -35,7 +35,7 @@ def examine_cameras() -> list[Finding]:
         advice = "\n".join(line.strip() for line in advice.strip().splitlines())
         return [Finding("Aravis", "warning", fault, f"only for GigE Vision and USB3 Vision cameras:\n{advice}")]
     findings = [Finding("Aravis", "ok", f"{library._name}, for GigE Vision and USB3 Vision cameras")]
-    answers: list[list[object]] = []
+    answers: list[Sequence[object]] = []
     # A daemon, so that a search that hangs in the library does not keep the program from ending.
     search = threading.Thread(target=lambda: answers.append(list_aravis_cameras()), daemon=True)
     search.start()
@@ -201,21 +201,17 @@ def try_stage(port: str) -> list[Finding]:
     """Ask a Grbl controller for its version, settings and state."""
     from uwlts.hardware.grbl_line import GrblLine, Message, Setting
 
-    line, failed = None, None
     try:
         line = GrblLine(port)
-        settings = {each.number: each.value for each in line.command("$$") if isinstance(each, Setting)}
-        built = [each.text for each in line.command("$I") if isinstance(each, Message)]
-        report, version = line.status(), line.version
-    except HardwareError as error:
-        failed = error
-    finally:
-        if line is not None:
-            try:
-                line.close(failed)
-            except HardwareError as error:
-                failed = error
-    if failed is not None:
+        try:
+            settings = {each.number: each.value for each in line.command("$$") if isinstance(each, Setting)}
+            built = [each.text for each in line.command("$I") if isinstance(each, Message)]
+            report, version = line.status(), line.version
+        except BaseException as error:
+            line.close(error)
+            raise
+        line.close()
+    except HardwareError as failed:
         advice = "see 'In case of trouble' in docs/hardware-stage.md"
         if "no permission" in str(failed):
             advice = "sudo usermod -aG dialout $USER\nthen log out and in again"

@@ -6,11 +6,13 @@ import socket
 import stat
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +25,7 @@ BUFFER_COMPLETE = 0
 _DOUBLES = [POINTER(c_double)] * 2
 _INTEGERS = [POINTER(c_int)] * 4
 # Result and arguments; a last argument for the error is added to all of them.
-_OF_CAMERA = {
+_OF_CAMERA: dict[str, tuple[Any, list[Any]]] = {
     "new": (c_void_p, [c_char_p]),
     "get_sensor_size": (None, [c_void_p, *_INTEGERS[:2]]),
     "get_vendor_name": (c_char_p, [c_void_p]),
@@ -55,7 +57,7 @@ for _feature in ("exposure_time", "gain", "frame_rate"):
         f"get_{_feature}": (c_double, [c_void_p]),
         f"set_{_feature}": (None, [c_void_p, c_double]),
     }
-_OTHERS = {
+_OTHERS: dict[str, tuple[Any, list[Any]]] = {
     "arv_update_device_list": (None, []),
     "arv_get_n_devices": (c_uint, []),
     "arv_get_device_id": (c_char_p, [c_uint]),
@@ -88,20 +90,24 @@ class AravisFunctions:
     """The library's functions as attributes, ready to be called."""
 
     def __init__(self, library: ctypes.CDLL):
-        table = dict(_OTHERS)
+        self._functions: dict[str, Callable[..., Any]] = {}
+        table: dict[str, tuple[Any, list[Any]]] = dict(_OTHERS)
         for name, (result, arguments) in _OF_CAMERA.items():
             table[f"arv_camera_{name}"] = (result, [*arguments, POINTER(POINTER(_GError))])
         for name, (result, arguments) in table.items():
             function = library[name]
             function.restype, function.argtypes = result, arguments
-            setattr(self, name, function)
+            self._functions[name] = function
         self._free_error = library["g_error_free"]
         self._free_error.restype, self._free_error.argtypes = None, [c_void_p]
 
-    def checked(self, name: str, *arguments: object) -> tuple[object, str | None]:
-        """Call a function of a camera; its result, and its complaint if it has one."""
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return self._functions[name]
+
+    def checked(self, name: str, *arguments: object) -> tuple[Any, str | None]:
+        """Call a function of a camera; its result, and the error message if there is one."""
         error = POINTER(_GError)()
-        result = getattr(self, name)(*arguments, byref(error))
+        result = self._functions[name](*arguments, byref(error))
         if not error:
             return result, None
         message = self.text(error.contents.message)
@@ -153,8 +159,10 @@ def list_aravis_cameras() -> list[FoundCamera]:
     parts = ("id", "serial_nbr", "address", "protocol")
     found = _served_on_loopback()
     for index in range(functions.arv_get_n_devices()):
-        texts = [functions.text(getattr(functions, f"arv_get_device_{part}")(index)) for part in parts]
-        found.append(FoundCamera(*texts))
+        identifier, serial, address, protocol = (
+            functions.text(getattr(functions, f"arv_get_device_{part}")(index)) for part in parts
+        )
+        found.append(FoundCamera(identifier, serial, address, protocol))
     return found
 
 
@@ -315,7 +323,8 @@ class AravisCamera(Camera):
             raise HardwareError(f"the camera {self.address} does not answer any more and cannot be stopped")
         self._call("stop_acquisition")
         stream, self._stream = self._stream, None
-        self._let_go([stream])
+        if stream is not None:
+            self._let_go([stream])
 
     def _trigger(self) -> None:
         self._call("software_trigger")
@@ -359,7 +368,7 @@ class AravisCamera(Camera):
         self._call(name, *map(ctypes.byref, numbers))
         return [number.value for number in numbers]
 
-    def _call(self, name: str, *arguments: object, of: str | None = "camera") -> object:
+    def _call(self, name: str, *arguments: object, of: str | None = "camera") -> Any:
         """Call ``arv_camera_NAME``; the library's complaint becomes a HardwareError."""
         receiver = () if of is None else (self._camera,)
         result, complaint = self._functions.checked(f"arv_camera_{name}", *receiver, *arguments)

@@ -298,8 +298,8 @@ class Camera(ABC):
         settings = self.settings
         if self._started:
             raise HardwareError(f"the camera {self.address} is running already")
-        free = settings.trigger == "free" and settings.frame_rate_hz is not None
-        self._check = FrameCheck(period_s=1 / settings.frame_rate_hz if free else None)
+        rate_hz = settings.frame_rate_hz if settings.trigger == "free" else None
+        self._check = FrameCheck(period_s=None if rate_hz is None else 1 / rate_hz)
         self._skip = faults == "skip"
         self._start()
         self._started = True
@@ -340,22 +340,22 @@ class Camera(ABC):
             status = self._check.judge(
                 frame_id=delivered.frame_id, time_s=delivered.time_s, complete=delivered.image is not None
             )
-            usable = delivered.image is not None and status is not FrameStatus.DUPLICATED
-            if status is FrameStatus.OK or (self._skip and usable):
-                return self._grabbed(delivered, status)
+            usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
+            if delivered.image is not None and usable:
+                return self._grabbed(delivered.image, delivered, status)
             if not self._skip:
                 raise HardwareError(f"frame {delivered.frame_id} of the camera {self.address} is {_MEANING[status]}")
 
-    def _grabbed(self, delivered: Delivered, status: FrameStatus) -> GrabbedFrame:
+    def _grabbed(self, image: np.ndarray, delivered: Delivered, status: FrameStatus) -> GrabbedFrame:
         region = self.settings.region
-        if delivered.image.shape != (region.height_px, region.width_px):
+        if image.shape != (region.height_px, region.width_px):
             raise HardwareError(
-                f"frame {delivered.frame_id} of the camera {self.address} has {delivered.image.shape[1]} x "
-                f"{delivered.image.shape[0]} px, expected {region.width_px} x {region.height_px} px"
+                f"frame {delivered.frame_id} of the camera {self.address} has {image.shape[1]} x "
+                f"{image.shape[0]} px, expected {region.width_px} x {region.height_px} px"
             )
         time_s = time.monotonic() if delivered.time_s is None else delivered.time_s
         exposure_ms = self.settings.exposure_ms if delivered.exposure_ms is None else delivered.exposure_ms
-        return GrabbedFrame(delivered.image, time_s, delivered.frame_id, exposure_ms, status)
+        return GrabbedFrame(image, time_s, delivered.frame_id, exposure_ms, status)
 
     def _no_frame(self, timeout_s: float) -> HardwareError:
         """The error of a frame that did not come; another HardwareError where the camera is gone altogether."""

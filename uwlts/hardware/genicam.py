@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -35,10 +36,11 @@ class GenicamCamera(Camera):
         super().__init__(address or f"genicam:{producer}" + (f":{serial}" if serial else ""))
         self._producer = Path(producer)
         self._serial = serial
-        self._harvester = None
-        self._acquirer = None
+        # harvesters comes without type information.
+        self._harvester: Any = None
+        self._open_acquirer: Any = None
         self._faults: tuple[type[BaseException], ...] = ()
-        self._timeout: type[BaseException]
+        self._timeout: type[BaseException] = BaseException
 
     def _open(self) -> CameraInfo:
         core, genapi, gentl = _libraries()
@@ -50,17 +52,17 @@ class GenicamCamera(Camera):
             )
         self._harvester = core.Harvester()
         try:
-            info = self._connect()
+            info = self._connect(self._harvester)
         except BaseException:
             self._close()
             raise
         return info
 
-    def _connect(self) -> CameraInfo:
-        self._harvester.add_file(str(self._producer))
+    def _connect(self, harvester: Any) -> CameraInfo:
+        harvester.add_file(str(self._producer))
         try:
-            self._harvester.update()
-            found = list(self._harvester.device_info_list)
+            harvester.update()
+            found = list(harvester.device_info_list)
             fitting = [each for each in found if self._serial in (None, each.serial_number)]
             if len(fitting) != 1:
                 listed = "".join(f"\n  genicam:{self._producer}:{each.serial_number} ({each.model})" for each in found)
@@ -69,7 +71,7 @@ class GenicamCamera(Camera):
                     f"Found:{listed or ' none; check power, cable, and that the file is a producer for this machine'}"
                 )
             with _own_interrupt():
-                self._acquirer = self._harvester.create(found.index(fitting[0]))
+                self._open_acquirer = harvester.create(found.index(fitting[0]))
             self._acquirer.num_buffers = _BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
             bits = _BITS.get(self._node("PixelFormat").value, 8)
@@ -77,8 +79,14 @@ class GenicamCamera(Camera):
             raise self._failed("opening it", error) from error
         return CameraInfo(f"{fitting[0].vendor} {fitting[0].model}", fitting[0].serial_number, width, height, bits)
 
+    @property
+    def _acquirer(self) -> Any:
+        if self._open_acquirer is None:
+            raise HardwareError(f"the camera {self.address} is not open: call open() first")
+        return self._open_acquirer
+
     def _close(self) -> None:
-        acquirer, self._acquirer = self._acquirer, None
+        acquirer, self._open_acquirer = self._open_acquirer, None
         harvester, self._harvester = self._harvester, None
         if acquirer is not None:
             acquirer.destroy()
@@ -169,7 +177,7 @@ class GenicamCamera(Camera):
         nodes = self._acquirer.remote_device.node_map
         return nodes.has_node(name) and nodes.get_node(name).get_access_mode() >= _WRITE_ONLY
 
-    def _node(self, name: str):
+    def _node(self, name: str) -> Any:
         return self._acquirer.remote_device.node_map.get_node(name)
 
     def _whole(self, side: str) -> int:
@@ -211,7 +219,7 @@ class GenicamCamera(Camera):
         finally:
             buffer.queue()
 
-    def _delivered(self, buffer) -> Delivered:
+    def _delivered(self, buffer: Any) -> Delivered:
         raw = buffer.module
         try:
             time_s = 1e-9 * raw.timestamp_ns

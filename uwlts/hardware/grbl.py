@@ -207,7 +207,7 @@ class GrblStage:
     def _position_of(self, report: Status) -> float:
         for _ in range(_REPORTS_TO_OFFSET):
             machine_mm = report.machine_mm
-            if machine_mm is None and self._line.offset_mm is not None:
+            if machine_mm is None and report.work_mm is not None and self._line.offset_mm is not None:
                 machine_mm = report.work_mm + self._line.offset_mm
             if machine_mm is not None:
                 # The report is rounded to 1 um; what the controller counts is steps.

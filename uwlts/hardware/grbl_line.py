@@ -120,7 +120,7 @@ def parse_reply(line: str) -> Reply:
 def _parse_status(body: str) -> Status | None:
     first, *rest = body.split("|")
     state = _STATE.match(first)
-    fields = dict(field.partition(":")[::2] for field in rest)
+    fields = {name: values for name, _, values in (field.partition(":") for field in rest)}
     positions = {name: fields[name] for name in ("MPos", "WPos", "WCO", "FS") if name in fields}
     if not state or ("MPos" in fields) == ("WPos" in fields):
         return None
@@ -259,7 +259,8 @@ class GrblLine:
     """
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
-        self.port, self.fault = port, None
+        self.port = port
+        self.fault: str | None = None
         self.messages: list[str] = []
         self.offset_mm: float | None = None
         self._received, self._unacknowledged = bytearray(), 0
@@ -267,7 +268,7 @@ class GrblLine:
         self._guard: subprocess.Popen[bytes] | None = None
         self._alive: int | None = None
         try:
-            _hang_up_on_close(self._serial.fd)
+            _hang_up_on_close(self._serial.fileno())
             self._start_guard()
             self.version = self._greeting(boot_s)
         except BaseException as error:
@@ -276,11 +277,12 @@ class GrblLine:
 
     def _start_guard(self) -> None:
         ending, self._alive = os.pipe()
+        descriptor = self._serial.fileno()
         command = [sys.executable, "-I", "-S", str(Path(laser_guard.__file__)), str(os.getpid()), str(ending)]
         try:
             # In a session of its own the terminal's Ctrl-C does not reach it.
             self._guard = subprocess.Popen(
-                [*command, str(self._serial.fd)], pass_fds=(ending, self._serial.fd), start_new_session=True,
+                [*command, str(descriptor)], pass_fds=(ending, descriptor), start_new_session=True,
                 stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
         except OSError as error:
@@ -515,7 +517,7 @@ def _open(port: str, baud: int) -> serial.Serial:
             errno.EACCES: "no permission; add yourself to the group dialout and log in again",
             errno.EBUSY: "another program uses it; close that program",
             errno.EAGAIN: "another program uses it; close that program",
-        }.get(error.errno, str(error))
+        }.get(error.errno or 0, str(error))
         raise HardwareError(f"cannot open {port}: {advice}") from error
 
 

@@ -45,7 +45,7 @@ class PageBeside:
 
     def _announce(self, process: "subprocess.Popen[str]") -> None:
         # The server's own banner comes first; what comes later must not fill the pipe.
-        for line in process.stdout:
+        for line in process.stdout or ():
             if line.startswith("open "):
                 self._say(f"{line.split(';')[0]}, while the scan runs")
 

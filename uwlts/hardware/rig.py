@@ -9,12 +9,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from uwlts.errors import HardwareError
 from uwlts.hardware.camera import Camera, GrabbedFrame
-from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.sensor import Sensor
 from uwlts.stripe import StripeStatus, extract_stripe
@@ -109,6 +109,32 @@ _PATIENCE_S = 3.0
 _RUN_UP_MM = 1.0
 
 
+class LaserStage(Protocol):
+    """What a rig needs of a stage and its laser; positions in mm."""
+
+    @property
+    def limits_mm(self) -> tuple[float, float]:
+        """Lowest and highest position."""
+        ...
+
+    @property
+    def laser_power(self) -> float:
+        """Power in force, 0 when the laser is off."""
+        ...
+
+    def position_mm(self) -> float:
+        """Position as it is read back."""
+        ...
+
+    def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
+        """Move, wait until the stage rests, and return the position read back."""
+        ...
+
+    def laser(self, on: bool, *, power: float = 1.0) -> None:
+        """Switch the laser."""
+        ...
+
+
 class Rig:
     """Takes the images of a plan one by one. The laser is on for its own images only.
 
@@ -118,7 +144,7 @@ class Rig:
         Images that were asked for again, as their frames were lost or damaged on their way.
     """
 
-    def __init__(self, plan: ScanPlan, sensor: Sensor, camera: Camera, stage: GrblStage):
+    def __init__(self, plan: ScanPlan, sensor: Sensor, camera: Camera, stage: LaserStage):
         self._plan, self._bits, self._camera, self._stage = plan, sensor.detector.bits, camera, stage
         self._settle_s = sensor.stage.settling_s if plan.stage.settle_s is None else plan.stage.settle_s
         self._position_mm: float | None = None

@@ -38,7 +38,8 @@ class StagePlan(Description):
         length = float(np.linalg.norm(value))
         if length < 1e-9:
             raise ValueError(f"direction {value} has no length")
-        return tuple(float(x) / length for x in value)
+        x, y, z = value
+        return x / length, y / length, z / length
 
     def positions_mm(self) -> list[float]:
         """All positions in their order."""

@@ -73,7 +73,7 @@ class LaserWatch:
         self, rig: Rig, sensor: Sensor, positions_mm: Sequence[float], *, difference: bool, lit: LitPlace | None = None
     ):
         self._rig, self._sensor, self._difference = rig, sensor, difference
-        self._positions_mm, self._lit = positions_mm, lit
+        self._positions_mm, self.lit = positions_mm, lit
         self._usual: tuple[int, float] | None = None
         self._without = 0
 
@@ -104,11 +104,11 @@ class LaserWatch:
                 if last or self._without % _AGAIN == 1:
                     self._look_elsewhere(place)
                 return
-        self._usual, self._lit, self._without = now, place, 0
+        self._usual, self.lit, self._without = now, place, 0
 
     def _look_elsewhere(self, here: LitPlace) -> None:
         """See the stripe where it was, or somewhere; HardwareError where it is not."""
-        wanted = [self._lit] if self._lit else [
+        wanted = [self.lit] if self.lit else [
             LitPlace(position, here.exposure_ms)
             for position in spread(self._positions_mm, LOOKS) if position != here.position_mm
         ]  # fmt: skip
@@ -116,15 +116,15 @@ class LaserWatch:
             self._rig.move_to(place.position_mm)
             lit, unlit = (self._rig.image(light, place.exposure_ms)[0] for light in ("laser", "lamp"))
             if shows_laser(lit, unlit, self._sensor, difference=self._difference):
-                self._lit = place
+                self.lit = place
                 self._rig.move_to(here.position_mm)
                 return
-        if self._lit is None:
+        if self.lit is None:
             raise no_light(self._positions_mm, here.exposure_ms)
         passed = self._without - 1
         also = f"; the {passed} images before this one were without a stripe too" if passed else ""
         raise HardwareError(
-            f"the laser has failed: at {self._lit.position_mm:g} mm, where its stripe was seen before, images with the "
+            f"the laser has failed: at {self.lit.position_mm:g} mm, where its stripe was seen before, images with the "
             f"laser on and off show the same{also}. Check its supply, key and interlock, then go on with --resume"
         )
 

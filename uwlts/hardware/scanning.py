@@ -7,7 +7,9 @@ laser is on for its own images only; the stage's driver switches it off however 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -82,8 +84,8 @@ class Seen:
 
 def shots_of(plan: ScanPlan) -> list[Shot]:
     """All images of a plan in their order."""
-    pairs = [(position, light) for position in plan.stage.positions_mm() for light in plan.lights]
-    return [Shot(number, position, light) for number, (position, light) in enumerate(pairs)]
+    pairs = enumerate(product(plan.stage.positions_mm(), plan.lights))
+    return [Shot(number, position, light) for number, (position, light) in pairs]
 
 
 def record_scan(
@@ -176,18 +178,19 @@ class _Taking:
     def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: Seen, warn: Callable[[str], None]):
         self._plan, self._sensor, self._rig, self._seen, self._warn = plan, sensor, rig, seen, warn
         self._positions_mm = plan.stage.positions_mm()
-        self._lit: LitPlace | None = None
-        self._watch: LaserWatch | None = None
+        self._watch = LaserWatch(rig, sensor, self._positions_mm, difference=plan.background)
         self._slip = SlipWatch()
 
     def settle_exposures(self) -> None:
         """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
-        exposures, missing = self._seen.exposure_ms, []
+        exposures: dict[Light, float] = self._seen.exposure_ms
+        missing: list[Light] = []
         for light in dict.fromkeys(self._plan.lights):
-            if light not in exposures and self._planned(light) == "auto":
+            planned = self._planned(light)
+            if light not in exposures and planned == "auto":
                 missing.append(light)
-            elif light not in exposures:
-                exposures[light] = self._planned(light)
+            elif light not in exposures and planned != "auto":
+                exposures[light] = planned
         looked = spread(self._positions_mm, _EXPOSED_AT)
         further = [position for position in spread(self._positions_mm, LOOKS) if position not in looked]
         for position in looked + further if missing else ():
@@ -202,11 +205,8 @@ class _Taking:
                 if light == "laser":
                     raise no_light(self._positions_mm, longest_ms)
                 exposures[light] = longest_ms
-        self._watch = LaserWatch(
-            self._rig, self._sensor, self._positions_mm, difference=self._plan.background, lit=self._lit
-        )
 
-    def _planned(self, light: Light) -> float | str:
+    def _planned(self, light: Light) -> float | Literal["auto"]:
         return self._plan.laser_ms if light == "laser" else self._plan.lamp_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
@@ -224,7 +224,7 @@ class _Taking:
             lit, unlit = (self._rig.image(each, exposure_ms)[0] for each in ("laser", "lamp"))
             if not shows_laser(lit, unlit, self._sensor, difference=self._plan.background):
                 return
-            self._lit = LitPlace(position_mm, exposure_ms)
+            self._watch.lit = LitPlace(position_mm, exposure_ms)
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
     def _settled(self, light: Light) -> float | None:

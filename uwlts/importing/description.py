@@ -138,6 +138,8 @@ def capture_header(
                 "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
             )
         direction = (1.0, 0.0, 0.0)
+    if told.medium is None:
+        raise DescriptionError("medium is missing: a capture states the medium in which the sensor was used")
     if told.target is not None:
         parse_target(told.target)
     if told.artefact is not None:

@@ -196,7 +196,8 @@ def import_folder(
             f"saturation_dn is {header.saturation_dn - zero}; images of {first.dtype} have no such value"
         )
     content = Content(header.sensor, header.saturation_dn - zero, header.target is not None)
-    _write(out, header, frames, reader, content, zero_dn=zero, overwrite=overwrite, progress=progress)
+    dtype = np.dtype(np.uint16) if zero else first.dtype
+    _write(out, header, frames, reader, content, zero_dn=zero, dtype=dtype, overwrite=overwrite, progress=progress)
     return Imported(len(matched.laser), len(matched.lamp), (*content.verdict(), *_unmatched(matched)))
 
 
@@ -222,7 +223,7 @@ class _Reader:
     def __init__(self, told: ImportDescription, sensor: Sensor, folder: Path):
         self._told, self._sensor, self._folder = told, sensor, folder
         self.dtype: np.dtype | None = None
-        self._kept: tuple[Path | None, np.ndarray | None] = None, None
+        self._kept: tuple[Path, np.ndarray] | None = None
 
     def image(self, path: Path, *, laser_on: bool) -> tuple[np.ndarray, int]:
         """Grey image (H, W) and its bits; ImageError where it is not like the others."""
@@ -240,16 +241,15 @@ class _Reader:
 
     def background(self, path: Path) -> np.ndarray:
         """Grey image (H, W) without laser, in the laser's channel."""
-        if self._kept[0] != path:
+        if self._kept is None or self._kept[0] != path:
             self._kept = path, self.image(path, laser_on=True)[0]
         return self._kept[1]
 
 
 def _write(
     out: Path, header: CaptureHeader, frames: list[PlannedFrame], reader: _Reader, content: Content, *,
-    zero_dn: int, overwrite: bool, progress: Callable[[int, int], None],
+    zero_dn: int, dtype: np.dtype, overwrite: bool, progress: Callable[[int, int], None],
 ) -> None:  # fmt: skip
-    dtype = np.dtype(np.uint16) if zero_dn else reader.dtype
     writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
     try:
         with writer:

@@ -110,10 +110,11 @@ def match(folder: Path, told: ImportDescription, rows: list[Row] | None) -> Matc
         missing = [row.file for row in rows if not (folder / row.file).is_file()]
         if missing:
             raise DescriptionError(f"the table names {', '.join(missing[:3])}, which {folder} does not hold")
-    by_column = rows is not None and any(row.light is not None for row in rows)
-    if by_column and (told.laser or told.lamp):
-        raise DescriptionError("the table has a column light, and there are patterns laser or lamp: give one of them")
-    if by_column:
+    if rows is not None and any(row.light is not None for row in rows):
+        if told.laser or told.lamp:
+            raise DescriptionError(
+                "the table has a column light, and there are patterns laser or lamp: give one of them"
+            )
         dark = [row.file for row in rows if row.light is None]
         if dark:
             raise DescriptionError(f"the table does not tell the light of {', '.join(dark[:3])}: laser, lamp or ignore")
@@ -285,9 +286,10 @@ def _positions(told: ImportDescription, matched: Matched) -> list[float] | None:
         )
     if stage.positions_mm is not None:
         return list(stage.positions_mm)
-    if stage.free:
-        return [float(place) for place in range(count)]
-    return [stage.start_mm + place * stage.step_mm for place in range(count)]
+    if stage.start_mm is not None and stage.step_mm is not None:
+        return [stage.start_mm + place * stage.step_mm for place in range(count)]
+    # Free poses have no positions; they are numbered.
+    return [float(place) for place in range(count)]
 
 
 def _own(row: Row) -> float:

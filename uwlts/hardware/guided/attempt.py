@@ -1,7 +1,8 @@
-"""The images of a guided calibration: lamp and laser, with exposures that are settled when they are first needed."""
+"""Images of a guided calibration and attempts at poses of the target: taken, judged, accepted or refused."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class GuidedImages:
 
     def __init__(self, rig: Rig, plan: ScanPlan, sensor: Sensor, *, dtype: np.dtype, known_ms: dict[Light, float]):
         self._rig, self._sensor, self._dtype = rig, sensor, dtype
-        self._planned = {"lamp": plan.lamp_ms, "laser": plan.laser_ms}
+        self._planned: dict[Light, float | Literal["auto"]] = {"lamp": plan.lamp_ms, "laser": plan.laser_ms}
         self._exposure_ms: dict[Light, float] = dict(known_ms)
 
     def move_to(self, position_mm: float) -> float:
@@ -80,35 +81,48 @@ _STAGE_CHANGE_PX = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A lamp image (H, W) with what it shows: the target, or None and the reasons."""
+    """A lamp image (H, W) with the target in it, None where there is none, and the reasons why it is of no use."""
 
     image: np.ndarray
     view: TargetView | None
     quality: TargetQuality | None
     reasons: tuple[str, ...]
 
+    @property
+    def usable(self) -> TargetView | None:
+        """The target, None where there is a reason against it."""
+        return None if self.reasons else self.view
+
 
 @dataclass(frozen=True, eq=False)
-class Attempt:
-    """What became of an attempt.
-
-    ``reasons`` are why it was refused, empty if it was not; then ``pose`` is to be recorded, with its lamp image and,
-    if the laser line was on the target, its laser image, each (H, W) with its exposure in ms, and ``state`` is how far
-    the calibration has come with it.
-    """
+class Refused:
+    """An attempt at a pose that is not to be recorded, and why."""
 
     found: Found
     reasons: tuple[str, ...]
-    pose: RecordedPose | None = None
-    lamp: tuple[np.ndarray, float] | None = None
-    laser: tuple[np.ndarray, float] | None = None
-    state: State | None = None
+
+    def line(self) -> str:
+        """The reasons in a line."""
+        return f"refused: {'; '.join(self.reasons)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Accepted:
+    """A pose to be recorded, and the ``state`` of the calibration with it.
+
+    ``lamp`` and, if the laser line was on the target, ``laser`` are the images (H, W) with their exposures in ms.
+    """
+
+    found: Found
+    quality: TargetQuality
+    pose: RecordedPose
+    lamp: tuple[np.ndarray, float]
+    laser: tuple[np.ndarray, float] | None
+    state: State
 
     def line(self) -> str:
         """Quality in a line."""
-        if self.reasons:
-            return f"refused: {'; '.join(self.reasons)}"
-        quality, state = self.found.quality, self.state
+        quality, state = self.quality, self.state
         stripe = f"stripe on {len(self.pose.stripe)} lines" if self.laser else "no stripe on the target"
         residual = "not yet" if state.solution is None else f"{state.solution.image_rms_px()[-1]:.2f} px"
         return (
@@ -117,8 +131,11 @@ class Attempt:
         )
 
 
-class Attempts:
-    """Takes and judges poses.
+Attempt = Refused | Accepted
+
+
+class PoseJudge:
+    """Judges images of the target, taken now or read from a recording.
 
     Parameters
     ----------
@@ -126,14 +143,10 @@ class Attempts:
         Grey value at which pixels clip.
     """
 
-    def __init__(self, images: GuidedImages, setting: Setting, wanted: Wanted, *, full_dn: int):
-        self._images, self._setting, self._wanted, self._full = images, setting, wanted, full_dn
+    def __init__(self, setting: Setting, wanted: Wanted, *, full_dn: int):
+        self._setting, self._wanted, self._full = setting, wanted, full_dn
         limits = QualityLimits()
         self.limits = limits if setting.poses == "free" else replace(limits, smallest_change_px=_STAGE_CHANGE_PX)
-
-    def look(self) -> Found:
-        """What the lamp shows now."""
-        return self.find(self._images.take("lamp")[0])
 
     def find(self, image: np.ndarray) -> Found:
         """The target in a lamp image (H, W), judged."""
@@ -151,23 +164,6 @@ class Attempts:
             full_dn=self._full, limits=self.limits,
         )  # fmt: skip
 
-    def attempt(self, before: State, stage_mm: float) -> Attempt:
-        """Take the target as it stands, to be the next pose after those of ``before``."""
-        lamp, lamp_ms = self._images.take("lamp")
-        found = self.find(lamp)
-        reasons = found.reasons or judge_novelty(found.view, [p.view for p in before.recorded], self.limits)
-        if reasons:
-            return Attempt(found, reasons)
-        laser, stripe = self._laser(found.view)
-        after = self.look()
-        reasons = after.reasons or judge_motion(found.view, after.view, self.limits)
-        if reasons or stripe.reasons:
-            return Attempt(found, (*reasons, *stripe.reasons))
-        shown = stripe.lines >= self.limits.fewest_lines
-        pose = RecordedPose(found.view, stripe.pixels if shown else np.empty((0, 2)), stage_mm)
-        state, reasons = self.with_pose(before, pose)
-        return Attempt(found, reasons, pose, (lamp, lamp_ms), laser if shown else None, state)
-
     def with_pose(self, before: State, pose: RecordedPose) -> tuple[State | None, tuple[str, ...]]:
         """How far one more pose leads, and why it does not fit the others."""
         try:
@@ -180,13 +176,46 @@ class Attempts:
         """How far recorded poses lead; errors as `state_of`."""
         return state_of(recorded, self._setting, self._wanted)
 
+
+class Attempts:
+    """Takes poses and judges them."""
+
+    def __init__(self, images: GuidedImages, judge: PoseJudge):
+        self._images, self._judge = images, judge
+        self.limits = judge.limits
+
+    def look(self) -> Found:
+        """The target in a lamp image taken now."""
+        return self._judge.find(self._images.take("lamp")[0])
+
+    def attempt(self, before: State, stage_mm: float) -> Attempt:
+        """Take the target as it stands, to be the next pose after those of ``before``."""
+        lamp, lamp_ms = self._images.take("lamp")
+        found = self._judge.find(lamp)
+        view, quality = found.usable, found.quality
+        if view is None or quality is None:
+            return Refused(found, found.reasons)
+        if reasons := judge_novelty(view, [p.view for p in before.recorded], self.limits):
+            return Refused(found, reasons)
+        laser, stripe = self._laser(view)
+        after = self.look()
+        reasons = after.reasons if after.usable is None else judge_motion(view, after.usable, self.limits)
+        if reasons or stripe.reasons:
+            return Refused(found, (*reasons, *stripe.reasons))
+        shown = stripe.lines >= self.limits.fewest_lines
+        pose = RecordedPose(view, stripe.pixels if shown else np.empty((0, 2)), stage_mm)
+        state, reasons = self._judge.with_pose(before, pose)
+        if state is None or reasons:
+            return Refused(found, reasons)
+        return Accepted(found, quality, pose, (lamp, lamp_ms), laser if shown else None, state)
+
     def _laser(self, view: TargetView) -> tuple[tuple[np.ndarray, float], StripeQuality]:
-        """Laser image with its exposure, taken anew with another exposure if the stripe is saturated."""
+        """Laser image with its exposure, taken again with another exposure if the stripe is saturated."""
         laser = self._images.take("laser")
-        stripe = self.stripe(laser[0], view)
+        stripe = self._judge.stripe(laser[0], view)
         if stripe.reasons and self._images.resettle("laser"):
             laser = self._images.take("laser")
-            stripe = self.stripe(laser[0], view)
+            stripe = self._judge.stripe(laser[0], view)
         return laser, stripe
 
 

@@ -1,4 +1,4 @@
-"""Whoever stands at the tank: told by lines of text, answers by Enter in the terminal or by the button of the page."""
+"""The operator of a guided calibration: lines of text, answers by Enter or the page's button, and the page."""
 
 import os
 import select
@@ -70,7 +70,6 @@ class HandSwitchedLaser:
     """In place of a stage where there is none: the operator switches the laser, and nothing moves."""
 
     limits_mm = (-float("inf"), float("inf"))
-    version = "none"
 
     def __init__(self, operator: Operator):
         self._operator = operator

@@ -1,4 +1,4 @@
-"""The target's part of a guided calibration: at the stage's positions, or wherever the operator is led to hold it."""
+"""Phases of a guided calibration: the target at the stage's positions or held by hand, then the step standard."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -11,9 +11,9 @@ from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, lea
 from uwlts.calibration.guidance.wishes import State, Wish, best_wish, gain_of, missing, missing_sheet, wish_words
 from uwlts.calibration.model import Calibration, WindowModel
 from uwlts.capture import Capture, CaptureWriter, Frame
-from uwlts.hardware.guided.attempt import Attempt, Attempts, Found, GuidedImages
+from uwlts.hardware.guided.attempt import Accepted, Attempt, Attempts, Found, GuidedImages, PoseJudge, Refused
 from uwlts.hardware.guided.operator import GuidedPage, Operator
-from uwlts.hardware.guided.plan import GuidedPlan
+from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
 from uwlts.metrology.artefact_descriptions import StepStandard
 from uwlts.sensor import Sensor
 from uwlts.targets import TargetView
@@ -27,15 +27,15 @@ _USEFUL = 0.25
 _RESETTLE_S = 2.0
 
 
-def recorded_poses(capture: Capture, attempts: Attempts) -> list[RecordedPose]:
+def recorded_poses(capture: Capture, judge: PoseJudge) -> list[RecordedPose]:
     """The poses that a capture of the target holds, as they were judged when they were taken."""
     stripes = {float(capture.stage_mm[k]): image for k, image in capture.frames(laser_on=True)}
     poses = []
     for frame, image in capture.frames(laser_on=False):
-        view, stage_mm = attempts.find(image).view, float(capture.stage_mm[frame])
+        view, stage_mm = judge.find(image).view, float(capture.stage_mm[frame])
         if view is not None:
             shown = stage_mm in stripes
-            stripe = attempts.stripe(stripes[stage_mm], view).pixels if shown else np.empty((0, 2))
+            stripe = judge.stripe(stripes[stage_mm], view).pixels if shown else np.empty((0, 2))
             poses.append(RecordedPose(view, stripe, stage_mm))
     return poses
 
@@ -101,11 +101,11 @@ class TargetPhase:
             for _ in range(_TRIES):
                 attempt = self._attempts.attempt(state, position)
                 state = self._done(attempt, state, f"{position:.2f} mm")
-                if not attempt.reasons or not self._can_change(attempt):
+                if isinstance(attempt, Accepted) or not self._can_change(attempt):
                     break
         return state
 
-    def _can_change(self, attempt: Attempt) -> bool:
+    def _can_change(self, attempt: Refused) -> bool:
         """Whether another attempt at the same place may be better: another exposure, or a target come to rest."""
         if any(reason.startswith("moved") for reason in attempt.reasons):
             return True
@@ -113,10 +113,11 @@ class TargetPhase:
 
     def _free(self, state: State) -> State:
         watch = _Watch(self._plan.still_s, self._clock)
-        wish, refused = None, []
+        wish: Wish | None = None
+        refused: list[TargetView] = []
         while still_missing(state) and len(state.recorded) < self._plan.most_images:
             found = self._attempts.look()
-            wish = wish or best_wish(state, spin_rad=_spin(None if found.reasons else found.view, state))
+            wish = wish or best_wish(state, spin_rad=_spin(found.usable, state))
             answer = self._operator.answer()
             if answer == "done":
                 break
@@ -129,10 +130,10 @@ class TargetPhase:
             attempt = self._attempts.attempt(state, _NUMBER_MM * self._next_number(state))
             state = self._done(attempt, state, f"image {len(state.recorded) + 1}")
             watch.see(None)
-            if attempt.reasons:
-                refused = [attempt.found.view] if attempt.found.view is not None else []
-            else:
+            if isinstance(attempt, Accepted):
                 wish = None
+            else:
+                refused = [] if attempt.found.view is None else [attempt.found.view]
         return state
 
     def _next_number(self, state: State) -> int:
@@ -140,15 +141,18 @@ class TargetPhase:
 
     def _why_wait(self, found: Found, state: State, wish: Wish | None, known: list[TargetView]) -> tuple[str, ...]:
         """Why the target as it stands need not be taken."""
-        reasons = found.reasons or judge_novelty(found.view, known, self._attempts.limits)
+        view = found.usable
+        if view is None:
+            return found.reasons
+        reasons = judge_novelty(view, known, self._attempts.limits)
         if reasons or wish is None or missing_sheet(state):
             return reasons
-        gain = gain_of(state, found.view, pose_of(found.view, state.camera))
+        gain = gain_of(state, view, pose_of(view, state.camera))
         return () if gain >= _USEFUL * wish.gain else ("adds little to what there is",)
 
     def _lead(self, found: Found, state: State, wish: Wish | None, reasons: tuple[str, ...]) -> None:
         """Show the image, and say what to do next."""
-        pose = None if found.reasons else pose_of(found.view, state.camera)
+        pose = None if found.usable is None else pose_of(found.usable, state.camera)
         sheet = missing_sheet(state)
         words = "move the target" if wish is None else wish_words(wish, state, pose)
         if sheet and not missing(state):
@@ -172,13 +176,13 @@ class TargetPhase:
 
     def _done(self, attempt: Attempt, state: State, name: str) -> State:
         """Record what was accepted, and say what became of it; the state after it."""
-        if not attempt.reasons:
+        stripe = None
+        if isinstance(attempt, Accepted):
             self._record(attempt)
-            state = attempt.state
+            state, stripe = attempt.state, attempt.pose.stripe
         line = f"{name}: {attempt.line()}"
         self._operator.say(line)
         self._page.add(line)
-        stripe = attempt.pose.stripe if attempt.pose else None
         points = attempt.found.view.pixels if attempt.found.view is not None else None
         self._page.live(
             attempt.found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=stripe, remark=line
@@ -186,7 +190,7 @@ class TargetPhase:
         self._show_state(state)
         return state
 
-    def _record(self, attempt: Attempt) -> None:
+    def _record(self, attempt: Accepted) -> None:
         stage_mm = attempt.pose.stage_mm
         for taken, laser_on in ((attempt.lamp, False), (attempt.laser, True)):
             if taken is not None:
@@ -231,11 +235,11 @@ def _spin(view: TargetView | None, state: State) -> float:
 class StepJudge:
     """Judges laser images of the standard by the calibration in air and the nominal window."""
 
-    def __init__(self, plan: GuidedPlan, sensor: Sensor, calibration: Calibration, window: WindowModel):
+    def __init__(self, step: GuidedStep, sensor: Sensor, calibration: Calibration, window: WindowModel):
         self.sensor = sensor
         self._calibration, self._window = calibration, window
-        self._standard = StepStandard.model_validate(plan.step.artefact())
-        self._index = sensor.medium(plan.step.medium).refractive_index(sensor.laser.wavelength_nm)
+        self._standard = StepStandard.model_validate(step.artefact())
+        self._index = sensor.medium(step.medium).refractive_index(sensor.laser.wavelength_nm)
 
     def judge(self, image: np.ndarray) -> StepQuality:
         """What an image (H, W) shows."""
@@ -247,7 +251,7 @@ class StepJudge:
     def depths_mm(self, capture: Capture) -> list[float]:
         """Depths outside the window at which a recording shows the standard."""
         qualities = [self.judge(image) for _, image in capture.frames(laser_on=True)]
-        return [quality.depth_mm for quality in qualities if not quality.reasons]
+        return [each.depth_mm for each in qualities if each.depth_mm is not None and not each.reasons]
 
 
 class StepPhase:
@@ -255,7 +259,7 @@ class StepPhase:
 
     def __init__(
         self,
-        plan: GuidedPlan,
+        step: GuidedStep,
         judge: StepJudge,
         *,
         images: GuidedImages,
@@ -264,7 +268,7 @@ class StepPhase:
         writer: CaptureWriter,
         before_s: float,
     ):
-        self._plan, self._judge, self._images = plan, judge, images
+        self._step, self._judge, self._images = step, judge, images
         self._operator, self._page, self._writer = operator, page, writer
         self._start_s = time.monotonic() - before_s
 
@@ -278,7 +282,7 @@ class StepPhase:
             if answer == "done":
                 break
             before = tuple(seen)
-            for position in self._plan.step.positions_mm or (None,):
+            for position in self._step.positions_mm or (None,):
                 taken = self._take(position, before)
                 seen += [] if taken is None else [taken]
         return seen
@@ -301,12 +305,14 @@ class StepPhase:
             quality = self._judge.judge(image)
         # Whoever moves the standard must not have the laser before him.
         self._images.unlit()
-        reasons = quality.reasons or self._why_not_here(quality.depth_mm, before_mm)
+        depth_mm, reasons = quality.depth_mm, quality.reasons
+        if depth_mm is not None and not reasons:
+            reasons = self._why_not_here(depth_mm, before_mm)
         self._tell(image, quality, reasons)
-        if reasons:
+        if reasons or depth_mm is None:
             return None
         self._writer.append(Frame(image, stage_mm, True, exposure_ms, time.monotonic() - self._start_s))
-        return quality.depth_mm
+        return depth_mm
 
     def _why_not_here(self, depth_mm: float, before_mm: Sequence[float]) -> tuple[str, ...]:
         if is_new(depth_mm, before_mm, self._judge.sensor):

@@ -46,7 +46,7 @@ class GuidedStage(Description):
 
     def places_mm(self) -> list[float]:
         """All positions in their order; empty where none are told."""
-        if self.first_mm is None:
+        if self.first_mm is None or self.last_mm is None:
             return list(self.positions_mm)
         return np.linspace(self.first_mm, self.last_mm, self.count).tolist()
 
@@ -164,12 +164,10 @@ class GuidedPlan(Description):
         direction = (0.0, 0.0, 1.0) if self.stage is None else self.stage.direction
         return self._header(name, setting.sensor, self.medium, direction, provenance, target=self.target)
 
-    def step_header(self, name: str, *, provenance: dict[str, Any]) -> CaptureHeader:
+    def step_header(self, name: str, step: GuidedStep, *, provenance: dict[str, Any]) -> CaptureHeader:
         """Header of the capture of the step standard; DescriptionError where sensor or medium are not valid."""
-        return self._header(
-            name, self.described_sensor(), self.step.medium, self.step.direction, provenance,
-            artefact=self.step.artefact(),
-        )  # fmt: skip
+        sensor = self.described_sensor()
+        return self._header(name, sensor, step.medium, step.direction, provenance, artefact=step.artefact())
 
     def _header(
         self, name: str, sensor: Sensor, medium: str, direction: Vector, provenance: dict[str, Any], **shown: Any

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 import uwlts
-from uwlts.calibration.guidance.solution import Setting
+from uwlts.calibration.guidance.solution import RecordedPose, Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
 from uwlts.calibration.guidance.wishes import State
 from uwlts.calibration.intrinsics import CameraOptions
@@ -23,10 +23,10 @@ from uwlts.capture import Capture, CaptureHeader, CaptureWriter, part_path
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.attempt import Attempts, GuidedImages
+from uwlts.hardware.guided.attempt import Attempts, GuidedImages, PoseJudge
 from uwlts.hardware.guided.operator import GuidedPage, HandSwitchedLaser, Operator
 from uwlts.hardware.guided.phases import StepJudge, StepPhase, TargetPhase, places_left, recorded_poses, still_missing
-from uwlts.hardware.guided.plan import GuidedPlan, check_positions
+from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep, check_positions
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light
 from uwlts.hardware.scanning import check_camera
@@ -92,7 +92,8 @@ def record_guided(
         raise DescriptionError("neither the plan nor the command line tells the stage's port: give --stage")
     camera = camera or CameraOptions()
     setting = replace(plan.setting(), camera=camera)
-    phase = _Phases(plan, setting, page, operator, resume, overwrite)
+    port = None if plan.stage is None else plan.stage.port
+    phase = _Phases(plan, setting, plan.camera, port, page, operator, resume, overwrite)
     state = phase.target(target_path(out))
     if plan.step is None:
         return GuidedRecording(target_path(out), None, tuple(still_missing(state)))
@@ -101,7 +102,7 @@ def record_guided(
         in_air = calibrate([capture], (), options=options).calibration
     sensor = plan.described_sensor()
     window = nominal_window(sensor.camera.window, sensor, refractions=refractions)
-    unseen = phase.step(step_path(out), StepJudge(plan, sensor, in_air, window))
+    unseen = phase.step(step_path(out), plan.step, StepJudge(plan.step, sensor, in_air, window))
     return GuidedRecording(target_path(out), step_path(out), (*still_missing(state), *unseen))
 
 
@@ -111,6 +112,8 @@ class _Phases:
 
     plan: GuidedPlan
     setting: Setting
+    camera: str
+    port: str | None
     page: GuidedPage
     operator: Operator
     resume: bool
@@ -118,23 +121,23 @@ class _Phases:
 
     def target(self, path: Path) -> State:
         """Record the target; how far that leads."""
-        full = self.setting.sensor.detector.full_scale_dn()
+        judge = PoseJudge(self.setting, self.plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
         if self.resume and path.is_file() and not part_path(path).exists():
-            done = Attempts(None, self.setting, self.plan.goal(), full_dn=full)
             with Capture(path) as capture:
-                state = done.state(recorded_poses(capture, done))
+                state = judge.state(recorded_poses(capture, judge))
             if not self._to_go_on(state):
                 self.operator.say(f"{path.name} is complete: {len(state.recorded)} poses")
                 return state
             os.replace(path, part_path(path))
-        positions = [] if self.plan.poses == "free" else self.plan.stage.places_mm()
+        stage = self.plan.stage
+        positions = [] if self.plan.poses == "free" or stage is None else stage.places_mm()
         with self._opened(self.plan.medium, positions) as (rig, provenance, dtype):
             header = self.plan.target_header(path.stem, provenance=provenance)
             known, before_s = _left_over(path) if self.resume else ({}, 0.0)
             scan = self.plan.scan_plan(medium=self.plan.medium, positions_mm=positions)
             images = GuidedImages(rig, scan, self.setting.sensor, dtype=dtype, known_ms=known)
-            attempts = Attempts(images, self.setting, self.plan.goal(), full_dn=full)
-            state = attempts.state(self._before(path, attempts))
+            attempts = Attempts(images, judge)
+            state = judge.state(self._before(path, judge))
             with self._writer(path, header, dtype) as writer:
                 phase = TargetPhase(
                     self.plan, self.setting, images=images, attempts=attempts, operator=self.operator, page=self.page,
@@ -148,15 +151,15 @@ class _Phases:
             return bool(still_missing(state)) and len(state.recorded) < self.plan.most_images
         return bool(places_left(self.plan, state))
 
-    def _before(self, path: Path, attempts: Attempts) -> list[Any]:
+    def _before(self, path: Path, judge: PoseJudge) -> list[RecordedPose]:
         if not (self.resume and part_path(path).exists()):
             return []
         with Capture(part_path(path)) as capture:
-            return recorded_poses(capture, attempts)
+            return recorded_poses(capture, judge)
 
-    def step(self, path: Path, judge: StepJudge) -> list[str]:
+    def step(self, path: Path, step: GuidedStep, judge: StepJudge) -> list[str]:
         """Record the step standard; what is missing of it."""
-        plan, seen = self.plan.step, []
+        seen: list[float] = []
         if self.resume:
             left = part_path(path) if part_path(path).exists() else path
             if left.is_file():
@@ -167,17 +170,17 @@ class _Phases:
                     self.operator.say(f"{path.name} is complete")
                     return []
                 os.replace(path, part_path(path))
-        request = f"bring the sensor into {plan.medium}, with its window, and the step standard before it"
+        request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
         self.page.request(request)
         self.operator.wait(request)
-        with self._opened(plan.medium, list(plan.positions_mm)) as (rig, provenance, dtype):
-            header = self.plan.step_header(path.stem, provenance=provenance)
+        with self._opened(step.medium, list(step.positions_mm)) as (rig, provenance, dtype):
+            header = self.plan.step_header(path.stem, step, provenance=provenance)
             known, before_s = _left_over(path) if self.resume else ({}, 0.0)
-            scan = self.plan.scan_plan(medium=plan.medium, positions_mm=list(plan.positions_mm))
+            scan = self.plan.scan_plan(medium=step.medium, positions_mm=list(step.positions_mm))
             images = GuidedImages(rig, scan, judge.sensor, dtype=dtype, known_ms=known)
             with self._writer(path, header, dtype) as writer:
                 phase = StepPhase(
-                    self.plan, judge, images=images, operator=self.operator, page=self.page, writer=writer,
+                    step, judge, images=images, operator=self.operator, page=self.page, writer=writer,
                     before_s=before_s,
                 )  # fmt: skip
                 seen = phase.run(seen)
@@ -191,12 +194,12 @@ class _Phases:
     def _opened(self, medium: str, positions_mm: list[float]) -> Iterator[tuple[Rig, dict[str, Any], np.dtype]]:
         """Camera and stage, ready to take images, with what captures tell of them."""
         sensor = self.setting.sensor
-        with self._stage(positions_mm) as stage, open_camera(self.plan.camera) as camera:
+        with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
             check_camera(camera, sensor)
             provenance = {
                 "source": "guided calibration", "title": self.plan.title,
                 "camera": f"{camera.info.name} {camera.info.serial}".strip(),
-                "stage": "none" if self.plan.stage is None else f"Grbl {stage.version}",
+                "stage": f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none",
                 "laser_power": self.plan.laser_power, "uwlts": uwlts.__version__,
             }  # fmt: skip
             dtype = np.dtype(np.uint16) if camera.info.bits > 8 else np.dtype(np.uint8)
@@ -206,10 +209,10 @@ class _Phases:
     @contextmanager
     def _stage(self, positions_mm: list[float]) -> Iterator[GrblStage | HandSwitchedLaser]:
         told = self.plan.stage
-        if told is None:
+        if told is None or self.port is None:
             yield HandSwitchedLaser(self.operator)
             return
-        with GrblStage(told.port) as stage:
+        with GrblStage(self.port) as stage:
             check_positions(positions_mm, limits_mm=stage.limits_mm)
             fastest = stage.settings.max_feed_mm_per_min
             if told.feed_mm_per_min > fastest:
@@ -226,6 +229,6 @@ def _left_over(path: Path) -> tuple[dict[Light, float], float]:
     if not part_path(path).exists():
         return {}, 0.0
     with Capture(part_path(path)) as capture:
-        lights = ["laser" if on else "lamp" for on in capture.laser_on.tolist()]
+        lights: list[Light] = ["laser" if on else "lamp" for on in capture.laser_on.tolist()]
         known = dict(zip(lights, capture.exposure_ms.tolist(), strict=True))
         return known, float(capture.time_s[-1]) if len(capture) else 0.0
