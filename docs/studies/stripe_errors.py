@@ -1,6 +1,6 @@
-"""The stripe centre's error by each effect, against truth: numbers, tables and plots of docs/stripe-errors.md.
+"""The stripe centre's error by each effect, against truth: numbers, tables and plots of docs/explanation/stripe-errors.md.
 
-    python docs/stripe_errors.py
+    python docs/studies/stripe_errors.py
 
 renders every case, draws the plots into docs/pictures, and writes the tables between their markers in the page.
 """
@@ -17,7 +17,7 @@ from twin.options import use_variant
 from uwlts.console import progress_bar
 from uwlts.report.numbers import fixed
 
-PAGE = Path(__file__).parent / "stripe-errors.md"
+PAGE = Path(__file__).parents[1] / "explanation" / "stripe-errors.md"
 SHOWN = (CROSSING, MASS, "quadratic", FILTERED, VERTEX)
 
 

@@ -1,6 +1,6 @@
-"""Methods of finding the stripe's centre and the circles' centres compared: tables of docs/stripe-methods.md.
+"""Methods of finding the stripe's centre and the circles' centres compared: tables of docs/explanation/stripe-methods.md.
 
-    python docs/stripe_methods.py [--frames 4]
+    python docs/studies/stripe_methods.py [--frames 4]
 
 renders every place once, photographs it with fresh speckle and noise, and writes the tables between their markers.
 """
@@ -22,7 +22,7 @@ from twin.options import use_variant
 from uwlts.console import progress_bar
 from uwlts.stripe import StripeMethod, StripeOptions, extract_stripe
 
-PAGE = Path(__file__).parent / "stripe-methods.md"
+PAGE = Path(__file__).parents[1] / "explanation" / "stripe-methods.md"
 FIT, FIT_FIVE, CROSSING = "profile fit", "profile fit, 5 lines averaged", "zero crossing"
 ALL_METHODS = {
     FIT: StripeOptions(method="profile-fit"),

@@ -1,6 +1,6 @@
-"""Formulas against rendering for quite different designs: prints the table of design-studies.md.
+"""Formulas against rendering for quite different designs: prints the table of docs/explanation/design-studies.md.
 
-Run from the project's folder: ``python docs/study_agreement.py`` (about half a minute per design on two cores).
+Run from the project's folder: ``python docs/studies/study_agreement.py`` (about half a minute per design on two cores).
 """
 
 from typing import Any

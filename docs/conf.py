@@ -1,0 +1,64 @@
+"""Settings of the documentation: Sphinx with MyST notebooks, which are executed when the site is built."""
+
+import os
+import shutil
+from importlib.metadata import version as version_of
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+project = "uwlts"
+copyright = "the uwlts authors"
+release = version = version_of("uwlts")
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "cyclopts.ext.sphinx",
+]
+source_suffix = {".md": "myst-nb"}
+exclude_patterns = ["_build", "studies", "pictures"]
+html_theme = "pydata_sphinx_theme"
+html_title = "uwlts"
+html_theme_options = {
+    "show_toc_level": 2,
+    "secondary_sidebar_items": ["page-toc"],
+    "navigation_with_keys": False,
+    "footer_start": [],
+    "footer_end": [],
+}
+html_sidebars = {"index": []}
+html_show_sourcelink = False
+html_copy_source = False
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 4
+# Links to source files and scenes leave the site; they are checked by the tests against the files themselves.
+suppress_warnings = ["myst.xref_missing"] if os.environ.get("UWLTS_DOCS_DRAFT") else []
+
+# A tutorial is executed again when its text changed; a page that fails or takes longer than 2 minutes stops the build.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(ROOT / "docs" / "_build" / "notebooks")
+nb_execution_timeout = 120
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autosummary_generate = True
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+
+
+def _copy_pictures(app) -> None:
+    """Make the pictures that pages show by name available to raw HTML."""
+    shutil.copytree(ROOT / "docs" / "pictures", Path(app.outdir) / "pictures", dirs_exist_ok=True)
+
+
+def setup(app) -> None:
+    """Connect the steps of this project's own."""
+    app.connect("builder-inited", _copy_pictures)
