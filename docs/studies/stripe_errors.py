@@ -1,4 +1,4 @@
-"""The stripe centre's error by each effect, against truth: numbers, tables and plots of docs/explanation/stripe-errors.md.
+"""The stripe centre's error by each effect, against truth: numbers, tables and plots of stripe-errors.md.
 
     python docs/studies/stripe_errors.py
 

@@ -1,4 +1,4 @@
-"""Methods of finding the stripe's centre and the circles' centres compared: tables of docs/explanation/stripe-methods.md.
+"""Methods of finding the stripe's centre and the circles' centres compared: tables of stripe-methods.md.
 
     python docs/studies/stripe_methods.py [--frames 4]
 
