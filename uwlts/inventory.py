@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from uwlts.calibration.joint_estimate import JointEstimate
 from uwlts.calibration.model import FORMAT as CALIBRATION_FORMAT
 from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.calibration.polynomial_model import FORMAT as POLYNOMIAL_FORMAT
@@ -138,21 +139,19 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         value = calibration.residuals.get(step, {}).get(name)
         if value is not None:
             lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
-    return lines + _joint_lines(calibration.residuals.get("joint", {}))
+    return lines + _joint_lines(calibration.joint)
 
 
-def _joint_lines(joint: dict[str, Any]) -> list[str]:
+def _joint_lines(joint: JointEstimate | None) -> list[str]:
     """Parameters of a joint estimate with their standard uncertainties, before and after."""
-    if not joint:
+    if joint is None:
         return []
     lines = ["joint estimate, with standard uncertainties after and before:"]
-    for name, value, std, before in zip(*(joint[key] for key in ("parameters", "values", "std", "std_before")),
-                                        strict=True):  # fmt: skip
-        lines.append(
-            f"  {name.replace('_', ' ')}: {value:.6g} ± {std:.2g}" + (f" ({before:.2g})" if before is not None else "")
-        )
-    scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint["scatter_px"].items())
-    return [*lines, f"scatter: {scatter}; {joint['strays']} of {joint['residuals']} residuals left out"]
+    for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
+        known = "" if before is None else f" ({before:.2g})"
+        lines.append(f"  {key.text.replace('_', ' ')}: {value:.6g} ± {std:.2g}{known}")
+    scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
+    return [*lines, f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out"]
 
 
 def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:

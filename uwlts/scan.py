@@ -7,7 +7,6 @@ import numpy as np
 
 from uwlts.brightness import beside_sheet, sharp_lines, slopes_of_brightness
 from uwlts.calibration.any_calibration import AnyCalibration, calibration_digest, check_fits
-from uwlts.calibration.joint.stored import is_joint
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.polynomial_model import PolynomialCalibration
 from uwlts.capture import Capture
@@ -83,7 +82,7 @@ def reconstruct_stripes(
     require_index(index)
     lines = stripes.lines_by_status
     sharp, blur = np.arange(len(stripes.line)), np.zeros(len(stripes.line))
-    exact = isinstance(calibration, Calibration) and is_joint(calibration)
+    exact = isinstance(calibration, Calibration) and calibration.joint is not None
     if exact:
         sharp, blur = sharp_lines(stripes)
         blurred = len(stripes.line) - len(sharp)

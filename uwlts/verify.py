@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.any_calibration import AnyCalibration
-from uwlts.calibration.joint.stored import is_joint
 from uwlts.capture import Capture
 from uwlts.errors import EvaluationError
 from uwlts.metrology.artefact_descriptions import parse_artefact
@@ -82,7 +81,7 @@ def verify(capture: Capture, calibration: AnyCalibration, *, limit_mm: float | N
     CalibrationError, CaptureError
         The calibration does not fit the capture, or there is no stripe.
     """
-    joint = is_joint(calibration)
+    joint = calibration.joint is not None
     if not joint and limit_mm is None:
         raise EvaluationError("the calibration tells no uncertainty to judge by: give --limit, or calibrate jointly")
     if capture.header.artefact is None:

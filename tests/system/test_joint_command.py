@@ -49,8 +49,8 @@ def folder(tmp_path_factory) -> Path:
 def test_lens_and_window_are_found_from_a_target_in_water(folder: Path, thesis_as_built: Sensor):
     """Besides the stated uncertainty the finite pupil, which no pinhole knows, shifts images by some 0.01 px."""
     calibration = read_calibration(folder / "calibration.json")
-    joint = calibration.residuals["joint"]
-    std = dict(zip(joint["parameters"], joint["std"], strict=True))
+    joint = calibration.joint
+    std = {key.text: value for key, value in zip(joint.parameters, joint.std, strict=True)}
     camera = thesis_as_built.camera
     assert abs(calibration.camera.fx_px - camera.focal_length_px()) < 4 * std["f"] + 0.1
     assert abs(calibration.camera.cx_px - camera.principal_point()[0]) < 4 * std["cx"] + 0.1

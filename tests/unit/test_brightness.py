@@ -5,6 +5,7 @@ import pytest
 
 from tests.unit.joint_views import MEDIUM, WATER, seen
 from uwlts.brightness import beside_sheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
+from uwlts.calibration.joint_estimate import JointEstimate
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.placement import camera_from_object, laser_pose
@@ -53,7 +54,7 @@ def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
     bright = 50.0 * np.exp(FADING * (STAGE[frame] - STAGE.mean()))
     stripes = FoundStripes(frame, np.tile(LINES, len(STAGE)), centres, bright, np.full(len(frame), 4.0), {})
     plain = nominal_calibration(thesis, thesis.media["water"])
-    joint = plain.model_copy(update={"residuals": {"joint": {}}})
+    joint = plain.model_copy(update={"joint": JointEstimate.model_construct()})
     with Capture(tmp_path / "scan.h5") as capture:
         off = []
         for calibration in (plain, joint):

@@ -242,9 +242,10 @@ def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path
 
 
 def test_a_damaged_volume_is_told(calibration):
-    joint = calibration.residuals["joint"]
-    damaged = joint | {"covered": [joint["covered"][0] | {"medium": 7}]}
+    damaged = calibration.joint.model_copy(
+        update={"covered": (calibration.joint.covered[0].model_copy(update={"medium": 7}),)}
+    )
     with pytest.raises(CalibrationError, match="covered volume is damaged"):
-        regions(calibration.model_copy(update={"residuals": {"joint": damaged}}))
+        regions(calibration.model_copy(update={"joint": damaged}))
     region = regions(calibration)[0]
     assert estimate_in(calibration, region).view == region.view

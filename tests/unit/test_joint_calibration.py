@@ -15,6 +15,7 @@ from uwlts.calibration.joint.sheet_jets import DescribedSheet
 from uwlts.calibration.joint.start import series_start
 from uwlts.calibration.model import FanModel, SheetModel
 from uwlts.calibration.nominal import nominal_calibration
+from uwlts.calibration.parameter_keys import StageParameter, StepHeight, WindowParameter, parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.placement import camera_from_object, laser_pose
@@ -43,10 +44,14 @@ def truth():
     }  # fmt: skip
 
 
+def std_by_text(result):
+    return {key.text: std for key, std in result.estimate.std().items()}
+
+
 def pulls(result):
     """Errors of the parameters over their stated uncertainties."""
-    estimate, std = result.estimate, result.estimate.std()
-    values = dict(zip(estimate.parameters.names, estimate.values, strict=True))
+    estimate, std = result.estimate, std_by_text(result)
+    values = {key.text: value for key, value in zip(estimate.parameters.keys, estimate.values, strict=True)}
     return {name: (values[name] - true) / std[name] for name, true in truth().items() if name in values}
 
 
@@ -94,9 +99,9 @@ def at_truth(view):
         "window_distance": window.distance_mm, "window_slope_x": normal[0], "window_slope_y": normal[1],
         "glass_thickness": window.thickness_mm, "glass_index": window.glass_index, "index of water": WATER,
         "sheet_turn_fan": 0.001, "sheet_turn_axis": -0.002, "sheet_offset": 0.05, "sheet_bow": 0.002,
-        "laser_window_turn": 0.003, "stage_scale": 1e-4, "target_bow": 0.02, "height": 23.0,
+        "laser_window_turn": 0.003, "stage_scale": 1e-4, "target_bow": 0.02, "height of the 23 mm step": 23.0,
     }  # fmt: skip
-    priors = {name: Prior(value, 1.0) for name, value in known.items()}
+    priors = {parameter_of(text): Prior(value, 1.0) for text, value in known.items()}
     parameters = Parameters(start.intrinsics, sheet, window, ("water",), priors)
     return parameters, parameters.start(start.intrinsics.from_model(nominal.camera)), start
 
@@ -124,7 +129,7 @@ def test_every_derivative_is_what_differences_say(view, kind):
         pixels = np.column_stack([np.linspace(200, 1000, 30), np.linspace(450, 550, 30)])
         evidence = StepProfileEvidence(
             view=view, pixels=pixels, upper=np.arange(30) % 2 == 0, upward=-frame[:3, 2], along=frame[:3, 1], across=1,
-            height="height", image=0,
+            height=StepHeight(23.0), image=0,
         )  # fmt: skip
         own = np.array([0.02, -390.0])
     for _ in range(8):
@@ -175,7 +180,7 @@ def in_air(noise):
 
 def test_target_images_in_water_alone_give_everything(in_water, thesis):
     result = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS)
-    found, std = pulls(result), result.estimate.std()
+    found, std = pulls(result), std_by_text(result)
     assert max(map(abs, found.values())) < 4.5
     assert std["window_distance"] < 1.0
     assert std["f"] < 0.0005 * truth()["f"]
@@ -187,10 +192,10 @@ def test_target_images_in_water_alone_give_everything(in_water, thesis):
 
 
 def test_air_and_water_together_are_better_than_either(in_air, in_water, thesis):
-    alone = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS).estimate.std()
+    alone = std_by_text(solve_jointly(gathered(thesis, [in_water]), options=OPTIONS))
     result = solve_jointly(gathered(thesis, [in_air, in_water]), options=OPTIONS)
     assert max(map(abs, pulls(result).values())) < 4.5
-    std = result.estimate.std()
+    std = std_by_text(result)
     assert std["f"] < 0.7 * alone["f"]
     assert std["window_distance"] < 0.2 * alone["window_distance"]
     assert std["laser_window_turn"] < 0.1 * alone["laser_window_turn"]
@@ -217,7 +222,7 @@ def test_a_target_held_by_hand_in_water(noise, thesis):
     )
     result = solve_jointly(gathered(thesis, [series]), options=replace(OPTIONS, poses="free"))
     assert max(map(abs, pulls(result).values())) < 4.5
-    assert "stage_scale" not in result.estimate.parameters.names
+    assert StageParameter.SCALE not in result.estimate.parameters.keys
 
 
 def test_steps_add_the_window_to_a_target_in_air(thesis):
@@ -229,9 +234,9 @@ def test_steps_add_the_window_to_a_target_in_air(thesis):
     result = solve_jointly(gathered(thesis, [air], step_views(sensor, noise=noise)), options=OPTIONS)
     found = pulls(result)
     assert max(abs(found[name]) for name in ("f", "cx", "cy", "k1", "k2", "window_distance", "window_slope_x")) < 4.5
-    assert result.estimate.std()["window_distance"] < 0.5 * thesis.uncertainty.window_distance_mm
-    height = next(name for name in result.estimate.parameters.names if "height" in name)
-    place = result.estimate.parameters.names.index(height)
+    assert result.estimate.std()[WindowParameter.DISTANCE] < 0.5 * thesis.uncertainty.window_distance_mm
+    height = next(key for key in result.estimate.parameters.keys if isinstance(key, StepHeight))
+    place = result.estimate.parameters.keys.index(height)
     assert abs(result.estimate.values[place] - 23.17) < 4.5 * result.estimate.std()[height]
 
 

@@ -11,6 +11,7 @@ from uwlts.calibration.joint.next_shot import next_shots
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.stored import found_estimate
 from uwlts.calibration.model import read_calibration, write_calibration
+from uwlts.calibration.parameter_keys import StageParameter
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.errors import CalibrationError, CaptureError
 from uwlts.sensor import Medium
@@ -101,6 +102,6 @@ def test_indices_without_their_media_are_noticed(written):
 def test_advice_is_given_where_the_stage_is_known_exactly(thesis):
     exact = thesis.uncertainty.model_copy(update={"stage_scale": 0.0})
     calibration = calibrated(thesis.model_copy(update={"uncertainty": exact}))
-    assert "stage_scale" not in calibration.residuals["joint"]["parameters"]
+    assert StageParameter.SCALE not in calibration.joint.parameters
     best = next_shots(calibration)[0]
     assert best.after_mm < best.before_mm

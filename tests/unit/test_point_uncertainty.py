@@ -12,6 +12,7 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.stored import stored_estimate
 from uwlts.calibration.joint.surface_scans import SLOPES
 from uwlts.calibration.model import KnownMedium, KnownStage
+from uwlts.calibration.parameter_keys import MediumIndex, StageParameter
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.calibration.sources import source_of
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
@@ -99,7 +100,7 @@ def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_
     points = []
     for values, lean in zip(drawn, leans, strict=True):
         along = np.array([1.0, *lean])
-        scale = 1.0 + stored.parameters.value(values, "stage_scale")
+        scale = 1.0 + stored.parameters.value(values, StageParameter.SCALE)
         changed = calibration.model_copy(
             update={
                 "camera": stored.parameters.camera(values), "window": stored.parameters.window_model(values),
@@ -137,7 +138,7 @@ def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, strip
         return reconstruct_pixels(calibration, pixels, medium_index=calibration.index_of(MEDIUM), stage_mm=0.0,
                                   stage_direction=np.array([1.0, 0, 0])).points_mm  # fmt: skip
 
-    shared = np.sqrt(calibration.residuals["joint"]["shared_variance"]["stripe on the target"])
+    shared = np.sqrt(calibration.joint.shared_variance["stripe on the target"])
     expected = (points(0.5) - points(-0.5)) * (stripe_noise_px(frame, line, centre) * shared)[:, None]
     np.testing.assert_allclose(
         full(known.random_mm2), np.einsum("ni,nj->nij", expected, expected), rtol=1e-3, atol=1e-3 * np.max(expected**2)
@@ -150,7 +151,7 @@ def test_another_water_is_known_by_its_temperature_only(calibration, stripes, th
     frame, line, centre = stripes
     other = Medium(kind="fresh", temperature_c=12.0)
     stored = stored_estimate(calibration, thesis, other)
-    assert stored.parameters.names[-1] == "index of the scan"
+    assert stored.parameters.keys[-1] == MediumIndex("the scan")
     std = other.index_uncertainty(calibration.wavelength_nm, thesis.uncertainty)
     assert np.sqrt(stored.covariance[-1, -1]) == pytest.approx(std)
     assert not stored.covariance[-1, :-1].any()
@@ -263,7 +264,7 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
     stored = stored_estimate(calibration, thesis, MEDIUM)
     priors = stored.parameters.priors | dict.fromkeys(SLOPES, Prior(0.0, 1.0))
     parameters = replace(stored.parameters, priors=priors)
-    covariance = np.zeros((len(parameters.names), len(parameters.names)))
+    covariance = np.zeros((len(parameters.keys), len(parameters.keys)))
     covariance[: len(stored.values), : len(stored.values)] = stored.covariance
     covariance[-2:, -2:] = [[4e-8, 1e-8], [1e-8, 9e-8]]
     known = replace(stored, parameters=parameters, values=np.append(stored.values, [0.0, 0.0]), covariance=covariance)
@@ -273,7 +274,7 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
         known, calibration.model_copy(update={"stages": stages}), header,
         np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance))),
     )  # fmt: skip
-    place = parameters.names.index("stage_scale")
+    place = parameters.keys.index(StageParameter.SCALE)
     lean = np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
     expected = np.zeros((3, 3))
     expected[0, 0] = covariance[place, place] + known.values[place] ** 2
@@ -295,7 +296,7 @@ def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(ca
         plain = point_uncertainty(capture, calibration, frame, line, centre)
         known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
     per_px = noise_mm(plain) / (stripe_noise_px(frame, line, centre) * np.sqrt(
-        calibration.residuals["joint"]["shared_variance"]["stripe on the target"]))[:, None]  # fmt: skip
+        calibration.joint.shared_variance["stripe on the target"]))[:, None]  # fmt: skip
     added = [0.3 * per_px * blur[:, None], 0.2 * beside]
     expected = sum(np.stack([each[:, i] * each[:, j] for i, j in PAIRS], axis=1) for each in added)
     # Patterns that move the points by less than 0.05 um together are left out.

@@ -22,6 +22,7 @@ from uwlts.calibration.joint.stored import found_estimate, stored_estimate
 from uwlts.calibration.joint.volume import estimate_in, lengths_over, regions
 from uwlts.calibration.model import read_calibration, write_calibration
 from uwlts.calibration.nominal import nominal_calibration
+from uwlts.calibration.parameter_keys import MediumIndex, StepHeight, parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.capture import Capture
 from uwlts.certificate import certificate_of
@@ -175,12 +176,12 @@ def test_what_tells_nothing_leaves_everything_as_it_was(earlier, thesis):
     """Two pixels are a line, and a third a height that nobody knows."""
     known = found_estimate(earlier, WARM)
     frame = camera_from_object(BUILT)
-    priors = known.parameters.priors | {"height": Prior(20.0, 1e4)}
+    priors = known.parameters.priors | {StepHeight(20.0): Prior(20.0, 1e4)}
     parameters = replace(known.parameters, priors=priors, earlier=EarlierEstimate(known.values, known.covariance))
     evidence = StepProfileEvidence(
         view=View(True, 0), pixels=np.array([[300.0, 505.0], [900.0, 505.0], [600.0, 480.0]]),
-        upper=np.array([False, False, True]), upward=-frame[:3, 2], along=frame[:3, 1], across=1, height="height",
-        image=0,
+        upper=np.array([False, False, True]), upward=-frame[:3, 2], along=frame[:3, 1], across=1,
+        height=StepHeight(20.0), image=0,
     )  # fmt: skip
     count = len(known.values)
     result = estimate(
@@ -195,9 +196,8 @@ def test_what_tells_nothing_leaves_everything_as_it_was(earlier, thesis):
 
 def test_correlations_of_the_earlier_estimate_count(earlier, thesis):
     """With its variances alone a step would be said to tell other things, and lengths would be known worse."""
-    joint = earlier.residuals["joint"]
-    covariance = np.diag(np.diag(joint["covariance"])).tolist()
-    loose = earlier.model_copy(update={"residuals": {"joint": joint | {"covariance": covariance}}})
+    covariance = tuple(map(tuple, np.diag(np.diag(earlier.joint.covariance)).tolist()))
+    loose = earlier.model_copy(update={"joint": earlier.joint.model_copy(update={"covariance": covariance})})
     full, alone = (
         refreshed(each, steps(thesis), index_std=POORLY_KNOWN).changes[0].length for each in (earlier, loose)
     )
@@ -209,15 +209,15 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     path = tmp_path / "new.json"
     write_calibration(path, result.calibration)
     calibration = read_calibration(path)
-    joint, before = calibration.residuals["joint"], earlier.residuals["joint"]
-    count = len(before["parameters"])
-    assert joint["parameters"][:count] == before["parameters"]
-    assert joint["parameters"][count:] == ["index of water 2", "height of the 23.17 mm step"]
-    assert joint["std_before"][:count] == before["std_before"]
-    assert joint["std_before"][count:] == [POORLY_KNOWN, 0.001]
-    assert (np.array(joint["std"][:count]) <= np.array(before["std"]) * (1 + 1e-6)).all()
-    assert set(joint["scatter_px"]) == {*before["scatter_px"], "stripe on the step"}
-    assert len(joint["images"]) == len(before["images"]) + 1
+    joint, before = calibration.joint, earlier.joint
+    count = len(before.parameters)
+    assert joint.parameters[:count] == before.parameters
+    assert joint.parameters[count:] == (MediumIndex("water 2"), StepHeight(23.17))
+    assert joint.std_before[:count] == before.std_before
+    assert joint.std_before[count:] == (POORLY_KNOWN, 0.001)
+    assert (np.array(joint.std[:count]) <= np.array(before.std) * (1 + 1e-6)).all()
+    assert set(joint.scatter_px) == {*before.scatter_px, "stripe on the step"}
+    assert len(joint.images) == len(before.images) + 1
     assert calibration.provenance["refreshed"][0]["date"] == earlier.provenance.get("date")
     # The new water is that of use, over the same volume, and its index is the new one.
     region = regions(calibration)[0]
@@ -245,10 +245,10 @@ def test_a_step_that_contradicts_its_description_is_refused(earlier, thesis, wro
 
 def moved_since(calibration, name, by):
     """A calibration of a sensor of which something was otherwise then."""
-    joint = calibration.residuals["joint"]
-    values = list(joint["values"])
-    values[joint["parameters"].index(name)] += by
-    return calibration.model_copy(update={"residuals": calibration.residuals | {"joint": joint | {"values": values}}})
+    joint = calibration.joint
+    values = list(joint.values)
+    values[joint.parameters.index(parameter_of(name))] += by
+    return calibration.model_copy(update={"joint": joint.model_copy(update={"values": tuple(values)})})
 
 
 def test_a_sensor_that_has_changed_is_noticed(earlier, thesis):
@@ -292,7 +292,7 @@ def test_the_command_refreshes_and_says_what_changed(drawn):
         done.stdout
     )
     assert "now (k = 2, by the calibration)" in done.stdout
-    std = new.residuals["joint"]["std"][new.residuals["joint"]["parameters"].index("index of water 2")]
+    std = new.joint.std_of(MediumIndex("water 2"))
     assert abs(new.media[1].index - 1.3312) < 3 * std
     assert std < 9e-4
     origin = json.loads((folder / "calibration.refreshed.json").read_text(encoding="utf-8"))["provenance"]

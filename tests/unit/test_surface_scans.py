@@ -18,6 +18,7 @@ from uwlts.calibration.joint.sheet_jets import DescribedSheet
 from uwlts.calibration.joint.surface_scans import SLOPES
 from uwlts.calibration.joint.surfaces import Cylinder, Plane, Spheres
 from uwlts.calibration.nominal import nominal_calibration
+from uwlts.calibration.parameter_keys import parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import CalibrationError, CaptureError, DescriptionError
@@ -37,6 +38,8 @@ KINDS = {
     "pipe along": ((ALONG,), Pipe(diameter_mm=220.0)), "pipe across": ((ACROSS,), Pipe(diameter_mm=60.0)),
 }  # fmt: skip
 
+SLOPE_NAMES = [key.text for key in SLOPES]
+
 
 def parameters(**std):
     """Everything as built and known, but for what ``std`` gives a standard uncertainty."""
@@ -50,8 +53,9 @@ def parameters(**std):
         "window_distance": window.distance_mm, "window_slope_x": normal[0], "window_slope_y": normal[1],
         "glass_thickness": window.thickness_mm, "glass_index": window.glass_index, "index of water": WATER,
         "sheet_turn_fan": 0.0, "sheet_turn_axis": 0.0, "sheet_offset": 0.0, "stage_scale": 0.0,
-    } | dict.fromkeys(SLOPES, 0.0)  # fmt: skip
-    priors = {name: Prior(value, std.get(name.replace(" ", "_"), 1e-9)) for name, value in known.items()}
+        "scan_slope_1": 0.0, "scan_slope_2": 0.0,
+    }  # fmt: skip
+    priors = {parameter_of(text): Prior(value, std.get(text.replace(" ", "_"), 1e-9)) for text, value in known.items()}
     camera = SENSOR.camera
     intrinsics = Intrinsics(CameraOptions(), width_px=camera.width_px, height_px=camera.height_px)
     found = Parameters(intrinsics, sheet, window, ("water",), priors)
@@ -96,8 +100,8 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
     model, shared = parameters()
     evidence, _ = evidence_of(kind, stage_mm=STAGE[::4])
     own = true_own(kind, evidence)
-    for name, slope in zip(SLOPES, SLOPE, strict=True):
-        shared[model.names.index(name)] = slope
+    for key, slope in zip(SLOPES, SLOPE, strict=True):
+        shared[model.keys.index(key)] = slope
     found = evidence.residuals(model, shared, own)
     assert sum(len(part.values) for part in found) > 300
     assert max(np.abs(part.values).max() for part in found) < 1e-6
@@ -163,9 +167,11 @@ def asked(found, **std):
     result = estimate(
         model, [*evidence, _Held(shared[:lens].copy())], shared, [*own, np.empty(0)], uncertainty=SENSOR.uncertainty
     )
-    true = dict(zip(model.names, shared, strict=True)) | dict(zip(SLOPES, SLOPE, strict=True))
-    values, names = dict(zip(model.names, result.values, strict=True)), [name.replace("_of_", " of ") for name in std]
-    return {name: values[name] - true[name] for name in names}, {name: result.std()[name] for name in names}, result
+    true = dict(zip(model.keys, shared, strict=True)) | dict(zip(SLOPES, SLOPE, strict=True))
+    values = dict(zip(model.keys, result.values, strict=True))
+    keys = {text: parameter_of(text) for text in (name.replace("_of_", " of ") for name in std)}
+    errors = {text: values[key] - true[key] for text, key in keys.items()}
+    return errors, {text: result.std()[key] for text, key in keys.items()}, result
 
 
 def noise(seed=8):
@@ -176,7 +182,7 @@ def noise(seed=8):
 def test_round_spheres_tell_the_stage_and_the_water(known):
     standard = STANDARD.model_copy(update={"diameter_uncertainty_mm": 0.002})
     scan = evidence_of("spheres", artefact=standard, sizes_known=known, noise=noise())
-    errors, std, result = asked([scan], **dict.fromkeys(SLOPES, 0.01), index_of_water=2e-3)
+    errors, std, result = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=2e-3)
     for name, error in errors.items():
         assert abs(error) < 4 * std[name], name
         # That points on a sphere err together is stated, so that the uncertainty is far from what 0.02 px alone leave.
@@ -187,7 +193,7 @@ def test_round_spheres_tell_the_stage_and_the_water(known):
 
 def test_a_known_spacing_is_a_length_in_water():
     """Unknown diameters say nothing of the scale; the spacing does, to 0.005 mm in 62 mm or a ten-thousandth."""
-    std = {"index_of_water": 5e-3, "window_distance": 1.0, **dict.fromkeys(SLOPES, 0.01)}
+    std = {"index_of_water": 5e-3, "window_distance": 1.0, **dict.fromkeys(SLOPE_NAMES, 0.01)}
     told = {}
     for known in (True, False):
         standard = STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.01})
@@ -205,13 +211,13 @@ def test_a_pipe_of_known_diameter_tells_the_water(kind):
     for known in (True, False):
         pipe = KINDS[kind][1].model_copy(update={"diameter_uncertainty_mm": 0.01})
         scan = evidence_of(kind, artefact=pipe, sizes_known=known, noise=noise())
-        errors, told[known], _ = asked([scan], **dict.fromkeys(SLOPES, 0.01), index_of_water=5e-3)
+        errors, told[known], _ = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=5e-3)
         assert all(abs(errors[name]) < 4 * told[known][name] for name in errors)
     # Along the stage every profile is the known circle, and the pipe slides on itself whatever way it moves. Across it
     # the stage measures the width, so that the form tells the water nearly as well, and is round only for the stage's
     # true direction.
     better = told[True]["index of water"] / told[False]["index of water"]
-    towards_z = told[True][SLOPES[1]] / 0.01
+    towards_z = told[True][SLOPE_NAMES[1]] / 0.01
     assert (better < 0.4 and towards_z > 0.9) if kind == "pipe along" else (better < 0.9 and towards_z < 0.7)
 
 
@@ -221,10 +227,10 @@ def test_a_plane_tells_the_sheet_but_not_the_stage():
     A sheet that is turned distorts in perspective, which the leaning plane shows, as it crosses all depths.
     """
     scan = evidence_of("plane", stage_mm=np.linspace(-70, 70, 15), noise=noise())
-    errors, std, _ = asked([scan], **dict.fromkeys(SLOPES, 0.01), sheet_turn_fan=0.05)
-    for name in SLOPES:
+    errors, std, _ = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), sheet_turn_fan=0.05)
+    for name in SLOPE_NAMES:
         assert std[name] == pytest.approx(0.01, rel=1e-3)
-        assert abs(errors[name] + SLOPE[SLOPES.index(name)]) < 1e-3
+        assert abs(errors[name] + SLOPE[SLOPE_NAMES.index(name)]) < 1e-3
     assert std["sheet_turn_fan"] < 0.1 * 0.05
     assert abs(errors["sheet_turn_fan"]) < 4 * std["sheet_turn_fan"]
 
@@ -248,10 +254,10 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
     result = solve_jointly(seen, options=CalibrationOptions(poses="stage", correct_circles=False))
     assert result.warnings == []
     found, std = result.estimate, result.estimate.std()
-    values = dict(zip(found.parameters.names, found.values, strict=True))
+    values = dict(zip(found.parameters.keys, found.values, strict=True))
     camera = SENSOR.camera
     true = {"f": camera.focal_length_px(), "window_distance": camera.window.distance_mm, "index of water": WATER}
-    assert max(abs(values[name] - value) / std[name] for name, value in true.items()) < 4.5
+    assert max(abs(values[key] - true[key.text]) / std[key] for key in map(parameter_of, true)) < 4.5
     for kind in (Spheres.kind, Plane.kind, Cylinder.kind):
         assert found.noise[kind].sigma_px == pytest.approx(0.1, rel=0.1)
     frame = result.calibration.object_transform()
@@ -263,7 +269,7 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
     slopes = [std[name] for name in SLOPES]
     assert np.linalg.norm(frame[:3, :3] @ stage.direction - moved) < 4.5 * np.linalg.norm(slopes)
     assert max(slopes) < 0.6 * np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
-    sources = {image["source"].split(",")[0] for image in result.calibration.residuals["joint"]["images"]}
+    sources = {image.source.split(",")[0] for image in result.calibration.joint.images}
     assert set(certified) < sources
 
 

@@ -14,12 +14,17 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.joint.volume import Lengths, estimate_in, lengths_over, regions
 from uwlts.calibration.joint.weakness import told, weaknesses
+from uwlts.calibration.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.calibration.target_image import TargetImage
 from uwlts.targets import parse_target
 
 BUILT = built_sensor()
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+
+
+def keys(*texts):
+    return [parameter_of(text) for text in texts]
 
 
 def noise(seed):
@@ -58,16 +63,16 @@ def of_calibration(calibration):
     region = regions(calibration)[0]
     known = estimate_in(calibration, region)
     over = lengths_over(calibration, known, region)
-    return known, over, weaknesses(over, known.parameters.names, known.covariance)
+    return known, over, weaknesses(over, known.parameters.keys, known.covariance)
 
 
 def test_two_that_cannot_be_told_apart_are_named_together():
     """Each alone costs 10 µm, they trade places with a correlation of 0.99, and the third is known well."""
-    names = ["window_distance", "index of water", "cx"]
+    names = keys("window_distance", "index of water", "cx")
     covariance = np.array([[1.0, 0.99, 0.0], [0.99, 1.0, 0.0], [0.0, 0.0, 0.01]])
     found = weaknesses(lengths([[0.01, 0.01, 0.001], [0.005, 0.005, 0.0]]), names, covariance)
     assert len(found) == 1
-    assert set(found[0].parameters) == {"window_distance", "index of water"}
+    assert set(found[0].parameters) == set(names[:2])
     # The standard uncertainty of their sum: 0.01 sqrt(2 + 2 * 0.99).
     assert found[0].cost_mm == pytest.approx(0.01 * np.sqrt(3.98), rel=1e-3)
     said = found[0].words()
@@ -80,40 +85,44 @@ def test_two_that_cannot_be_told_apart_are_named_together():
 def test_what_cancels_in_every_length_is_not_named():
     """Two parameters known to 1 each trade places without any length changing."""
     covariance = np.array([[1.0, -0.9999999, 0.0], [-0.9999999, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    found = weaknesses(lengths([[0.01, 0.01, 0.002]]), ["window_distance", "f", "glass_index"], covariance)
-    assert [each.parameters for each in found] == [("glass_index",)]
+    found = weaknesses(lengths([[0.01, 0.01, 0.002]]), keys("window_distance", "f", "glass_index"), covariance)
+    assert [each.parameters for each in found] == [(WindowParameter.GLASS_INDEX,)]
     assert "index of the window's glass is known too little; it costs 0.002 mm" in found[0].words()
 
 
 def test_independent_ones_are_not_called_confused():
-    found = weaknesses(lengths([[0.01, 0.01]]), ["window_distance", "glass_index"], np.eye(2))
+    found = weaknesses(lengths([[0.01, 0.01]]), keys("window_distance", "glass_index"), np.eye(2))
     assert not found[0].confused
     assert "are known too little; together they cost 0.014 mm" in found[0].words()
 
 
 def test_less_than_a_micrometre_is_said_to_be_nothing():
-    assert weaknesses(lengths([[0.0009, 0.0]]), ["window_distance", "f"], np.eye(2)) == []
+    assert weaknesses(lengths([[0.0009, 0.0]]), keys("window_distance", "f"), np.eye(2)) == []
     assert "nothing" in told([])[0]
 
 
 def test_a_height_that_is_the_cause_is_named_though_it_moves_no_point():
     """Knowing the height would leave 0.2 of the window distance's standard uncertainty."""
     covariance = np.array([[1.0, 0.98], [0.98, 1.0]])
-    found = weaknesses(lengths([[0.01, 0.0]]), ["window_distance", "height of the 23 mm step"], covariance)
-    assert found[0].parameters == ("window_distance", "height of the 23 mm step")
+    names = keys("window_distance", "height of the 23 mm step")
+    found = weaknesses(lengths([[0.01, 0.0]]), names, covariance)
+    assert found[0].parameters == tuple(names)
     assert found[0].confused
 
 
-def without(known, name):
+def without(known, key):
     """The covariance where a parameter is known."""
-    place = known.parameters.names.index(name)
+    place = known.parameters.keys.index(key)
     column = known.covariance[:, place]
     return known.covariance - np.outer(column, column) / column[place]
 
 
 @pytest.mark.parametrize(
     ("height_mm", "pair"),
-    [(0.01, {"window_distance", "height of the 23.17 mm step"}), (1e-4, {"window_distance", "laser_window_turn"})],
+    [
+        (0.01, {WindowParameter.DISTANCE, StepHeight(23.17)}),
+        (1e-4, {WindowParameter.DISTANCE, SheetParameter.WINDOW_TURN}),
+    ],
 )
 def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
     """A step's height follows from window distance and turned sheet alike; knowing one of the pair really helps."""
@@ -122,8 +131,8 @@ def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
     assert set(found[0].parameters[:2]) == pair
     assert found[0].confused
     before = np.mean(over.std_mm(known.covariance) ** 2)
-    for name in pair:
-        assert np.mean(over.std_mm(without(known, name)) ** 2) < 0.65 * before
+    for key in pair:
+        assert np.mean(over.std_mm(without(known, key)) ** 2) < 0.65 * before
     assert any("target in air without the window" in outlook.words for outlook in next_shots(calibration))
 
 
@@ -140,7 +149,7 @@ def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
     frame = from_water.object_transform()
     cosine, sine = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
     turn = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
-    outline = np.array(from_water.residuals["joint"]["covered"][0]["outline_mm"]) @ turn[1:, 1:]
+    outline = np.array(from_water.joint.covered[0].outline_mm) @ turn[1:, 1:]
     frame[:3, :3] = frame[:3, :3] @ turn
     moved = from_water.model_copy(update={"camera_from_object": tuple(map(tuple, frame.tolist()))})
     region = replace(regions(from_water)[0], outline_mm=outline)
@@ -181,7 +190,7 @@ def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
     result = solve_jointly(gathered(thesis, [in_water, added]), options=OPTIONS)
     known, over, _ = of_calibration(from_water)
     reached = np.sqrt(np.mean(over.std_mm(result.estimate.covariance) ** 2))
-    assert known.parameters.names == result.estimate.parameters.names
+    assert known.parameters.keys == result.estimate.parameters.keys
     assert reached == pytest.approx(best.after_mm, rel=0.2)
     assert [o.after_mm for o in outlooks] == sorted(o.after_mm for o in outlooks)
     every = " ".join(o.words for o in outlooks)
@@ -193,6 +202,8 @@ def test_a_single_line_covers_no_area(thesis):
     """One stripe alone cannot be solved; of a calibration whose outline is a line nothing is said of lengths."""
     series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise(4), columns=15)
     calibration = solve_jointly(gathered(thesis, [series]), options=OPTIONS).calibration
-    calibration.residuals["joint"]["covered"][0]["outline_mm"] = [[-50.0, 10.0], [50.0, 10.0]]
+    joint = calibration.joint
+    line = joint.covered[0].model_copy(update={"outline_mm": ((-50.0, 10.0), (50.0, 10.0))})
+    calibration = calibration.model_copy(update={"joint": joint.model_copy(update={"covered": (line,)})})
     assert next_shots(calibration) == []
     assert "cover no area" in advice_lines(calibration)[0]

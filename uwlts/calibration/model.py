@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from uwlts.calibration.joint_record import require_joint
+from uwlts.calibration.joint_estimate import JointEstimate, Origin, joint_estimate_in
 from uwlts.files import written_aside
 from uwlts.json_file import described, read_json
 from uwlts.sensor import Description, Distortion, Medium, Positive, Vector
@@ -102,7 +102,8 @@ class Calibration(Description):
     ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
     ``stripe_along`` is as in the sensor description. ``media`` are those of the evidence: in just these the index
     found replaces the one that follows from the description. ``stages`` are those whose direction was found.
-    ``residuals`` are named figures of each step, ``provenance`` tells what the calibration was made from.
+    ``residuals`` are named figures of each step, ``provenance`` what the calibration was made from. ``joint`` is the
+    joint estimate where there is one; in the file it is among the residuals.
     """
 
     sensor_name: str
@@ -117,6 +118,22 @@ class Calibration(Description):
     stages: tuple[KnownStage, ...] = ()
     residuals: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
+    joint: JointEstimate | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_file(cls, content: Any) -> Any:
+        residuals = content.get("residuals") if isinstance(content, dict) else None
+        if not (isinstance(residuals, dict) and "joint" in residuals):
+            return content
+        joint = joint_estimate_in(residuals["joint"], content.get("provenance", {}))
+        return content | {"residuals": {key: each for key, each in residuals.items() if key != "joint"}, "joint": joint}
+
+    @model_serializer(mode="wrap")
+    def _into_file(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content = handler(self) | {"residuals": self.residuals_in_file()}
+        del content["joint"]
+        return content
 
     @model_validator(mode="after")
     def _consistent(self) -> "Calibration":
@@ -128,9 +145,20 @@ class Calibration(Description):
         if self.window is not None:
             _require_unit(self.window.normal, "the window's normal")
         require_plain_json(self.residuals, self.provenance)
-        if "joint" in self.residuals:
-            require_joint(self.residuals["joint"], self.provenance)
         return self
+
+    def residuals_in_file(self) -> dict[str, Any]:
+        """The residuals as files have them, the joint estimate among them as plain JSON."""
+        if self.joint is None:
+            return self.residuals
+        # After the camera's figures, as files have always had it, so that digests stay.
+        figures = list(self.residuals.items())
+        place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
+        return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
+
+    def origin(self) -> Origin:
+        """What a joint calibration was made from, by its provenance."""
+        return Origin.model_validate(self.provenance)
 
     def index_of(self, medium: Medium) -> float:
         """Refractive index of a medium at the laser's wavelength, as last calibrated where it was; else RangeError."""
@@ -143,7 +171,7 @@ class Calibration(Description):
         if found is None:
             return described
         stage, forth = found
-        return stage.direction if forth else tuple(-part for part in stage.direction)
+        return stage.direction if forth else (-stage.direction[0], -stage.direction[1], -stage.direction[2])
 
     def stage_of(self, described: Vector) -> tuple[KnownStage, bool] | None:
         """The stage that was calibrated along a direction of the OCS, and whether it goes that way or back."""

@@ -54,6 +54,10 @@ class PolynomialCalibration(Description):
     residuals: dict[str, Any] = {}
     provenance: dict[str, Any] = {}
 
+    @property
+    def joint(self) -> None:
+        """Polynomials hold no joint estimate."""
+
     @model_validator(mode="after")
     def _consistent(self) -> "PolynomialCalibration":
         count, lines = len(self.domains_px), self.width_px if self.stripe_along == "width" else self.height_px

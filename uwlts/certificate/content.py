@@ -10,13 +10,13 @@ import numpy as np
 import uwlts
 from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.joint.next_shot import Outlook, next_shots
-from uwlts.calibration.joint.quantities import quantity_of
-from uwlts.calibration.joint.stored import is_joint
+from uwlts.calibration.joint.stored import require_joint
 from uwlts.calibration.joint.volume import Region, lengths_over, regions
 from uwlts.calibration.joint.weakness import told, weaknesses
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.calibration.sources import sha256_of
-from uwlts.certificate.lengths import InUse, in_use, index_name, worth_of_lengths
+from uwlts.certificate.lengths import InUse, in_use, index_key, worth_of_lengths
 from uwlts.certificate.seal import FORMAT, VERSION, sealed
 
 _BEST_SHOTS = 3
@@ -52,9 +52,9 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
         "wavelength_nm": calibration.wavelength_nm,
         "made_from": calibration.provenance,
         "parameters": parameter_rows(calibration),
-        "uncertainty_known": is_joint(calibration),
+        "uncertainty_known": calibration.joint is not None,
     }  # fmt: skip
-    return sealed(content | (_joint(calibration) if is_joint(calibration) else _by_turns(calibration)))
+    return sealed(content | (_joint(calibration) if calibration.joint is not None else _by_turns(calibration)))
 
 
 def certificate_lines(content: dict[str, Any]) -> list[str]:
@@ -77,9 +77,8 @@ def certificate_lines(content: dict[str, Any]) -> list[str]:
 
 def parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
     """Every parameter in words with its unit, value, and standard uncertainties after and before; None for unknown."""
-    if is_joint(calibration):
-        joint = calibration.residuals["joint"]
-        rows = zip(joint["parameters"], joint["values"], joint["std"], joint["std_before"], strict=True)
+    if (joint := calibration.joint) is not None:
+        rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
         return [_row(*row) for row in rows]
     camera, window = calibration.camera, calibration.window
     figures = calibration.residuals
@@ -88,19 +87,19 @@ def parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
     values = {"f": camera.fx_px, "fx": camera.fx_px, "fy": camera.fy_px, "cx": camera.cx_px, "cy": camera.cy_px}
     values |= camera.distortion.model_dump()
     shown = [*names, "cx", "cy", *(name for name, value in camera.distortion.model_dump().items() if value)]
-    rows = [_row(name, values[name], std.get(name), None) for name in shown]
+    rows = [_row(parameter_of(name), values[name], std.get(name), None) for name in shown]
     if window is not None:
-        rows.append(_row("window_distance", window.distance_mm, figures.get("window", {}).get("std_mm"), None))
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, figures.get("window", {}).get("std_mm"), None))
         if window.refractions == 2:
-            rows.append(_row("glass_thickness", window.thickness_mm, None, None))
-            rows.append(_row("glass_index", window.glass_index, None, None))
+            rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm, None, None))
+            rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index, None, None))
     return rows
 
 
-def _row(name: str, value: float, std: float | None, before: float | None) -> dict[str, Any]:
-    quantity = quantity_of(name)
+def _row(key: ParameterKey, value: float, std: float | None, before: float | None) -> dict[str, Any]:
+    quantity = key.quantity
     return {
-        "name": name,
+        "name": key.text,
         "words": quantity.words,
         "unit": quantity.unit,
         "value": value * quantity.factor,
@@ -127,14 +126,15 @@ def _by_turns(calibration: Calibration) -> dict[str, Any]:
 
 
 def _joint(calibration: Calibration) -> dict[str, Any]:
-    joint, found = calibration.residuals["joint"], regions(calibration)
+    joint, found = require_joint(calibration), regions(calibration)
+    stored = joint.in_file()
     content: dict[str, Any] = {
         "validity": [_validity(in_use(calibration, region)) for region in found],
-        "scatter_px": joint["scatter_px"],
-        "shared_variance": joint["shared_variance"],
-        "residuals": joint["residuals"],
-        "strays": joint["strays"],
-        "images": joint.get("images", []),
+        "scatter_px": joint.scatter_px,
+        "shared_variance": joint.shared_variance,
+        "residuals": joint.residual_count,
+        "strays": joint.outlier_count,
+        "images": stored.get("images", []),
     }
     if not found:
         return content | {"remark": "the calibration does not tell what volume its evidence covers: calibrate again"}
@@ -142,12 +142,12 @@ def _joint(calibration: Calibration) -> dict[str, Any]:
         return content | {"remark": "the stripes of the evidence cover no area: what lengths are worth is not known"}
     use = in_use(calibration, found[0])
     lengths, known = lengths_over(calibration, use.known, found[0]), use.known
-    weak = weaknesses(lengths, known.parameters.names, known.covariance)
+    weak = weaknesses(lengths, known.parameters.keys, known.covariance)
     return content | {
         "lengths": [asdict(worth) for worth in worth_of_lengths(use)],
         "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
         "cannot_tell": told(weak),
-        "weaknesses": [asdict(each) for each in weak],
+        "weaknesses": [asdict(each) | {"parameters": [key.text for key in each.parameters]} for each in weak],
         "next_shots": _shots(next_shots(calibration)),
     }
 
@@ -170,9 +170,8 @@ def _worth_telling(outlooks: Sequence[Outlook]) -> list[Outlook]:
 def _validity(use: InUse) -> dict[str, Any]:
     """Where evidence covers the volume, in which medium, and how well its index is known."""
     region: Region = use.region
-    known, joint = use.known, use.calibration.residuals["joint"]
-    name = index_name(known)
-    std = joint["std"][joint["parameters"].index(name)] if name in joint["parameters"] else None
+    known, index = use.known, index_key(use.known)
+    std = None if index is None else require_joint(use.calibration).std_of(index)
     low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
     return {
         "name": region.name,

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.observations import STEP, STRIPE
-from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.stored import StoredEstimate, require_joint
 from uwlts.calibration.joint.surfaces import SCANNED
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_between, points_at
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.parameter_keys import MediumIndex
 from uwlts.sensor import Uncertainty
 
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
@@ -54,21 +55,20 @@ class InUse:
 def in_use(calibration: Calibration, region: Region) -> InUse:
     """A joint calibration in one of its regions; CalibrationError where it is damaged."""
     known = estimate_in(calibration, region)
-    uncertainty = Uncertainty.model_validate(calibration.provenance.get("known_before", {}))
-    covariance, index = known.covariance.copy(), index_name(known)
-    if index in known.parameters.names:
-        place = known.parameters.names.index(index)
+    uncertainty = calibration.origin().known_before
+    covariance, index = known.covariance.copy(), index_key(known)
+    if index in known.parameters.keys:
+        place = known.parameters.keys.index(index)
         drift = region.medium.index_per_kelvin(calibration.wavelength_nm) * uncertainty.drift_k
         covariance[place, place] += drift**2
-    scatter = calibration.residuals["joint"]["scatter_px"]
+    scatter = require_joint(calibration).scatter_px
     noise = next((scatter[kind] for kind in (STRIPE, STEP, *SCANNED) if kind in scatter), 0.0)
     return InUse(calibration, region, known, covariance, uncertainty, noise)
 
 
-def index_name(known: StoredEstimate) -> str:
-    """Name of the index of what the camera looks into; empty in air."""
-    medium = known.view.medium
-    return "" if medium is None else f"index of {known.parameters.media[medium]}"
+def index_key(known: StoredEstimate) -> MediumIndex | None:
+    """The index of what the camera looks into; None in air."""
+    return None if known.view.medium is None else known.parameters.index_key(known.view.medium)
 
 
 def worth_of_lengths(use: InUse) -> list[Worth]:

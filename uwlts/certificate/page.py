@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 
-from uwlts.calibration.joint.stored import is_joint
 from uwlts.calibration.joint.volume import regions
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.sources import captures_in
@@ -93,10 +91,10 @@ def _pictures(
     content: dict[str, Any], calibration: Calibration, before: tuple[str, Calibration] | None
 ) -> dict[str, Any]:
     drawn: dict[str, Any] = {"maps": [], "changes": [], "largest_change_um": None, "worst": []}
-    if not is_joint(calibration):
+    joint = calibration.joint
+    if joint is None:
         return drawn
-    joint = calibration.residuals["joint"]
-    drawn["correlation"] = Markup(correlation_picture(joint["parameters"], np.array(joint["covariance"])))
+    drawn["correlation"] = Markup(correlation_picture(joint.parameters, joint.covariance_matrix()))
     if content["images"]:
         drawn["residuals"] = [Markup(picture) for picture in image_residuals(content["images"])]
         drawn["worst"] = sorted(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.joint.quantities import quantity_of
+from uwlts.calibration.parameter_keys import ParameterKey
 from uwlts.certificate.lengths import Worth
 from uwlts.report.canvas import ticks
 from uwlts.report.colours import coloured
@@ -54,12 +54,12 @@ def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool 
     return _picture(_WIDTH, height, parts, title)
 
 
-def correlation_picture(names: Sequence[str], covariance: np.ndarray) -> str:
+def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) -> str:
     """The correlation matrix of parameters, coloured, with their names at the left and numbers above."""
     std = np.sqrt(np.diag(covariance))
     std = np.where(std > 0, std, 1.0)
     correlation = covariance / np.outer(std, std)
-    words = [quantity_of(name).words for name in names]
+    words = [key.quantity.words for key in keys]
     left, top = 40 + _LETTER * max(map(len, words)), 26
     parts = []
     for row, column in np.ndindex(correlation.shape):

@@ -92,7 +92,6 @@ def calibrate(
     from uwlts.calibration.intrinsics import CameraOptions
     from uwlts.calibration.joint.advice import advice_lines
     from uwlts.calibration.joint.procedure import calibrate_jointly
-    from uwlts.calibration.joint.stored import is_joint
     from uwlts.calibration.model import write_calibration
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.calibration.procedure import calibrate as solve
@@ -138,7 +137,7 @@ def calibrate(
         )
     write_calibration(out, result.calibration, overwrite=overwrite)
     print("\n".join(calibration_lines(result.calibration)))
-    if is_joint(result.calibration):
+    if result.calibration.joint is not None:
         print("\n".join(advice_lines(result.calibration)))
     for warning in result.warnings:
         warn(warning)

@@ -44,7 +44,6 @@ def reconstruct(
         Replace an existing file.
     """
     from uwlts.calibration.any_calibration import read_any_calibration
-    from uwlts.calibration.joint.stored import is_joint
     from uwlts.capture import Capture
     from uwlts.cloud import write_cloud
     from uwlts.scan import reconstruct_capture
@@ -55,7 +54,7 @@ def reconstruct(
     known = read_any_calibration(calibration)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
         scan = reconstruct_capture(
-            opened, known, options=options, index=index, with_uncertainty=is_joint(known), progress=progress
+            opened, known, options=options, index=index, with_uncertainty=known.joint is not None, progress=progress
         )
         lit = int(opened.laser_on.sum())
     write_cloud(out, scan.cloud, overwrite=overwrite)

@@ -58,7 +58,7 @@ def window_curve_figure(calibrations: tuple[GatheredCalibration, ...], true_mm: 
 def residual_figures(found: GatheredCalibration) -> list[Drawn]:
     """Bars for every list of numbers in the residuals; matrices and short lists are left out."""
     drawn = []
-    for group, name, values in _lists(found.calibration.residuals, ""):
+    for group, name, values in _lists(found.calibration.residuals_in_file(), ""):
         if len(values) <= SHORT_LIST or not any(is_number(value) for value in values):
             continue
         labels = _labels(found.calibration.residuals, group, len(values))

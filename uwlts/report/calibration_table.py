@@ -34,7 +34,7 @@ def parameter_table(campaign: Campaign) -> Comparison:
 
 def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> Comparison:
     """Every single figure that the residuals of the calibrations hold, by its name."""
-    tables = [dict(_figures(found.calibration.residuals, "")) for found in calibrations]
+    tables = [dict(_figures(found.calibration.residuals_in_file(), "")) for found in calibrations]
     names = dict.fromkeys(name for table in tables for name in table)
     return Comparison(
         tuple(found.name for found in calibrations),

@@ -8,8 +8,9 @@ follows, correlations included, from calculating it again with each pattern adde
 
 import numpy as np
 
+from uwlts.calibration.joint.observations import STRIPE
 from uwlts.calibration.joint.rays import COLUMNS
-from uwlts.calibration.joint.stored import StoredEstimate, stored_estimate
+from uwlts.calibration.joint.stored import StoredEstimate, require_joint, stored_estimate
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.sources import sha256_of
 from uwlts.capture import Capture
@@ -111,14 +112,13 @@ def point_uncertainty(
 
 def _made_from(calibration: Calibration, capture: Capture) -> bool:
     """Whether a capture is one of the scans that a calibration was made from."""
-    named = {s["sha256"] for s in calibration.provenance.get("scan_captures", []) if s["file"] == capture.path.name}
+    named = {scan.sha256 for scan in calibration.origin().scan_captures if scan.file == capture.path.name}
     return bool(named) and sha256_of(capture.path) in named
 
 
 def _shared_by_neighbours(calibration: Calibration) -> float:
     """How much larger the noise is than neighbours tell, as those err together."""
-    shared = calibration.residuals["joint"].get("shared_variance", {})
-    return float(np.sqrt(shared.get("stripe on the target", 1.0)))
+    return float(np.sqrt(require_joint(calibration).shared_variance.get(STRIPE, 1.0)))
 
 
 def _derivatives(

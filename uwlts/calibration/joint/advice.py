@@ -13,5 +13,5 @@ def advice_lines(calibration: Calibration) -> list[str]:
         return ["the stripes of the evidence cover no area: what lengths measured by it are worth is not known"]
     known = estimate_in(calibration, region)
     lengths = lengths_over(calibration, known, region)
-    lines = told(weaknesses(lengths, known.parameters.names, known.covariance))
+    lines = told(weaknesses(lengths, known.parameters.keys, known.covariance))
     return [*lines, *(f"next: {outlook.advice()}" for outlook in next_shots(calibration)[:1])]

@@ -13,8 +13,7 @@ import numpy as np
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
 from uwlts.calibration.joint.noise import strays
 from uwlts.calibration.joint.observations import TARGET, Residuals, TargetEvidence
-from uwlts.calibration.joint.prior_words import off_as_words
-from uwlts.calibration.joint.quantities import quantity_of
+from uwlts.calibration.joint.prior_words import format_deviation
 from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor, Uncertainty
 
@@ -125,8 +124,8 @@ def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
     parameters = result.parameters
     mean, before = parameters.prior_mean(), parameters.prior_std()
     wrong, doubtful = [], []
-    for name, value, known, std, after in zip(
-        parameters.names, result.values, mean, before, np.sqrt(np.diag(result.covariance)), strict=True
+    for key, value, known, std, after in zip(
+        parameters.keys, result.values, mean, before, np.sqrt(np.diag(result.covariance)), strict=True
     ):
         if not np.isfinite(std):
             continue
@@ -135,7 +134,7 @@ def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
         sigmas = abs(value - known) / share
         if sigmas > _DOUBTFUL:
             alone = known + (value - known) * (std / share) ** 2
-            words = off_as_words(name, alone, known, std, sigmas=sigmas)
+            words = format_deviation(key, alone, known, std, sigmas=sigmas)
             (wrong if sigmas > _WRONG else doubtful).append((sigmas, words))
     return [words for _, words in sorted(wrong, reverse=True)], [words for _, words in sorted(doubtful, reverse=True)]
 
@@ -151,12 +150,12 @@ def _of_earlier(result: Estimate) -> tuple[list[str], list[str]]:
     worst = int(np.argmax(sigmas))
     if sigmas[worst] <= _DOUBTFUL:
         return [], []
-    quantity = quantity_of(result.parameters.names[worst])
+    quantity = result.parameters.keys[worst].quantity
     value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
     words = (
         f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in the "
-        f"{quantity.words}: {quantity.shown(value, std)} against {quantity.shown_with(known, std)}: check heights and "
-        "media in the captures; if they are right, the sensor has changed, calibrate again"
+        f"{quantity.words}: {quantity.format_value(value, std)} against {quantity.format_with_std(known, std)}: check "
+        "heights and media in the captures; if they are right, the sensor has changed, calibrate again"
     )
     return ([words], []) if sigmas[worst] > _WRONG else ([], [words])
 

@@ -11,6 +11,7 @@ from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET, Residuals
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
 from uwlts.calibration.joint.surfaces import SCANNED
+from uwlts.calibration.parameter_keys import ParameterKey
 from uwlts.errors import CalibrationError
 from uwlts.sensor import Uncertainty
 
@@ -64,9 +65,9 @@ class Estimate:
     rounds: int
     stopped: str
 
-    def std(self) -> dict[str, float]:
+    def std(self) -> dict[ParameterKey, float]:
         """Standard uncertainty of every parameter."""
-        return dict(zip(self.parameters.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        return dict(zip(self.parameters.keys, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 def estimate(

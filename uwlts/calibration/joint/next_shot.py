@@ -14,11 +14,10 @@ from uwlts.calibration.joint.noise import Noise, with_slope_bias
 from uwlts.calibration.joint.observations import TARGET
 from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.shots import SPHERE_MM, SPHERES, Shot, sphere_shot, step_shot, target_shot
-from uwlts.calibration.joint.stored import StoredEstimate
+from uwlts.calibration.joint.stored import StoredEstimate, require_joint
 from uwlts.calibration.joint.surfaces import Spheres
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_over, regions
 from uwlts.calibration.model import Calibration
-from uwlts.sensor import Uncertainty
 from uwlts.targets import Target, parse_target
 
 _TILT_DEG = 20.0
@@ -109,8 +108,8 @@ def information(calibration: Calibration, shot: Shot) -> np.ndarray:
 
 def _noise_of(calibration: Calibration, shot: Shot) -> dict[str, Noise]:
     """Noise of every kind of a shot's residuals; that of the noisiest other stripe for a kind new to the evidence."""
-    joint = calibration.residuals["joint"]
-    known = {name: Noise(sigma, joint["shared_variance"][name]) for name, sigma in joint["scatter_px"].items()}
+    joint = require_joint(calibration)
+    known = {name: Noise(sigma, joint.shared_variance[name]) for name, sigma in joint.scatter_px.items()}
     stripe = max((noise for name, noise in known.items() if name != TARGET), key=Noise.effective_px)
     found = {kind: known.get(kind, stripe) for kind in {part.kind for part in shot.residuals}}
     if Spheres.kind in found:
@@ -141,11 +140,11 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _candidates(calibration: Calibration, known: StoredEstimate, region: Region) -> Iterator[_Candidate]:
-    provenance = calibration.provenance
-    uncertainty = Uncertainty.model_validate(provenance.get("known_before", {}))
+    origin = calibration.origin()
+    uncertainty = origin.known_before
     low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
     depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
-    target = parse_target(provenance["target"]) if "target" in provenance else None
+    target = None if origin.target is None else parse_target(origin.target)
     if target is not None:
         yield from _targets(calibration, known, region.name, target, depths)
         # One image in air is of use beside others taken so, whose series tells the camera.

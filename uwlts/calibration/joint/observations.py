@@ -16,6 +16,7 @@ import numpy as np
 
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.rays import COLUMNS
+from uwlts.calibration.parameter_keys import StageParameter, StepHeight, TargetParameter
 from uwlts.calibration.target_placement import Placement
 
 TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
@@ -141,7 +142,7 @@ class TargetEvidence:
         if rays is None:
             return None
         start, along = pose.into_target(rays.origins), pose.rotation.T @ rays.directions
-        bow = parameters.value(shared, "target_bow")
+        bow = parameters.value(shared, TargetParameter.BOW)
         known = self.placement.points_mm[here]
         bulge = self._bulge(known)
         reach = (bow * bulge - start[2]) / along[2]
@@ -164,11 +165,11 @@ class TargetEvidence:
             return (into @ moved.transpose(1, 0, 2)).reshape(2 * len(known), -1)
 
         by_scale = flat(pose.by_scale()[:, None])
-        by_shared = np.empty((2, len(known), len(parameters.names)))
+        by_shared = np.empty((2, len(known), len(parameters.keys)))
         for axis in (0, 1):
             by_shared[axis] = parameters.by_shared(by_rays[:, axis], self.view)
-            parameters.add(by_shared[axis], "target_bow", slope[axis] * bulge)
-            parameters.add(by_shared[axis], "stage_scale", by_scale[axis])
+            parameters.add(by_shared[axis], TargetParameter.BOW, slope[axis] * bulge)
+            parameters.add(by_shared[axis], StageParameter.SCALE, by_scale[axis])
         return Residuals(
             kind=TARGET,
             values=(found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel(),
@@ -187,7 +188,7 @@ class TargetEvidence:
         if points is None:
             return None
         at = pose.into_target(points.points)
-        bow = parameters.value(shared, "target_bow")
+        bow = parameters.value(shared, TargetParameter.BOW)
         offset = at[:2] - self.middle_mm[:, None]
         # Height above the bent target: its gradient by the point in the target's frame.
         gradient = np.stack([*(-2.0 * bow / self.radius_mm**2 * offset), np.ones(at.shape[1])])
@@ -196,8 +197,8 @@ class TargetEvidence:
         by_sheet = np.einsum("in,cin->cn", in_camera, points.by_sheet)
         bulge = self._bulge(at.T)
         by_shared = parameters.by_shared(by_rays, self.view, by_sheet)
-        parameters.add(by_shared, "target_bow", -bulge)
-        parameters.add(by_shared, "stage_scale", pose.by_scale() @ gradient)
+        parameters.add(by_shared, TargetParameter.BOW, -bulge)
+        parameters.add(by_shared, StageParameter.SCALE, pose.by_scale() @ gradient)
         by_own = np.einsum("in,cin->nc", gradient, pose.by_own(points.points))
         per_px = by_rays[COLUMNS.index("uv"[self.across])]
         return Residuals(
@@ -243,7 +244,7 @@ class _Pose:
             by_tilt = ((np.eye(3) - np.outer(direction, direction))[:, :2] * abs(direction[2])).T
             columns = np.append(np.arange(8), 8 + np.flatnonzero(evidence.images() == image))
             nominal = float(evidence.placement.shifts_mm[evidence.placement.image == image][0])
-            travel = nominal * (1.0 + parameters.value(shared, "stage_scale")) + float(own[columns[8:]].sum())
+            travel = nominal * (1.0 + parameters.value(shared, StageParameter.SCALE)) + float(own[columns[8:]].sum())
         return cls(
             rotation=rotation, rotation_by=by.reshape(3, 3, 3), shift=own[3:6], direction=direction,
             direction_by=by_tilt, travel=travel, nominal=nominal, own=columns, image=int(image),
@@ -285,8 +286,8 @@ class StepProfileEvidence:
         Unit vectors of the camera frame: away from the sensor turned round, that is from the lower tread to the upper
         one, and along the stripe.
     across : {0, 1}
-    height : str
-        Name of the shared parameter.
+    height : StepHeight
+        The shared parameter.
     image : int
         Number of the image among all of steps.
     predicted : (N, 2), optional
@@ -299,7 +300,7 @@ class StepProfileEvidence:
     upward: np.ndarray
     along: np.ndarray
     across: int
-    height: str
+    height: StepHeight
     image: int
     predicted: np.ndarray | None = None
 

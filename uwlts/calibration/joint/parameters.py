@@ -1,4 +1,4 @@
-"""The parameters that all evidence shares: what they are called, where they start, what is known of them before."""
+"""The parameters that all evidence shares: their keys, where they start, what is known of them before."""
 
 from dataclasses import dataclass, field
 
@@ -10,6 +10,7 @@ from uwlts.calibration.joint.rays import COLUMNS, LENS, WINDOW, RayJets, ray_jet
 from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
 from uwlts.calibration.joint.sheet_jets import DescribedSheet, PointJets, points_on_sheet
 from uwlts.calibration.model import CameraModel, SheetModel, WindowModel
+from uwlts.calibration.parameter_keys import MediumIndex, ParameterKey, parameter_of
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Names and places of the shared parameters in one vector (P,).
+    """Keys and places of the shared parameters in one vector (P,).
 
     Attributes
     ----------
@@ -54,13 +55,14 @@ class Parameters:
     sheet: DescribedSheet
     window: WindowModel | None
     media: tuple[str, ...]
-    priors: dict[str, Prior]
+    priors: dict[ParameterKey, Prior]
     earlier: EarlierEstimate | None = None
-    names: tuple[str, ...] = field(init=False)
+    keys: tuple[ParameterKey, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        known = (name for name, prior in self.priors.items() if prior.std > 0)
-        object.__setattr__(self, "names", (*self.intrinsics.names, *known))
+        lens = (parameter_of(name) for name in self.intrinsics.names)
+        known = (key for key, prior in self.priors.items() if prior.std > 0)
+        object.__setattr__(self, "keys", (*lens, *known))
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""
@@ -82,7 +84,7 @@ class Parameters:
         """The window of a vector."""
         if self.window is None:
             return None
-        distance, slope_x, slope_y, thickness, index = (self.value(values, name) for name in WINDOW)
+        distance, slope_x, slope_y, thickness, index = (self.value(values, key) for key in WINDOW)
         normal = np.array([slope_x, slope_y, 1.0])
         return self.window.model_copy(
             update={
@@ -97,7 +99,7 @@ class Parameters:
 
     def medium_index(self, values: np.ndarray, view: View) -> float:
         """Index of a view's medium relative to air."""
-        return 1.0 if view.medium is None else self.value(values, self._index_name(view))
+        return 1.0 if view.medium is None else self.value(values, self.index_key(view.medium))
 
     def rays(self, values: np.ndarray, view: View, pixels: np.ndarray) -> RayJets | None:
         """Rays of pixels (N, 2) in the medium of a view."""
@@ -113,37 +115,38 @@ class Parameters:
 
     def by_shared(self, by_rays: np.ndarray, view: View, by_sheet: np.ndarray | None = None) -> np.ndarray:
         """Derivatives (N, P) by the shared parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
-        result = np.zeros((by_rays.shape[1], len(self.names)))
+        result = np.zeros((by_rays.shape[1], len(self.keys)))
         lens = by_rays[2 : 2 + len(LENS)]
         result[:, : len(self.intrinsics.names)] = lens.T @ self.intrinsics.map
         if view.window:
-            for name in WINDOW:
-                self.add(result, name, by_rays[COLUMNS.index(name)])
+            for key in WINDOW:
+                self.add(result, key, by_rays[COLUMNS.index(key)])
         if view.medium is not None and view.window:
-            self.add(result, self._index_name(view), by_rays[COLUMNS.index("medium_index")])
+            self.add(result, self.index_key(view.medium), by_rays[COLUMNS.index("medium_index")])
         if by_sheet is not None:
-            for name, column in zip(SHEET, by_sheet[:5], strict=True):
-                self.add(result, name, column)
+            for key, column in zip(SHEET, by_sheet[:5], strict=True):
+                self.add(result, key, column)
             if view.medium is not None:
-                self.add(result, self._index_name(view), by_sheet[5])
+                self.add(result, self.index_key(view.medium), by_sheet[5])
         return result
 
-    def value(self, values: np.ndarray, name: str) -> float:
+    def value(self, values: np.ndarray, key: ParameterKey) -> float:
         """A parameter but the lens's; zero for one that there is not."""
-        if name in self.names:
-            return float(values[self.names.index(name)])
-        return self.priors[name].mean if name in self.priors else 0.0
+        if key in self.keys:
+            return float(values[self.keys.index(key)])
+        return self.priors[key].mean if key in self.priors else 0.0
 
-    def add(self, by_shared: np.ndarray, name: str, column: np.ndarray) -> None:
+    def add(self, by_shared: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
         """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
-        if name in self.names:
-            by_shared[:, self.names.index(name)] += column
+        if key in self.keys:
+            by_shared[:, self.keys.index(key)] += column
+
+    def index_key(self, medium: int) -> MediumIndex:
+        """The index of a medium by its number."""
+        return MediumIndex(self.media[medium])
 
     def _estimated(self) -> list[Prior]:
-        return [self.priors[name] for name in self.names[len(self.intrinsics.names) :]]
-
-    def _index_name(self, view: View) -> str:
-        return f"index of {self.media[view.medium]}"
+        return [self.priors[key] for key in self.keys[len(self.intrinsics.names) :]]
 
     def _sheet_values(self, values: np.ndarray) -> np.ndarray:
-        return np.array([self.value(values, name) for name in SHEET])
+        return np.array([self.value(values, key) for key in SHEET])

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.account import evidence_figures
 from uwlts.calibration.joint.circle_centres import centred
 from uwlts.calibration.joint.contradictions import findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.figures import joint_figures
+from uwlts.calibration.joint.evidence_summary import joint_estimate, lens_and_window_figures
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, refuse_two_lenses
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.priors import priors_of
@@ -21,6 +20,7 @@ from uwlts.calibration.joint.start import series_start, sheet_start
 from uwlts.calibration.joint.step_start import line_start, step_profiles
 from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
 from uwlts.calibration.joint.surfaces import Plane
+from uwlts.calibration.joint_estimate import JointEstimate
 from uwlts.calibration.model import Calibration, KnownMedium, KnownStage
 from uwlts.calibration.procedure import CalibrationOptions, nominal_window
 from uwlts.calibration.sheet import object_frame
@@ -175,7 +175,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     target = gathered.series[0].found.target.model_dump(mode="json")
     provenance |= {"known_before": sensor.uncertainty.model_dump(), "target": target}
     frame = object_frame(parameters.sheet_model(result.values), laser_axis=laser_pose(sensor).axis)
-    kept = evidence_figures(result, evidence, sources, frame)
+    kept = joint_estimate(result, evidence, sources, frame)
     stages = [
         KnownStage(
             described=gathered.scans[0].stage_direction.tolist(),
@@ -188,12 +188,10 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
 
 
 def _calibration(
-    gathered: Gathered, result: Estimate, frame: np.ndarray, stages: list[KnownStage], evidence: dict[str, Any],
+    gathered: Gathered, result: Estimate, frame: np.ndarray, stages: list[KnownStage], joint: JointEstimate,
     provenance: dict[str, Any],
 ) -> Calibration:  # fmt: skip
     sensor, parameters, values = gathered.sensor, result.parameters, result.values
-    figures = joint_figures(result)
-    figures["joint"] |= evidence
     sheet = parameters.sheet_model(values)
     wet = parameters.window is None and gathered.media
     return Calibration(
@@ -210,6 +208,7 @@ def _calibration(
             KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
             for number, medium in enumerate(gathered.media.values())
         ),
-        residuals=figures,
+        residuals=lens_and_window_figures(result),
+        joint=joint,
         provenance=provenance,
     )

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.model import CameraModel, WindowModel
+from uwlts.calibration.parameter_keys import LensParameter, WindowParameter
 from uwlts.camera import directions
 
-LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-WINDOW = ("window_distance", "window_slope_x", "window_slope_y", "glass_thickness", "glass_index")
+LENS = tuple(key for key in LensParameter if key is not LensParameter.F)
+WINDOW = tuple(WindowParameter)
 COLUMNS = ("u", "v", *LENS, *WINDOW, "medium_index")
-"""By what rays are differentiated. The window's normal runs along (window_slope_x, window_slope_y, 1)."""
+"""By what rays are differentiated."""
 
 _INNER = 8
 """Ideal image coordinates x and y, five numbers of the window, the medium's index."""

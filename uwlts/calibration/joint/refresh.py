@@ -20,6 +20,7 @@ from uwlts.calibration.joint.step_start import line_start, step_profiles
 from uwlts.calibration.joint.stored import StoredEstimate, found_estimate
 from uwlts.calibration.joint.water_change import WaterChange, water_changes
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.parameter_keys import MediumIndex
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.calibration.sources import captures_in
 from uwlts.capture import Capture
@@ -92,7 +93,7 @@ def refresh(
         _refuse_unsuitable(capture, calibration)
     options = CalibrationOptions() if options is None else options
     gathered = gather_jointly([], steps, options=options, progress=progress)
-    used = {source["sha256"] for source in captures_in(calibration.provenance)}
+    used = {source.sha256 for source in calibration.origin().captures()}
     again = [source["file"] for source in captures_in(gathered.provenance) if source["sha256"] in used]
     if again:
         raise CalibrationError(f"the calibration was made from {', '.join(again)} already: take a new image")
@@ -113,12 +114,12 @@ def solve_refreshed(
     wavelength = calibration.wavelength_nm
     indices = [options.medium_index or medium.refractive_index(wavelength) for medium in gathered.media.values()]
     heights = {evidence.height: height for evidence, height in profiles}
-    turns = known.values[[known.parameters.names.index(name) for name in SHEET[:3]]]
+    turns = known.values[[known.parameters.keys.index(key) for key in SHEET[:3]]]
     described = priors_of(gathered, window, indices, turns, heights, options)
-    priors = known.parameters.priors | {n: p for n, p in described.items() if n not in known.parameters.priors}
+    priors = known.parameters.priors | {k: p for k, p in described.items() if k not in known.parameters.priors}
     if index_std is not None:
         for name in gathered.media:
-            priors[f"index of {name}"] = replace(priors[f"index of {name}"], std=index_std)
+            priors[MediumIndex(name)] = replace(priors[MediumIndex(name)], std=index_std)
     parameters = replace(
         known.parameters, media=(*known.parameters.media, *gathered.media), priors=priors,
         earlier=EarlierEstimate(known.values, known.covariance),
@@ -152,20 +153,20 @@ def _other_water(
     sensor: Sensor,
 ) -> str:
     """With which indices steps agree that contradict those described, in words; empty where with none."""
-    new = [name for name in parameters.names[len(parameters.earlier.values) :] if name.startswith("index of ")]
-    free = {name: replace(parameters.priors[name], std=_ANY_INDEX) for name in new}
+    new = [key for key in parameters.keys[len(parameters.earlier.values) :] if isinstance(key, MediumIndex)]
+    free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
     result, against = _judged(replace(parameters, priors=parameters.priors | free), evidence, sources, sensor)
     if against.contradictions:
         return ""
-    found = dict(zip(parameters.names, result.values, strict=True))
+    found = dict(zip(parameters.keys, result.values, strict=True))
     words = []
-    for name in new:
-        known, std = parameters.priors[name], result.std()[name]
-        sigmas = abs(found[name] - known.mean) / np.hypot(std, known.std)
+    for key in new:
+        known, std = parameters.priors[key], result.std()[key]
+        sigmas = abs(found[key] - known.mean) / np.hypot(std, known.std)
         if sigmas < _TELLING:
             continue
         words.append(
-            f"the steps say that the {name} is {found[name]:.4f} +- {std:.2g}, {sigmas:.1f} standard uncertainties "
+            f"the steps say that the {key.text} is {found[key]:.4f} +- {std:.2g}, {sigmas:.1f} standard uncertainties "
             f"from the {known.mean:.5f} +- {known.std:.2g} described"
         )
     advice = (

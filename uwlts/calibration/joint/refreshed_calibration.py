@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 
 from uwlts.calibration.any_calibration import calibration_digest
-from uwlts.calibration.joint.account import evidence_figures, outline
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.figures import joint_figures
+from uwlts.calibration.joint.evidence_summary import joint_estimate, lens_and_window_figures, outline
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.stored import require_joint
+from uwlts.calibration.joint_estimate import CoveredRegion, JointEstimate
 from uwlts.calibration.model import Calibration, KnownMedium, KnownStage
 from uwlts.calibration.procedure import sources_of
 from uwlts.calibration.sheet import object_frame
@@ -45,43 +46,48 @@ def refreshed_calibration(
                 KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
                 for number, medium in enumerate(media)
             ),
-            "residuals": _figures(earlier, result, evidence_figures(result, evidence, sources, frame)),
+            "residuals": earlier.residuals
+            | {
+                name: {**earlier.residuals.get(name, {}), **figures}
+                for name, figures in lens_and_window_figures(result).items()
+            },
+            "joint": _joint(require_joint(earlier), joint_estimate(result, evidence, sources, frame)),
             "provenance": _provenance(earlier, gathered, warnings),
         }
     )
 
 
-def _figures(earlier: Calibration, result: Estimate, evidence: Mapping[str, Any]) -> dict[str, Any]:
-    old, new = earlier.residuals, joint_figures(result)
-    before, joint = old["joint"], new["joint"]
-    count = len(before["std_before"])
-    joint["std_before"] = [*before["std_before"], *joint["std_before"][count:]]
-    for key in ("scatter_px", "shared_variance"):
-        joint[key] = before[key] | joint[key]
-    for key in ("residuals", "strays"):
-        joint[key] += before[key]
-    covered = before.get("covered", [])
-    joint["images"] = [*before.get("images", []), *evidence["images"]]
-    joint["covered"] = [*covered, *(_with_earlier(entry, covered) for entry in evidence["covered"])]
-    return (
-        old
-        | {key: {**old.get(key, {}), **figures} for key, figures in new.items() if key != "joint"}
-        | {"joint": before | joint}
+def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
+    """The new estimate with what the earlier one knew of all evidence before."""
+    fields = {name: getattr(new, name) for name in JointEstimate.model_fields}
+    return before.model_copy(
+        update=fields
+        | {
+            "std_before": before.std_before + new.std_before[len(before.std_before) :],
+            "scatter_px": before.scatter_px | new.scatter_px,
+            "shared_variance": before.shared_variance | new.shared_variance,
+            "residual_count": before.residual_count + new.residual_count,
+            "outlier_count": before.outlier_count + new.outlier_count,
+            "images": before.images + new.images,
+            "covered": before.covered + tuple(_with_earlier(region, before.covered) for region in new.covered),
+        }
     )
 
 
-def _with_earlier(entry: dict[str, Any], covered: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
     """What is covered in new water, with the largest region covered in earlier water through the window."""
-    wet = [other for other in covered if other["window"] and other["medium"] is not None]
+    wet = [other for other in covered if other.window and other.medium is not None]
     if not wet:
-        return entry
-    most = max(wet, key=lambda other: other["points"])
-    depths = [*entry["camera_depth_mm"], *most["camera_depth_mm"]]
-    return entry | {
-        "points": entry["points"] + most["points"],
-        "camera_depth_mm": [min(depths), max(depths)],
-        "outline_mm": outline(np.array([*entry["outline_mm"], *most["outline_mm"]])).tolist(),
-    }
+        return region
+    most = max(wet, key=lambda other: other.point_count)
+    depths = (*region.camera_depth_mm, *most.camera_depth_mm)
+    return region.model_copy(
+        update={
+            "point_count": region.point_count + most.point_count,
+            "camera_depth_mm": (min(depths), max(depths)),
+            "outline_mm": tuple(map(tuple, outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
+        }
+    )
 
 
 def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, Any]:

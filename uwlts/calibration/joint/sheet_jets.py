@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.rays import RayJets
+from uwlts.calibration.joint_estimate import NominalSheet
 from uwlts.calibration.model import FanModel, SheetModel
+from uwlts.calibration.parameter_keys import SheetParameter
 from uwlts.sheet_surface import behind_window_mm, fan_distances, sheet_surface
 
-PARAMETERS = ("sheet_turn_fan", "sheet_turn_axis", "sheet_offset", "sheet_bow", "laser_window_turn")
+PARAMETERS = tuple(SheetParameter)
 """Turns of the normal in rad towards the axis and towards the fan's direction, shift in mm, numbers of `FanModel`."""
 
 
@@ -32,15 +34,33 @@ class DescribedSheet:
     apex_mm: np.ndarray
     pivot_mm: np.ndarray
 
-    def model(self, values: np.ndarray) -> SheetModel:
-        """The sheet of the parameters (5,)."""
-        normal, _ = self._normal(values)
-        fan = FanModel(
+    @classmethod
+    def of(cls, nominal: NominalSheet) -> "DescribedSheet":
+        """The sheet that a file describes."""
+        normal, axis, middle, apex, pivot = np.array(
+            [nominal.normal, nominal.axis, nominal.middle_mm, nominal.apex_mm, nominal.pivot_mm]
+        )
+        return cls(normal, axis, middle, apex, pivot)
+
+    def nominal(self) -> NominalSheet:
+        """The sheet as a file describes it."""
+        return NominalSheet(
+            normal=self.normal.tolist(), axis=self.axis.tolist(), middle_mm=self.middle_mm.tolist(),
+            apex_mm=self.apex_mm.tolist(), pivot_mm=self.pivot_mm.tolist(),
+        )  # fmt: skip
+
+    def fan(self, values: np.ndarray) -> FanModel:
+        """The fan of the parameters (5,)."""
+        return FanModel(
             apex_mm=tuple(self.apex_mm.tolist()), axis=tuple(self.axis.tolist()),
             pivot_mm=tuple(self.pivot_mm.tolist()), bow_rad=float(values[3]), window_turn_rad=float(values[4]),
         )  # fmt: skip
+
+    def model(self, values: np.ndarray) -> SheetModel:
+        """The sheet of the parameters (5,)."""
+        normal, _ = self._normal(values)
         offset = float(normal @ self.middle_mm + values[2])
-        return SheetModel(normal=tuple(normal.tolist()), offset_mm=offset, fan=fan)
+        return SheetModel(normal=tuple(normal.tolist()), offset_mm=offset, fan=self.fan(values))
 
     def _normal(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal (3,) and its derivatives (2, 3) by the two turns."""
@@ -66,7 +86,7 @@ class DescribedSheet:
         for row, n in enumerate(normal_by):
             turned = (cosine - 1.0) * n + sine * (across(n, normal) + across(normal, n))
             by[row] = n @ from_middle + turned @ from_pivot
-        fan = self.model(values).fan
+        fan = self.fan(values)
         at, behind = fan_distances(points, fan, medium_index=index), behind_window_mm(fan)
         of_bow, of_turn = at.bulges()
         # The fan seems to begin farther away as the index grows.

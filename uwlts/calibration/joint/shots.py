@@ -9,10 +9,11 @@ import numpy as np
 from uwlts.calibration.joint.observations import Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Prior
 from uwlts.calibration.joint.stored import StoredEstimate
-from uwlts.calibration.joint.surface_scans import SLOPES, SurfaceScanEvidence
+from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
 from uwlts.calibration.joint.surfaces import Spheres
 from uwlts.calibration.joint.volume import pixels_at
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.calibration.target_placement import Placement
 from uwlts.camera import project_through_window
 from uwlts.sensor import Uncertainty
@@ -69,9 +70,9 @@ def step_shot(
 
     None where too little of it is in view.
     """
-    height = next((name for name in known.parameters.names if name.startswith("height of ")), None)
+    height = next((key for key in known.parameters.keys if isinstance(key, StepHeight)), None)
     if height is None:
-        height = f"height of the {STEP_MM:g} mm step"
+        height = StepHeight(STEP_MM)
         known = extended(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
     y = np.linspace(-_STEP_REACH_MM, _STEP_REACH_MM, _SAMPLES)
     upper = np.abs(y) < _STEP_HALF_MM
@@ -99,7 +100,9 @@ def sphere_shot(
     """A scan along X of two spheres of unknown size, their centres at a depth Z; None where they are not in view."""
     lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
     known = extended(
-        known, dict.fromkeys(SLOPES, Prior(0.0, lean)) | {"stage_scale": Prior(0.0, uncertainty.stage_scale)}
+        known,
+        dict.fromkeys((StageParameter.SLOPE_1, StageParameter.SLOPE_2), Prior(0.0, lean))
+        | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)},
     )
     frame, radius = calibration.object_transform(), SPHERE_MM / 2
     stage = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
@@ -132,9 +135,9 @@ def sphere_shot(
     return None if parts is None else Shot(known, parts, std)
 
 
-def extended(known: StoredEstimate, priors: Mapping[str, Prior]) -> StoredEstimate:
+def extended(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
     """The estimate with those of these parameters that it has not and that are not known exactly, behind its own."""
-    added = {name: prior for name, prior in priors.items() if name not in known.parameters.names and prior.std > 0}
+    added = {key: prior for key, prior in priors.items() if key not in known.parameters.keys and prior.std > 0}
     count = len(known.values)
     covariance = np.zeros((count + len(added),) * 2)
     covariance[:count, :count] = known.covariance

@@ -6,6 +6,7 @@ from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.observations import StepProfileEvidence
 from uwlts.calibration.joint.parameters import Parameters, Prior
 from uwlts.calibration.model import Calibration, WindowModel
+from uwlts.calibration.parameter_keys import StepHeight
 from uwlts.calibration.procedure import step_image
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.metrology.treads import Tread
@@ -30,7 +31,7 @@ def step_profiles(
             view=view, pixels=image.pixels[on_tread], upper=image.labels[on_tread] == Tread.UPPER,
             upward=-transform[:3, 2], along=transform[:3, 1],
             across=1 if gathered.sensor.camera.stripe_along == "width" else 0,
-            height=f"height of the {height:g} mm step", image=number,
+            height=StepHeight(height), image=number,
         )  # fmt: skip
         found.append((evidence, Prior(height, stated / 2 if stated else usual)))
     return found, warnings

@@ -14,8 +14,9 @@ from uwlts.calibration.joint.observations import Residuals
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.rays import COLUMNS
 from uwlts.calibration.joint.surfaces import Surface, leaning
+from uwlts.calibration.parameter_keys import StageParameter
 
-SLOPES = ("scan_slope_1", "scan_slope_2")
+SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
 """How far the stage's direction leans from the one described, towards two directions across it."""
 
 # Where the ray's crossing with the sheet moves almost along the surface, a residual in px would be out of all bounds.
@@ -83,14 +84,14 @@ class SurfaceScanEvidence:
         count = len(own) - len(self.stage_mm)
         direction, by_slopes = self._direction(parameters, shared)
         nominal = self.stage_mm[self.frame]
-        travel = nominal * (1.0 + parameters.value(shared, "stage_scale")) + own[count:][self.frame]
+        travel = nominal * (1.0 + parameters.value(shared, StageParameter.SCALE)) + own[count:][self.frame]
         off = self.surface.distances(points.points + self.beside_mm + direction[:, None] * travel, own[:count])
         by_rays = np.einsum("in,cin->cn", off.outward, points.by_rays)
         by_shared = parameters.by_shared(by_rays, self.view, np.einsum("in,cin->cn", off.outward, points.by_sheet))
         by_position = direction @ off.outward
-        parameters.add(by_shared, "stage_scale", by_position * nominal)
-        for name, by in zip(SLOPES, by_slopes, strict=True):
-            parameters.add(by_shared, name, (by @ off.outward) * travel)
+        parameters.add(by_shared, StageParameter.SCALE, by_position * nominal)
+        for key, by in zip(SLOPES, by_slopes, strict=True):
+            parameters.add(by_shared, key, (by @ off.outward) * travel)
         column = COLUMNS.index("uv"[self.across])
         least = _LEAST_SHARE * np.linalg.norm(points.by_rays[column], axis=0)
         per_px = np.copysign(np.maximum(np.abs(by_rays[column]), least), by_rays[column])
@@ -128,7 +129,7 @@ class SurfaceScanEvidence:
 
     def _direction(self, parameters: Parameters, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The stage's direction (3,) and its derivatives (2, 3) by the slopes."""
-        slopes = np.array([parameters.value(shared, name) for name in SLOPES])
+        slopes = np.array([parameters.value(shared, key) for key in SLOPES])
         return leaning(self.direction, self.across_stage, slopes)
 
 

@@ -6,13 +6,13 @@ moves rigidly, so that what only moves the sensor's frame does not count.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.rays import COLUMNS
-from uwlts.calibration.joint.stored import StoredEstimate, found_estimate
+from uwlts.calibration.joint.stored import StoredEstimate, found_estimate, require_joint
+from uwlts.calibration.joint_estimate import CoveredRegion
 from uwlts.calibration.model import Calibration
 from uwlts.camera import project_through_window
 from uwlts.errors import CalibrationError
@@ -118,22 +118,21 @@ class Lengths:
 
 def regions(calibration: Calibration) -> list[Region]:
     """The regions that a joint calibration's evidence covers, that of its use first; CalibrationError if damaged."""
-    try:
-        found = [_region(calibration, entry) for entry in calibration.residuals["joint"].get("covered", [])]
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise CalibrationError(f"the calibration's covered volume is damaged: {error!r}") from error
+    found = [_region(calibration, entry) for entry in require_joint(calibration).covered]
     return sorted(found, key=lambda region: (region.view.medium is None, -region.points))
 
 
-def _region(calibration: Calibration, entry: dict[str, Any]) -> Region:
-    number = entry["medium"]
+def _region(calibration: Calibration, covered: CoveredRegion) -> Region:
+    number = covered.medium
+    if number is not None and number >= len(calibration.media):
+        raise CalibrationError(f"the calibration's covered volume is damaged: it has no medium number {number}")
     return Region(
-        name=entry["name"],
+        name=covered.name,
         medium=Medium(kind="air") if number is None else calibration.media[number].medium,
-        view=View(bool(entry["window"]), number),
-        outline_mm=np.array(entry["outline_mm"], dtype=np.float64).reshape(-1, 2),
-        camera_depth_mm=np.array(entry["camera_depth_mm"], dtype=np.float64),
-        points=int(entry["points"]),
+        view=View(covered.window, number),
+        outline_mm=np.array(covered.outline_mm, dtype=np.float64).reshape(-1, 2),
+        camera_depth_mm=np.array(covered.camera_depth_mm, dtype=np.float64),
+        points=covered.point_count,
     )
 
 

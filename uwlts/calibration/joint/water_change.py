@@ -7,6 +7,7 @@ import numpy as np
 from uwlts.calibration.joint.estimate import Estimate
 from uwlts.calibration.joint.volume import Lengths, Region, estimate_in, lengths_over, regions
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.parameter_keys import MediumIndex
 
 
 @dataclass(frozen=True)
@@ -74,14 +75,15 @@ def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChang
     seen = {region.view.medium: region for region in regions(calibration)}
     found = []
     for number, name in enumerate(parameters.media):
-        place = parameters.names.index(f"index of {name}")
+        key = MediumIndex(name)
+        place = parameters.keys.index(key)
         if place < count or number not in seen:
             continue
         lengths = _lengths(calibration, seen[number])
         found.append(
             WaterChange(
                 name, float(before[place]), float(std_before[place]), float(result.values[place]),
-                std[parameters.names[place]],
+                std[key],
                 None if lengths is None else _length_change(lengths, result, before, covariance),
             )
         )  # fmt: skip

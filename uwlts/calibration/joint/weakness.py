@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.joint.quantities import quantity_of
 from uwlts.calibration.joint.volume import Lengths
+from uwlts.calibration.parameter_keys import ParameterKey
 
 _MOST = 3
 _LEAST_SHARE = 0.1
@@ -31,7 +31,7 @@ class Weakness:
 
     Attributes
     ----------
-    parameters : tuple of str
+    parameters : tuple of ParameterKey
         Those that make it up, the most important first.
     confused : bool
         Whether the evidence cannot tell them apart, rather than knows each too little.
@@ -45,7 +45,7 @@ class Weakness:
         Largest depth Z of its ends, OCS.
     """
 
-    parameters: tuple[str, ...]
+    parameters: tuple[ParameterKey, ...]
     confused: bool
     cost_mm: float
     length_mm: float
@@ -54,7 +54,7 @@ class Weakness:
 
     def words(self) -> str:
         """The weakness as a sentence without its full stop."""
-        names = [quantity_of(name).words for name in self.parameters]
+        names = [key.quantity.words for key in self.parameters]
         listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
         what = f"{self.cost_mm:.3f} mm in a length of {self.length_mm:.0f} mm along {self.along}"
         if len(names) == 1:
@@ -64,15 +64,14 @@ class Weakness:
         return f"{listed} are known too little; together they cost {what}"
 
 
-def weaknesses(lengths: Lengths, names: Sequence[str], covariance: np.ndarray) -> list[Weakness]:
+def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.ndarray) -> list[Weakness]:
     """The directions that cost most, at most three; none where no length becomes uncertain by a micrometre.
 
     Parameters
     ----------
     lengths : Lengths
         Over the volume.
-    names : sequence of str
-        Of the parameters.
+    keys : sequence of ParameterKey
     covariance : (P, P)
     """
     std = np.sqrt(np.diag(covariance))
@@ -92,7 +91,7 @@ def weaknesses(lengths: Lengths, names: Sequence[str], covariance: np.ndarray) -
         start, end = lengths.ends_mm[worst]
         found.append(
             Weakness(
-                parameters=tuple(names[place] for place in named),
+                parameters=tuple(keys[place] for place in named),
                 confused=len(named) > 1 and _confused(covariance, named),
                 cost_mm=float(abs(changes[worst])),
                 length_mm=float(lengths.length_mm[worst]),

@@ -9,11 +9,13 @@ from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.model import WindowModel
+from uwlts.calibration.parameter_keys import ParameterKey, SheetParameter, WindowParameter
 
-_HELD = {
-    "window_tilt": ("window_slope_x", "window_slope_y"), "bow": ("sheet_bow",), "window_turn": ("laser_window_turn",),
+_HELD: dict[str, tuple[ParameterKey, ...]] = {
+    "window_tilt": (WindowParameter.SLOPE_X, WindowParameter.SLOPE_Y), "bow": (SheetParameter.BOW,),
+    "window_turn": (SheetParameter.WINDOW_TURN,),
 }  # fmt: skip
-_GLASS = ("glass_thickness", "glass_index")
+_GLASS = (WindowParameter.THICKNESS, WindowParameter.GLASS_INDEX)
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
         for name, others in DIMENSIONS.items()
         if name == "distortion"
         or (name == "refractions" and parameters.window is not None)
-        or any(held in parameters.names for held in _HELD.get(name, ()))
+        or any(held in parameters.keys for held in _HELD.get(name, ()))
     }
 
 
@@ -90,18 +92,18 @@ def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
     known = problem.parameters
     options = replace(known.intrinsics.options, distortion=candidate.distortion)
     intrinsics = Intrinsics(options, width_px=known.intrinsics.width_px, height_px=known.intrinsics.height_px)
-    held = {name for field, names in _HELD.items() if not getattr(candidate, field) for name in names}
+    held = {key for field, keys in _HELD.items() if not getattr(candidate, field) for key in keys}
     window, priors = known.window, dict(known.priors)
     if candidate.refractions == 1 and window is not None:
         window = WindowModel(refractions=1, distance_mm=window.distance_mm, normal=window.normal)
         held |= set(_GLASS)
         priors |= {
-            "window_distance": replace(priors["window_distance"], std=np.inf),
-            "glass_thickness": replace(priors["glass_thickness"], mean=0.0),
-            "glass_index": replace(priors["glass_index"], mean=1.0),
+            WindowParameter.DISTANCE: replace(priors[WindowParameter.DISTANCE], std=np.inf),
+            WindowParameter.THICKNESS: replace(priors[WindowParameter.THICKNESS], mean=0.0),
+            WindowParameter.GLASS_INDEX: replace(priors[WindowParameter.GLASS_INDEX], mean=1.0),
         }
-    priors = {name: replace(prior, std=0.0) if name in held else prior for name, prior in priors.items()}
+    priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in priors.items()}
     parameters = replace(known, intrinsics=intrinsics, window=window, priors=priors)
-    start = dict(zip(known.names, problem.shared, strict=True))
-    shared = np.array([start.get(name, 0.0) for name in parameters.names])
+    start = dict(zip(known.keys, problem.shared, strict=True))
+    shared = np.array([start.get(key, 0.0) for key in parameters.keys])
     return replace(problem, parameters=parameters, shared=shared)

@@ -156,5 +156,5 @@ def choice_of(found: dict[Candidate, dict[str, Prediction] | str], ways: Sequenc
         else:
             number = list(predictions).index(candidate)
             scores = {where: each.score(number) for where, each in tallies.items()}
-            judged.append(Judged(candidate, len(result[INSIDE].parameters.names), scores))
+            judged.append(Judged(candidate, len(result[INSIDE].parameters.keys), scores))
     return Choice(judged, {way.where: way for way in ways}, predictions, tallies)

@@ -46,11 +46,11 @@ class Prediction:
 
         True of models of which neither holds the other's.
         """
-        names, others = self.parameters.names, smaller.parameters.names
-        more = [place for place, name in enumerate(names) if name not in others]
-        if not set(others) <= set(names) or not more:
+        keys, others = self.parameters.keys, smaller.parameters.keys
+        more = [place for place, key in enumerate(keys) if key not in others]
+        if not set(others) <= set(keys) or not more:
             return True
-        held = np.array([smaller.parameters.value(smaller.values, names[place]) for place in more])
+        held = np.array([smaller.parameters.value(smaller.values, keys[place]) for place in more])
         off = self.values[more] - held
         square = off @ np.linalg.solve(self.covariance[np.ix_(more, more)], off)
         return bool(chi2.sf(square, len(more)) < _BY_CHANCE)
