@@ -21,7 +21,7 @@ from twin.hardware.serve import ServedTwin, serve
 from twin.options import Options
 from twin.scene import load_scene
 from uwlts.calibration.model import read_calibration
-from uwlts.calibration.procedure import calibrate
+from uwlts.calibration.procedure import calibrate_sequentially
 from uwlts.capture import Capture, part_path
 from uwlts.errors import DescriptionError
 from uwlts.hardware.guided.plan import load_guided_plan
@@ -171,7 +171,7 @@ def test_the_stage_leads_to_the_twins_camera_and_sheet(served, plan, sensor, tmp
         assert not capture.header.sensor.camera.window.mounted and capture.header.medium_name == "air"
     # The captures give the same calibration again.
     with Capture(tmp_path / "c-target.h5") as capture:
-        again = calibrate([capture]).calibration
+        again = calibrate_sequentially([capture]).calibration
     assert read_calibration(tmp_path / "c.json").camera == again.camera
 
 

@@ -16,7 +16,7 @@ from twin.scene import load_scene
 from twin.simulate import simulate
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
-from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate
+from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate_sequentially
 from uwlts.capture import Capture
 from uwlts.evaluate import Judgement, judge
 from uwlts.library import load_sensor
@@ -72,7 +72,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibratio
     ]
     with Capture(target) as air:
         opened = [Capture(path) for path in steps]
-        result = calibrate([air], opened, options=CalibrationOptions(refractions=2))
+        result = calibrate_sequentially([air], opened, options=CalibrationOptions(refractions=2))
         for capture in opened:
             capture.close()
     return folder, result

@@ -11,7 +11,7 @@ import tomli_w
 from tests.unit.calibration_views import turn
 from tests.unit.drawn_stripes import coarse_sensor
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.procedure import CalibrationOptions, calibrate
+from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
 from uwlts.capture import Capture
 from uwlts.importing import import_folder
 from uwlts.placement import camera_from_object, laser_pose
@@ -96,7 +96,8 @@ def test_a_board_in_free_poses_calibrates_camera_and_sheet(tmp_path: Path, targe
     imported = import_folder(folder, tmp_path / "board.h5")
     assert (imported.laser, imported.lamp, imported.warnings) == (8, 8, ())
     with Capture(tmp_path / "board.h5") as capture:
-        result = calibrate([capture], options=CalibrationOptions(poses="free", camera=CameraOptions(distortion=())))
+        options = CalibrationOptions(poses="free", camera=CameraOptions(distortion=()))
+        result = calibrate_sequentially([capture], options=options)
     assert result.warnings == [] and len(result.air.images) == 8
     # Four standard deviations of what the corners determine. The sheet hangs on the camera: a wrong focal length scales
     # its distance, a wrong principal point turns it.

@@ -18,7 +18,7 @@ from tests.unit.calibration_views import (
 from tests.unit.drawn_stripes import coarse_sensor, stripe_image
 from uwlts.calibration.camera_poses import CameraOptions
 from uwlts.calibration.model import read_calibration, write_calibration
-from uwlts.calibration.procedure import CalibrationOptions, calibrate
+from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.placement import camera_from_object, laser_pose
@@ -103,7 +103,7 @@ def files(air_frames, tmp_path_factory):
 def result(files):
     told = []
     with Capture(files[0]) as air, Capture(files[1]) as steps:
-        made = calibrate([air], [steps], progress=lambda *what: told.append(what))
+        made = calibrate_sequentially([air], [steps], progress=lambda *what: told.append(what))
         assert told[len(air) - 1] == ("target", len(air), len(air))
         assert told[-1] == ("step", len(steps), len(steps))
         assert len(told) == len(air) + len(steps)
@@ -130,7 +130,7 @@ def test_the_sensor_is_found(result):
 def test_circle_offsets_are_taken_out(result, files):
     assert 0.005 < max(np.abs(bias).max() for bias in result.bias_px) < 0.5
     with Capture(files[0]) as air:
-        plain = calibrate([air], options=CalibrationOptions(correct_circles=False))
+        plain = calibrate_sequentially([air], options=CalibrationOptions(correct_circles=False))
     assert plain.bias_px is None
     assert plain.calibration.window is None
     assert plain.window is None
@@ -162,7 +162,7 @@ def test_the_file_keeps_the_figures(result, tmp_path):
 def test_one_refraction_and_free_directions(files):
     options = CalibrationOptions(refractions=1, poses="stage", camera=CameraOptions(distortion=()))
     with Capture(files[0]) as air, Capture(files[1]) as steps:
-        result = calibrate([air], [steps], options=options)
+        result = calibrate_sequentially([air], [steps], options=options)
     assert result.calibration.window.refractions == 1
     assert any("one interface" in warning for warning in result.warnings)
     # Paraxial rays leave the outer face of a plate as from one interface at d + t (1/g - 1/n) / (1 - 1/n).
@@ -176,10 +176,10 @@ def test_one_refraction_and_free_directions(files):
 def test_contradictory_captures_are_refused(files, air_frames, tmp_path):
     def run(path, steps=(), **options):
         with Capture(path) as air:
-            return calibrate([air], steps, options=CalibrationOptions(**options))
+            return calibrate_sequentially([air], steps, options=CalibrationOptions(**options))
 
     with pytest.raises(CalibrationError, match="no capture"):
-        calibrate([])
+        calibrate_sequentially([])
     with pytest.raises(CalibrationError, match="tell its target"):
         run(write(tmp_path / "untold.h5", frames=air_frames[:1]))
     with pytest.raises(CalibrationError, match="found in no image"):

@@ -8,8 +8,9 @@ import pytest
 from tests.unit.calibration_views import built_sensor
 from tests.unit.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.prior_words import off_as_words
+from uwlts.calibration.joint.prior_words import format_deviation
 from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.parameter_keys import parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.sensor import Medium, Uncertainty
@@ -174,4 +175,4 @@ def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
 )
 def test_angles_are_told_in_degrees(name, value, words):
     std = np.tan(np.radians(0.5)) if "slope" in name else np.radians(0.5)
-    assert off_as_words(name, value, 0.0, std, sigmas=6.0).startswith(words)
+    assert format_deviation(parameter_of(name), value, 0.0, std, sigmas=6.0).startswith(words)

@@ -10,7 +10,7 @@ from uwlts.calibration.any_calibration import check_fits
 from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.model import read_calibration, write_calibration
 from uwlts.calibration.nominal import nominal_calibration
-from uwlts.calibration.procedure import CalibrationOptions, Evidence, calibrate, gather, solve
+from uwlts.calibration.procedure import CalibrationOptions, Evidence, calibrate_sequentially, gather, solve
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.library import load_sensor
@@ -225,7 +225,7 @@ def test_images_of_the_target_come_from_one_medium(tmp_path):
             gather([air, fresh], [], options=CalibrationOptions())
         # With a step standard in water the target must have been seen in air.
         with pytest.raises(CalibrationError, match="seen in fresh: take all images of it in air"):
-            calibrate([fresh], [fresh])
+            calibrate_sequentially([fresh], [fresh])
         # All in water is the single viewpoint: refused here only because these images show no target.
         with pytest.raises(CalibrationError, match="found in no image"):
-            calibrate([fresh])
+            calibrate_sequentially([fresh])

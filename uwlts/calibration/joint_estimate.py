@@ -128,13 +128,14 @@ class CaptureSource(BaseModel):
 
 
 class Origin(BaseModel):
-    """What a joint calibration was made from: the captures, and how well the sensor was known before."""
+    """What a calibration was made from: captures, target, how well the sensor was known before; warnings of it."""
 
     known_before: Uncertainty = Uncertainty()
     air_captures: tuple[CaptureSource, ...] = ()
     step_captures: tuple[CaptureSource, ...] = ()
     scan_captures: tuple[CaptureSource, ...] = ()
     target: dict[str, Any] | None = None
+    warnings: tuple[str, ...] = ()
 
     def captures(self) -> tuple[CaptureSource, ...]:
         """Those of targets, of steps and of scans."""

@@ -157,7 +157,7 @@ class Calibration(Description):
         return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
 
     def origin(self) -> Origin:
-        """What a joint calibration was made from, by its provenance."""
+        """What the calibration was made from, by its provenance."""
         return Origin.model_validate(self.provenance)
 
     def index_of(self, medium: Medium) -> float:

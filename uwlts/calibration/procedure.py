@@ -138,7 +138,7 @@ class Evidence:
     warnings: list[str]
 
 
-def calibrate(
+def calibrate_sequentially(
     air: Sequence[Capture],
     steps: Sequence[Capture] = (),
     *,
@@ -173,7 +173,7 @@ def calibrate(
 def gather(
     air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
 ) -> Evidence:
-    """Find the target, the stripes on it and those on the step standard in all images; errors as for `calibrate`."""
+    """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`."""
     sensor = common_sensor([*air, *steps])
     media = {capture.header.medium.kind for capture in air}
     if len(media) > 1 or (steps and media != {"air"}):
@@ -200,7 +200,7 @@ def gather(
 
 
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
-    """Calibrate from what the captures show, with the errors of `calibrate`; ``start`` is a camera nearly as sought."""
+    """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
     sensor, found = evidence.sensor, evidence.air
     camera, unbiased = _camera(evidence, options, start)
     if found.no_stripe:

@@ -87,15 +87,11 @@ def calibrate(
     overwrite
         Replace an existing file; guided, and without resume, its captures too.
     """
-    from contextlib import ExitStack
-
+    from uwlts.calibration.calibrate import calibrate as calibrated
     from uwlts.calibration.intrinsics import CameraOptions
     from uwlts.calibration.joint.advice import advice_lines
-    from uwlts.calibration.joint.procedure import calibrate_jointly
     from uwlts.calibration.model import write_calibration
     from uwlts.calibration.procedure import CalibrationOptions
-    from uwlts.calibration.procedure import calibrate as solve
-    from uwlts.capture import Capture
     from uwlts.inventory import calibration_lines
     from uwlts.refraction import require_index
     from uwlts.stripe import StripeOptions
@@ -119,27 +115,16 @@ def calibrate(
         same_water=not new_water, sizes_known=not unknown_sizes,
         stripe=StripeOptions(method=method) if method else StripeOptions(),
     )  # fmt: skip
-    with ExitStack() as stack, progress_bar("calibrating") as progress:
-        air_captures = [stack.enter_context(Capture(path)) for path in air]
-        step_captures = [stack.enter_context(Capture(path)) for path in step]
-        water_captures = [stack.enter_context(Capture(path)) for path in water]
-        scan_captures = [stack.enter_context(Capture(path)) for path in scan]
-
-        def report(stage: str, done: int, total: int) -> None:
-            progress(done, total)
-
-        result = (
-            calibrate_jointly(
-                [*air_captures, *water_captures], step_captures, scan_captures, options=options, progress=report
-            )
-            if water or joint or scan
-            else solve(air_captures, step_captures, options=options, progress=report)
-        )
-    write_calibration(out, result.calibration, overwrite=overwrite)
-    print("\n".join(calibration_lines(result.calibration)))
-    if result.calibration.joint is not None:
-        print("\n".join(advice_lines(result.calibration)))
-    for warning in result.warnings:
+    with progress_bar("calibrating") as progress:
+        calibration = calibrated(
+            air=air, water=water, step=step, scan=scan, method="joint" if joint else "auto", options=options,
+            progress=lambda stage, done, total: progress(done, total),
+        )  # fmt: skip
+    write_calibration(out, calibration, overwrite=overwrite)
+    print("\n".join(calibration_lines(calibration)))
+    if calibration.joint is not None:
+        print("\n".join(advice_lines(calibration)))
+    for warning in calibration.origin().warnings:
         warn(warning)
     print(f"wrote {out}")
 

@@ -18,7 +18,7 @@ from uwlts.calibration.any_calibration import AnyCalibration, read_any_calibrati
 from uwlts.calibration.model import Calibration, write_calibration
 from uwlts.calibration.polynomial import calibrate_polynomials
 from uwlts.calibration.polynomial_model import PolynomialCalibration, write_polynomials
-from uwlts.calibration.procedure import CalibrationOptions, calibrate
+from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
 from uwlts.capture import Capture
 from uwlts.thesis.folder import CampaignFolder
 
@@ -69,7 +69,7 @@ def _rays(target: Path, steps: list[Path], *, refractions: int) -> Calibration:
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(target))]
         opened = [stack.enter_context(Capture(path)) for path in steps]
-        return calibrate(air, opened, options=CalibrationOptions(refractions=refractions)).calibration
+        return calibrate_sequentially(air, opened, options=CalibrationOptions(refractions=refractions)).calibration
 
 
 def _polynomials(target: Path) -> PolynomialCalibration:

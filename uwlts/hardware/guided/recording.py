@@ -18,7 +18,7 @@ from uwlts.calibration.guidance.solution import RecordedPose, Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
 from uwlts.calibration.guidance.wishes import State
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.procedure import CalibrationOptions, calibrate, nominal_window
+from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially, nominal_window
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, part_path
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.hardware.camera_addresses import open_camera
@@ -99,7 +99,7 @@ def record_guided(
         return GuidedRecording(target_path(out), None, tuple(still_missing(state)))
     options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=camera)
     with Capture(target_path(out)) as capture:
-        in_air = calibrate([capture], (), options=options).calibration
+        in_air = calibrate_sequentially([capture], (), options=options).calibration
     sensor = plan.described_sensor()
     window = nominal_window(sensor.camera.window, sensor, refractions=refractions)
     unseen = phase.step(step_path(out), plan.step, StepJudge(plan.step, sensor, in_air, window))
