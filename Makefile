@@ -21,7 +21,7 @@ help:
 	@echo "make clean   remove .venv, .llvm, caches and build results"
 
 demo: setup
-	@$(PYTHON) -m twin.demo
+	@$(PYTHON) -m twin.cli demo
 
 test: setup
 	@$(PYTHON) -m twin.hardware.aravis_install

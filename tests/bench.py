@@ -111,7 +111,7 @@ def pipeline() -> list[Row]:
     """Time of stripe extraction and reconstruction on one core: the default method, and the fastest one."""
     from twin.options import Options
     from twin.scene import load_scene
-    from twin.simulate import Studio
+    from twin.studio import Studio
     from uwlts.calibration.nominal import nominal_calibration
     from uwlts.library import load_sensor
     from uwlts.reconstruction import reconstruct_pixels
@@ -201,9 +201,8 @@ def demo() -> list[Row]:
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        subprocess.run(
-            [sys.executable, "-m", "twin.demo"], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL
-        )
+        command = [sys.executable, "-m", "twin.cli", "demo"]
+        subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
         seconds = time.perf_counter() - start
     # ru_maxrss of the children is the largest single process; the demo runs two at a time.
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20

@@ -16,7 +16,7 @@ from tests.virtual_sensors import altered
 from twin.options import NONE, Options
 from twin.renderer import Renderer
 from twin.scene import load_scene
-from twin.simulate import simulate
+from twin.studio import record_scene
 from uwlts.library import load_sensor
 from uwlts.sensor import Medium
 
@@ -109,7 +109,7 @@ def campaign() -> tuple[int, float, float, float]:
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         for number, (name, changes, seed) in enumerate(recordings):
-            simulate(
+            record_scene(
                 load_scene(name, changes=changes), load_sensor("thesis"), Path(folder, f"{number}.h5"),
                 as_built=as_built, options=Options(seed=seed),
                 progress=lambda done, total: moments.append(time.perf_counter()),

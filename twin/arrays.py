@@ -6,13 +6,28 @@ the kernel that gathers a vector's components. Either would compile kernels anew
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+# Mitsuba's arrays are those of the variant in use. The stubs give them two unrelated families of types (`mitsuba.Float`
+# and `drjit.auto.ad.Float`) and refuse sums of points and vectors: annotations name the arrays without checking them.
+Float: TypeAlias = Any
+Bool: TypeAlias = Any
+UInt32: TypeAlias = Any
+Point2f: TypeAlias = Any
+Point3f: TypeAlias = Any
+Vector3f: TypeAlias = Any
+SurfaceInteraction3f: TypeAlias = Any
+PCG32: TypeAlias = Any
+BSDFPtr: TypeAlias = Any
 
 _ALIGNMENT_BYTES = 64
 
 
-def to_jit(kind: type, values: np.ndarray) -> mi.Float:
+def to_jit(kind: type, values: np.ndarray) -> Float:
     """A one-dimensional array as ``mi.Float`` or ``mi.UInt32`` whose memory is always aligned."""
     dtype = np.dtype(np.float32 if kind is mi.Float else np.uint32)
     size = values.size * dtype.itemsize
@@ -23,6 +38,18 @@ def to_jit(kind: type, values: np.ndarray) -> mi.Float:
     return kind(aligned)
 
 
-def to_numpy(vector: mi.Point3f) -> np.ndarray:
+def to_numpy(vector: Point3f) -> np.ndarray:
     """The components of N vectors as (N, 3)."""
     return np.stack([component.numpy() for component in vector], axis=1)
+
+
+def scalar_transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
+    """A transform (4, 4) of a shape, fixed in the scene."""
+    return mi.ScalarTransform4f(matrix)
+
+
+def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:
+    """A transform (4, 4) whose numbers are not compiled into kernels."""
+    opaque = mi.Matrix4f(matrix)
+    dr.make_opaque(opaque)
+    return mi.Transform4f(opaque)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.arrays import to_jit, to_numpy
+from twin.arrays import Bool, Float, Point2f, Point3f, SurfaceInteraction3f, Vector3f, to_jit, to_numpy
 from twin.objects import Objects
 from twin.pose import SensorPose
 from twin.windows import WindowFaces
@@ -44,7 +44,7 @@ class LensRays:
         """Radius of the entrance pupil, D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant)."""
         return 0.5 * self.camera.focal_length_mm / self._working_f_number()
 
-    def through_pupil(self, chief: mi.Vector3f, pupil: mi.Point2f) -> tuple[mi.Point3f, mi.Vector3f]:
+    def through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
         """Origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
 
         ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens).
@@ -53,7 +53,7 @@ class LensRays:
         focused = chief * (self.camera.focus_distance_mm / chief.z)
         return origin, dr.normalize(mi.Vector3f(focused - origin))
 
-    def directions(self, x: mi.Float, y: mi.Float) -> mi.Vector3f:
+    def directions(self, x: Float, y: Float) -> Vector3f:
         """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
         focal = self.camera.focal_length_px()
         cx, cy = self.camera.principal_point()
@@ -61,7 +61,7 @@ class LensRays:
         true = self._undistorted(seen)
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
-    def _undistorted(self, seen: mi.Point2f) -> mi.Point2f:
+    def _undistorted(self, seen: Point2f) -> Point2f:
         """Invert x_d = x (1 + k1 r2 + k2 r4 + k3 r6) + 2 p1 x y + p2 (r2 + 2 x2) (Brown 1971) by Newton's method."""
         d = self.camera.distortion
         if not any((d.k1, d.k2, d.p1, d.p2, d.k3)):
@@ -98,9 +98,9 @@ class LensRays:
 class Bundle:
     """Camera rays in the medium, in the sensor's OCS: origins, unit directions, and sensor irradiance per radiance."""
 
-    origin: mi.Point3f
-    direction: mi.Vector3f
-    weight: mi.Float
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
 
 
 class View:
@@ -118,7 +118,7 @@ class View:
         self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
         self._blur: tuple[np.ndarray, np.ndarray] | None = None
 
-    def bundle(self, x: mi.Float, y: mi.Float, pupil: mi.Point2f | None = None) -> Bundle:
+    def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Bundle:
         """Rays behind the window of image points; pixel (0, 0) is the centre of the first pixel.
 
         ``pupil`` holds points of the unit disc; without them chief rays through the pupil's centre are returned.
@@ -141,7 +141,7 @@ class View:
             self._grids[spacing] = bundle, (rows, columns)
         return self._grids[spacing]
 
-    def depth_mm(self, p: mi.Point3f) -> mi.Float:
+    def depth_mm(self, p: Point3f) -> Float:
         """Depth z in the camera frame of points of the OCS."""
         row = self._camera_from_object[2]
         return p.x * float(row[0]) + p.y * float(row[1]) + p.z * float(row[2]) + float(row[3])
@@ -168,9 +168,8 @@ class View:
         pupil = np.concatenate([np.zeros((3, 2)), rim])
         at = (image[:, None] + shift).reshape(-1, 2)
         through = np.tile(pupil, (len(image), 1))
-        bundle = self.bundle(
-            *(to_jit(mi.Float, v) for v in at.T), mi.Point2f(*(to_jit(mi.Float, v) for v in through.T))
-        )
+        x, y, pupil_x, pupil_y = (to_jit(mi.Float, values) for values in (*at.T, *through.T))
+        bundle = self.bundle(x, y, mi.Point2f(pupil_x, pupil_y))
         dr.eval(bundle.origin, bundle.direction, bundle.weight)
         transform = self._camera_from_object
         o = to_numpy(bundle.origin).astype(float) @ transform[:3, :3].T + transform[:3, 3]
@@ -189,14 +188,14 @@ class View:
 class RaySegment:
     """A segment of camera rays in the OCS up to a surface, with the weight and length in mm of the path before it."""
 
-    origin: mi.Point3f
-    direction: mi.Vector3f
-    weight: mi.Float
-    length_before: mi.Float
-    si: mi.SurfaceInteraction3f
-    valid: mi.Bool
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
+    length_before: Float
+    si: SurfaceInteraction3f
+    valid: Bool
 
-    def end(self) -> mi.Point3f:
+    def end(self) -> Point3f:
         """Where the segment ends, in the OCS."""
         return mi.Point3f(self.origin + self.direction * dr.select(self.valid, self.si.t, 1.0))
 
@@ -206,7 +205,7 @@ def ray_segments(
     extinction: float,
     pose: SensorPose,
     bundle: Bundle,
-    travel_mm: mi.Float | None,
+    travel_mm: Float | None,
     *,
     mirrors: int,
 ) -> Iterator[RaySegment]:

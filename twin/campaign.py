@@ -255,7 +255,7 @@ def _lower_block(scene: Scene) -> int:
             f"{scene.title}: a step standard of {len(blocks)} blocks has no height to change: build it of two, or set "
             "step_height_half_width_mm to 0"
         )
-    return max(blocks, key=blocks.get)
+    return max(blocks, key=lambda number: blocks[number])
 
 
 def _moved(thing: AnyObject, by_mm: tuple[float, float, float]) -> AnyObject:

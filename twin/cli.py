@@ -9,12 +9,15 @@ from cyclopts import App, Parameter
 
 import uwlts
 from twin.campaign import campaign_names, load_campaign
-from twin.options import ALL, CPU, NONE, Options, use_variant
+from twin.demonstration import FOLDER as DEMO_FOLDER
+from twin.demonstration import demo as run_demo
+from twin.options import CPU, use_variant
+from twin.recording import choose_options, choose_scene, choose_sensors
+from twin.recording import simulate as render_to_file
 from twin.scene import load_scene, scene_names
 from uwlts.console import progress_bar, run
 from uwlts.errors import DescriptionError
-from uwlts.library import load_sensor, names
-from uwlts.sensor import Sensor
+from uwlts.library import names
 from uwlts.waters import water_names
 
 app = App(
@@ -36,7 +39,7 @@ def simulate(
     medium: str | None = None,
     spp: int = 16,
     seed: int = 0,
-    water: str | None = None,
+    water: float | str | None = None,
     without: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
     ideal: Annotated[bool, Parameter(negative="")] = False,
     resume: Annotated[bool, Parameter(negative="")] = False,
@@ -81,36 +84,24 @@ def simulate(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    places: tuple[str | None, ...] = placement or (None,)
-    if len(places) > 1 and "{placement}" not in out.name:
-        raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
-    recordings = []
-    for place in places:
-        wanted = {"placement": place, "medium": medium, "water": _water(water)}
-        changes = {key: value for key, value in wanted.items() if value is not None}
-        description = load_scene(scene, changes=changes)
-        recordings.append((description, out.with_name(out.name.replace("{placement}", description.placement))))
-    nominal = load_sensor(sensor)
-    built = _built(as_built, nominal, sensor)
-    options = Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))
-    use_variant(variant)
-    from twin.simulate import simulate as record
-
-    for description, path in recordings:
-        with progress_bar(f"{description.title}, {description.placement}") as progress:
-            record(
-                description, nominal, path, as_built=built, options=options,
-                overwrite=overwrite, resume=resume, progress=progress,
-            )  # fmt: skip
-        print(f"wrote {path}")
-
-
-def _water(text: str | None) -> str | float | None:
-    """A turbidity if it reads as a number, else a name."""
-    try:
-        return None if text is None else float(text)
-    except ValueError:
-        return text
+    render_to_file(
+        scene,
+        sensor=sensor,
+        out=out,
+        as_built=as_built,
+        placement=placement,
+        medium=medium,
+        spp=spp,
+        seed=seed,
+        water=water,
+        without=without,
+        ideal=ideal,
+        resume=resume,
+        overwrite=overwrite,
+        variant=variant,
+        show_progress=True,
+        report=print,
+    )
 
 
 @app.command
@@ -121,7 +112,7 @@ def serve(
     as_built: str | None = None,
     placement: str | None = None,
     medium: str | None = None,
-    water: str | None = None,
+    water: float | str | None = None,
     spp: int = 16,
     seed: int = 0,
     without: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
@@ -174,13 +165,11 @@ def serve(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    wanted = {"placement": placement, "medium": medium, "water": _water(water)}
-    description = load_scene(scene, changes={key: value for key, value in wanted.items() if value is not None})
-    options = Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))
+    description = choose_scene(scene, placement=placement, medium=medium, water=water)
+    options = choose_options(spp=spp, seed=seed, without=without, ideal=ideal)
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
-    nominal = load_sensor(sensor)
-    built = _built(as_built, nominal, sensor)
+    _, built = choose_sensors(sensor, as_built)
     use_variant(variant)
     from twin.hardware.bench import parse_fault
     from twin.hardware.serve import serve as serve_twin
@@ -188,23 +177,12 @@ def serve(
 
     faults = [parse_fault(text) for text in fault]
     with serve_twin(
-        description, built or nominal, options=options, stage_start_mm=stage_start, lamp=lamp, faults=faults,
+        description, built, options=options, stage_start_mm=stage_start, lamp=lamp, faults=faults,
         speed_up=speed_up, report=lambda line: print(line, flush=True),
     ) as served:  # fmt: skip
         print("\n".join([*served.lines(), "serving; Ctrl-C ends it"]), flush=True)
         wait_for_end(served)
     print(f"ended after {served.rates()}")
-
-
-def _built(as_built: str | None, nominal: Sensor, name: str) -> Sensor | None:
-    """The sensor that is rendered in place of the nominal one called ``name``, whose images it must fit."""
-    if as_built is None:
-        return None
-    built = load_sensor(as_built)
-    shared = {"width_px", "height_px", "stripe_along"}
-    if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
-        raise DescriptionError(f"'{as_built}' has another image size or stripe orientation than '{name}'")
-    return built
 
 
 @app.command
@@ -336,6 +314,25 @@ def sweep(
         )
     print("\n".join(outcome_lines(described, outcome)))
     print(f"wrote {folder / 'report.html'}, designs.csv, summary.json and winner.toml")
+
+
+@app.command
+def demo(*, out: Path = DEMO_FOLDER) -> None:
+    """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
+
+    Runs exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html.
+
+    Example: twin demo
+
+    Parameters
+    ----------
+    out
+        Folder for all results.
+    """
+    try:
+        run_demo(out)
+    except subprocess.CalledProcessError as error:
+        sys.exit(error.returncode)  # the command has printed why
 
 
 @app.command

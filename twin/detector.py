@@ -9,6 +9,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from typing import cast
 
 import numpy as np
 from scipy import special
@@ -99,7 +100,8 @@ def _checked(electrons: np.ndarray, pattern: FixedPattern | None) -> np.ndarray:
 
 def _fast_generators(rng: np.random.Generator, count: int) -> list[np.random.Generator]:
     """Independent generators that continue the given one's seed; SFC64 is NumPy's fastest."""
-    return [np.random.Generator(np.random.SFC64(seed)) for seed in rng.bit_generator.seed_seq.spawn(count)]
+    seeds = cast(np.random.SeedSequence, rng.bit_generator.seed_seq)
+    return [np.random.Generator(np.random.SFC64(seed)) for seed in seeds.spawn(count)]
 
 
 def _collected(

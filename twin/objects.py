@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
 
-from twin.arrays import to_jit
+from twin.arrays import Bool, Float, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.finish import albedo_parts, finish_bsdf, square_on
 from twin.pattern import register_circle_pattern
-from twin.scene import AnyObject, Block, CirclePlate, FreeForm, Head, Mesh, Pipe, Scene, Sphere
+from twin.scene import AnyObject, Block, CirclePlate, FreeForm, Head, Mesh, Pipe, Plate, Scene, Sphere, Weld
 from twin.shapes import bowed_plate, head_surface, weld_surface
 from uwlts.errors import DescriptionError
 
@@ -50,21 +50,21 @@ class Objects:
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
-    _facts: dict[str, mi.Float]
+    _facts: dict[str, Float]
 
-    def mirror_share(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+    def mirror_share(self, si: SurfaceInteraction3f) -> Float:
         """Share of light that the place hit reflects as a mirror; 0 on backs and where nothing is hit."""
         return dr.select(si.wi.z > 0, self._fact("mirror", si), 0.0)
 
-    def polarisation(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+    def polarisation(self, si: SurfaceInteraction3f) -> Float:
         """Degree of polarisation of laser light that the object hit scatters, 0 where nothing is hit."""
         return self._fact("polarisation", si)
 
-    def roughness_um(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+    def roughness_um(self, si: SurfaceInteraction3f) -> Float:
         """Rms height of the object hit, 0 where nothing is hit."""
         return self._fact("roughness_um", si)
 
-    def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
+    def albedo(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
         """Radiance towards the viewer from surfaces under a sky of radiance 1 all around, mirror images aside.
 
         It is the share of light from the viewer's direction that the surface scatters: a diffuse surface's reflectance;
@@ -75,7 +75,7 @@ class Objects:
         last = len(_ALBEDO_COSINES) - 1
         place = dr.minimum(dr.abs(si.wi.z), 1.0) * last
         below = mi.UInt32(dr.minimum(dr.floor(place), last - 1))
-        start = dr.reinterpret_array(mi.UInt32, si.shape) * (last + 1) + below
+        start = _registry_number(si.shape) * (last + 1) + below
         black, per_unit = (
             dr.lerp(
                 dr.gather(mi.Float, self._facts[key], start, active),
@@ -86,8 +86,8 @@ class Objects:
         )
         return dr.select(active, black + per_unit * reflectance, 0.0)
 
-    def _fact(self, key: str, si: mi.SurfaceInteraction3f) -> mi.Float:
-        return dr.gather(mi.Float, self._facts[key], dr.reinterpret_array(mi.UInt32, si.shape), si.is_valid())
+    def _fact(self, key: str, si: SurfaceInteraction3f) -> Float:
+        return dr.gather(mi.Float, self._facts[key], _registry_number(si.shape), si.is_valid())
 
 
 def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
@@ -133,9 +133,14 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     )
 
 
-def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> mi.Float:
+def _registry_number(shape: mi.ShapePtr) -> UInt32:
+    """Numbers of shapes in Dr.Jit's registry."""
+    return cast(Any, dr.reinterpret_array(mi.UInt32, shape))
+
+
+def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     """Values (objects,) or (objects, N) at the places of the objects' shapes in Dr.Jit's registry."""
-    number = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+    number = [int(_registry_number(mi.ShapePtr(shape))[0]) for shape in shapes]
     table = np.zeros((max(number) + 1, *values.shape[1:]), np.float32)
     table[number] = values
     flat = to_jit(mi.Float, table)
@@ -162,15 +167,17 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
             kind = "cylinder"
         case CirclePlate() if thing.bow_mm != 0:
             return _mesh(thing, pose, bsdf)
-        case Mesh() | FreeForm():
+        case Mesh() | Head() | Weld():
             return _mesh(thing, pose, {"type": "twosided", "bsdf": bsdf})
-        case _:
+        case Plate() | CirclePlate():
             matrix = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1)
             kind = "rectangle"
-    return mi.load_dict({"type": kind, "to_world": _to_world(matrix), "bsdf": bsdf})
+        case _:
+            assert_never(thing)
+    return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
 
 
-def _mesh(thing: Mesh | FreeForm | CirclePlate, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
+def _mesh(thing: Mesh | Head | Weld | CirclePlate, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
     """A surface of triangles with its vertices already in scene coordinates."""
     vertices, faces, uv = _surface(thing)
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -186,10 +193,12 @@ def _mesh(thing: Mesh | FreeForm | CirclePlate, pose: np.ndarray, bsdf: dict[str
     return mesh
 
 
-def _surface(thing: Mesh | FreeForm | CirclePlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface(thing: Mesh | Head | Weld | CirclePlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (V, 3) in the object's own frame, faces (F, 3) and, if it has them, texture coordinates (V, 2)."""
     if isinstance(thing, FreeForm):
-        vertices, faces = head_surface(height_mm=thing.height_mm) if isinstance(thing, Head) else weld_surface(thing)
+        # Frozen models are hashable, which type checkers do not see.
+        weld = cast(Any, thing)
+        vertices, faces = head_surface(height_mm=thing.height_mm) if isinstance(thing, Head) else weld_surface(weld)
         return vertices, faces, None
     if isinstance(thing, CirclePlate):
         return bowed_plate(width_mm=thing.width_mm, height_mm=thing.height_mm, bow_mm=thing.bow_mm)
@@ -214,7 +223,9 @@ def _surface_from_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
         loaded = trimesh.load(path, force="scene")
     except (ValueError, NotImplementedError, OSError) as error:
         raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
-    vertices, faces, uv, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros((0, 2))], 0
+    assert isinstance(loaded, trimesh.Scene)  # as it was forced to be
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
+    uv: list[np.ndarray | None] = [np.zeros((0, 2))]
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
@@ -223,26 +234,28 @@ def _surface_from_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
             faces.append(part.faces + count)
             uv.append(getattr(part.visual, "uv", None))
             count += len(part.vertices)
-    textured = all(coordinates is not None for coordinates in uv)
-    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv) if textured else None
+    known = [coordinates for coordinates in uv if coordinates is not None]
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(known) if len(known) == len(uv) else None
 
 
 def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
     """The mirrors of one object at its pose (4, 4) in the scene."""
     if thing.mirror_share() == 0:
         return
-    if isinstance(thing, Block):
-        half = np.array(thing.size_mm) / 2
-        for axes in _BLOCK_FACES:
-            face = np.eye(4)
-            face[:3, :3], face[:3, 3] = axes, axes[:, 2] * half
-            yield MirrorFace(pose @ face, np.abs(axes.T @ half)[:2], thing.mirror_share())
-    else:
-        yield MirrorFace(pose @ _FACING_SENSOR, np.array([thing.width_mm, thing.height_mm]) / 2, thing.mirror_share())
-
-
-def _to_world(matrix: np.ndarray) -> mi.ScalarTransform4f:
-    return mi.ScalarTransform4f(matrix)
+    match thing:
+        case Block():
+            half = np.array(thing.size_mm) / 2
+            for axes in _BLOCK_FACES:
+                face = np.eye(4)
+                face[:3, :3], face[:3, 3] = axes, axes[:, 2] * half
+                yield MirrorFace(pose @ face, np.abs(axes.T @ half)[:2], thing.mirror_share())
+        case Plate():
+            half = np.array([thing.width_mm, thing.height_mm]) / 2
+            yield MirrorFace(pose @ _FACING_SENSOR, half, thing.mirror_share())
+        case Sphere() | Pipe() | Mesh() | Head() | Weld() | CirclePlate():
+            raise NotImplementedError(f"a {thing.kind} has no flat face that could be a mirror")
+        case _:
+            assert_never(thing)
 
 
 def _scaled(x: float, y: float, z: float) -> np.ndarray:

@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.arrays import Float, Point3f, Vector3f, opaque_transform
+
 
 @dataclass(frozen=True)
 class Travel:
@@ -22,7 +24,7 @@ class Travel:
     row_mm: float
     middle_row: float
 
-    def at(self, row: mi.Float, moment: mi.Float | float) -> mi.Float:
+    def at(self, row: Float, moment: Float | float) -> Float:
         """Travel in mm of image rows at a moment of their exposure, from 0 to 1."""
         exposure, per_row = dr.opaque(mi.Float, self.exposure_mm), dr.opaque(mi.Float, self.row_mm)
         return (row - self.middle_row) * per_row + (moment - 0.5) * exposure
@@ -46,11 +48,12 @@ class SensorPose:
 
     def moved(self, travel_mm: float) -> SensorPose:
         """The pose after a travel, standing still."""
+        assert self.travel is not None
         transform = self.scene_from_object.copy()
         transform[:3, 3] += travel_mm * self.travel.direction
         return SensorPose(transform)
 
-    def ray(self, origin: mi.Point3f, direction: mi.Vector3f, travel_mm: mi.Float | None = None) -> mi.Ray3f:
+    def ray(self, origin: Point3f, direction: Vector3f, travel_mm: Float | None = None) -> mi.Ray3f:
         """A ray of the OCS in the scene, where the sensor has travelled by ``travel_mm``."""
         # A point plus a vector is a vector to Dr.Jit, and vectors are not moved.
         start = self._to_scene @ mi.Point3f(origin)
@@ -58,22 +61,15 @@ class SensorPose:
             start += self._direction * travel_mm
         return mi.Ray3f(mi.Point3f(start), self.direction(direction))
 
-    def direction(self, direction: mi.Vector3f) -> mi.Vector3f:
+    def direction(self, direction: Vector3f) -> Vector3f:
         """A direction of the OCS in the scene."""
         # The difference of two points is a point to Dr.Jit, which a transform would also shift.
         return self._to_scene @ mi.Vector3f(direction)
 
-    def object_travel(self, travel_mm: mi.Float) -> mi.Vector3f:
+    def object_travel(self, travel_mm: Float) -> Vector3f:
         """The sensor's travel as a vector of the OCS."""
         return self.object_direction(self._direction) * travel_mm
 
-    def object_direction(self, direction: mi.Vector3f) -> mi.Vector3f:
+    def object_direction(self, direction: Vector3f) -> Vector3f:
         """A direction of the scene in the OCS."""
         return self._to_object @ mi.Vector3f(direction)
-
-
-def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:
-    """A transform (4, 4) whose numbers are not compiled into kernels."""
-    opaque = mi.Matrix4f(matrix)
-    dr.make_opaque(opaque)
-    return mi.Transform4f(opaque)

@@ -12,14 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.arrays import to_jit
+from twin.arrays import Float, UInt32, to_jit
 from twin.camera import Bundle, RaySegment, View, ray_segments
 from twin.image_sampling import (
     NODE_SPACING_PX,
@@ -149,7 +149,7 @@ class Renderer:
                 for moment, (light, *_) in self._moments(pose, direct)]  # fmt: skip
         return self._pixels_of(np.any(near, axis=0))
 
-    def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None = None) -> mi.Float:
+    def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None = None) -> Float:
         """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
         direct, _ = lights(self._sources[:1], pose)
         segment = next(self._segments(pose, bundle, travel_mm))
@@ -157,18 +157,16 @@ class Renderer:
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
-    def _segments(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None) -> Iterator[RaySegment]:
+    def _segments(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
         return ray_segments(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
 
-    def _sigmas(self, light: Light, segment: RaySegment) -> mi.Float:
+    def _sigmas(self, light: Light, segment: RaySegment) -> Float:
         """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
         here = light.at(segment.end())
         return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
-    def _radiance(
-        self, pose: SensorPose, segment: RaySegment, sources: list[Light], travel_mm: mi.Float | None
-    ) -> mi.Float:
+    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], travel_mm: Float | None) -> Float:
         """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
@@ -187,6 +185,7 @@ class Renderer:
         bundle, shape = self.view.grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
         reach = np.zeros_like(lit, np.float32)
+        image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         for moment, sources in self._moments(pose, direct + mirrored):
             haze = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
@@ -219,7 +218,7 @@ class Renderer:
                 direct, mirrored = lights(self._sources, moved, self._mirrors)
                 yield moved, direct + mirrored
 
-    def _haze(self, light: Light, segment: RaySegment, sigmas: mi.Float) -> mi.Float:
+    def _haze(self, light: Light, segment: RaySegment, sigmas: Float) -> Float:
         """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
 
         ``sigmas`` is the sheet's distance where the rays end on a surface, in standard deviations.
@@ -293,11 +292,11 @@ class Renderer:
         return image
 
     def _evenly_lit_sums(
-        self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None, ambient: bool
-    ) -> tuple[mi.Float]:
+        self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, ambient: bool
+    ) -> tuple[Float]:
         return (self._evenly_lit(pose, bundle, travel_mm, ambient=ambient),)
 
-    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None, *, ambient: bool) -> mi.Float:
+    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, *, ambient: bool) -> Float:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -318,8 +317,8 @@ class Renderer:
     # --- pixels -------------------------------------------------------------------------------------------------------
 
     def _stripe_sums(
-        self, pose: SensorPose, bundle: Bundle, travel_mm: mi.Float | None, sources: list[Light]
-    ) -> tuple[mi.Float, mi.Float, mi.Float]:
+        self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, sources: list[Light]
+    ) -> tuple[Float, Float, Float]:
         """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
         for segment in self._segments(pose, bundle, travel_mm):
@@ -330,7 +329,7 @@ class Renderer:
         return total, polarised, rough
 
     def _fine(
-        self, light: Callable[..., tuple[mi.Float, ...]], pose: SensorPose, rows: np.ndarray, columns: np.ndarray,
+        self, light: Callable[..., tuple[Float, ...]], pose: SensorPose, rows: np.ndarray, columns: np.ndarray,
         *rest: object, spp: int, shifted: bool = False,
     ) -> np.ndarray:  # fmt: skip
         """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray.
@@ -359,9 +358,10 @@ class Renderer:
 
     def _pixels_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels in the marked grid cells."""
-        return np.nonzero(self._repeated(cells))
+        rows, columns = np.nonzero(self._repeated(cells))
+        return rows, columns
 
-    def _spread(self, values: mi.Float, shape: tuple[int, int]) -> np.ndarray:
+    def _spread(self, values: Float, shape: tuple[int, int]) -> np.ndarray:
         """Values of nodes given to the pixels between them, (H, W); zero if they are one number."""
         if dr.width(values) == 1:
             return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
@@ -380,9 +380,10 @@ def _further(sensor: Sensor, laser: Laser, medium: Medium) -> Source:
     return Source(Sheet(other, medium), np.linalg.inv(camera_from_object(other)) @ camera_from_object(sensor))
 
 
-def _random(count: int, seed: int) -> mi.Float:
+def _random(count: int, seed: int) -> Float:
     """Numbers from 0 to 1 that depend on their index and the seed."""
-    return mi.sample_tea_float32(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, seed))
+    index, key = cast(UInt32, dr.arange(mi.UInt32, count)), cast(UInt32, dr.opaque(mi.UInt32, seed))
+    return mi.sample_tea_float32(index, key)
 
 
 def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

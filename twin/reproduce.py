@@ -103,9 +103,11 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, ov
     try:
         folder.mkdir(parents=True, exist_ok=True)
         recorded = sorted(folder.glob("campaign-*/*.h5*"))
-        known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        content = path.read_bytes() if path.is_file() else b"null"
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    try:
+        known = json.loads(content)
     except ValueError:
         known = None
     if known == plan:
@@ -133,12 +135,12 @@ def _record(job: _Job, tell: Callable[[None], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
 
-    from twin.simulate import simulate
+    from twin.studio import record_scene
 
     dr.set_thread_count(1)
     try:
         # What is there of an incomplete recording is a part to go on with, or lacks its truth.
-        simulate(
+        record_scene(
             job.take.scene, job.take.sensor, job.path, as_built=job.take.built, options=job.options,
             overwrite=True, resume=part_path(job.path).exists(), progress=lambda images, total: tell(None),
         )  # fmt: skip

@@ -291,7 +291,8 @@ class Motion(Description):
     def recorded_direction(self) -> tuple[float, float, float]:
         """Unit direction that the capture states."""
         vector = np.array(self.nominal_direction or self.direction)
-        return tuple(float(x) for x in vector / np.linalg.norm(vector))
+        x, y, z = (vector / np.linalg.norm(vector)).tolist()
+        return x, y, z
 
     def shots(self) -> Iterator["Shot"]:
         """Every image of the scan in its order."""

@@ -178,11 +178,10 @@ def _quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.nda
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
-def _locked(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+def _locked(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The arrays, no longer to be written to: they are kept for the next caller."""
-    for array in arrays:
-        array.flags.writeable = False
-    return arrays
+    vertices.flags.writeable = faces.flags.writeable = False
+    return vertices, faces
 
 
 def bowed_plate(

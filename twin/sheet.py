@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.arrays import to_jit
+from twin.arrays import Float, Point3f, UInt32, Vector3f, to_jit
 from twin.windows import WindowFaces, frame_about
 from uwlts.errors import DesignError
 from uwlts.placement import camera_from_object, laser_pose
@@ -50,20 +51,20 @@ class SheetLight:
     ``exit_mm`` is the way back to the laser's window.
     """
 
-    distance_mm: mi.Float
-    sigma_mm: mi.Float
-    irradiance: mi.Float
-    direction: mi.Vector3f
-    normal: mi.Vector3f
-    exit_mm: mi.Float
+    distance_mm: Float
+    sigma_mm: Float
+    irradiance: Float
+    direction: Vector3f
+    normal: Vector3f
+    exit_mm: Float
 
 
 @dataclass(frozen=True)
 class SheetRays:
     """Rays of the sheet's light in the OCS, each of equal power: where they leave the window, and unit directions."""
 
-    origin: mi.Point3f
-    direction: mi.Vector3f
+    origin: Point3f
+    direction: Vector3f
 
 
 class Sheet:
@@ -108,7 +109,7 @@ class Sheet:
         self._waist, self._rayleigh, self._waist_at = waist, rayleigh, laser.waist_distance_mm
         self._extinction = medium.extinction_per_mm(laser.wavelength_nm)
 
-    def at(self, p: mi.Point3f) -> SheetLight:
+    def at(self, p: Point3f) -> SheetLight:
         """Light of the sheet at points in the OCS.
 
         The slope of the fan ray through a point solves y0(m) + m Z = Y (Newton). Between two fan rays flows the power
@@ -135,7 +136,7 @@ class Sheet:
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
         return SheetLight(distance, sigma, dr.select(exit_mm > 0, irradiance, 0.0), direction, normal, exit_mm)
 
-    def sample(self, u: mi.Point3f) -> SheetRays:
+    def sample(self, u: Point3f) -> SheetRays:
         """Rays behind the window, drawn in proportion to power with three numbers from 0 to 1 each.
 
         ``u.x`` chooses the fan ray, ``u.y`` and ``u.z`` how far beside and how much turned against it: with the
@@ -146,7 +147,7 @@ class Sheet:
         t = self._normalised(m)
         tilt, z = _value(self._tilt, t), _value(self._exit_z, t)
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
-        along = mi.Vector3f(tilt, m, 1.0)
+        along = cast(Vector3f, mi.Vector3f(tilt, m, 1.0))
         leaves = mi.Point3f(_value(self._x0, t) + tilt * z, _value(self._y0, t) + m * z, z)
         # Where the ray is as far from the laser as the waist.
         from_laser = leaves - mi.Point3f(self._origin)
@@ -159,11 +160,11 @@ class Sheet:
         along.x += turned * stretch
         return SheetRays(leaves, dr.normalize(along))
 
-    def _normalised(self, m: mi.Float) -> mi.Float:
+    def _normalised(self, m: Float) -> Float:
         offset, scale = self._y0.mapparms()
         return dr.fma(m, scale, offset)
 
-    def _normal(self, m: mi.Float, t: mi.Float, z: mi.Float) -> mi.Vector3f:
+    def _normal(self, m: Float, t: Float, z: Float) -> Vector3f:
         """Unit normal of the surface X(Y, Z): its derivatives are X_Y = (x0' + k' Z) / (y0' + Z), X_Z = k - m X_Y."""
         # At the fan's origin, where all rays meet, both derivatives vanish.
         spread = dr.maximum(_value(self._dy0, t) + z, _SMALLEST_SPREAD_MM)
@@ -207,7 +208,8 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindo
 def _power_along(laser: Laser, slope: np.ndarray, fan: _FanBehindWindow) -> tuple[PowerTable, float]:
     """Power behind the window per slope, and in total in W."""
     lit = _fan_lit_angles(laser)
-    nodes = np.linspace(*np.interp(lit[[0, -1]], fan.angle, slope), _NODES)
+    first, last = np.interp(lit[[0, -1]], fan.angle, slope)
+    nodes = np.linspace(first, last, _NODES)
     angle_of, passes = _series(slope, fan.angle, _SERIES_SLOPE), _series(slope, fan.transmitted, 1e-6)
     density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
     between = np.union1d(lit, fan.angle[(fan.angle > lit[0]) & (fan.angle < lit[-1])])
@@ -222,7 +224,7 @@ def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshe
     return fit.truncate(max(1, np.count_nonzero(left > tolerance)))
 
 
-def _value(series: Chebyshev, t: mi.Float) -> mi.Float:
+def _value(series: Chebyshev, t: Float) -> Float:
     """The series at its variable brought to -1 to 1, by Clenshaw's recurrence, which keeps 32 bits exact."""
     ahead, beyond = mi.Float(0.0), mi.Float(0.0)
     for coefficient in series.coef[:0:-1]:
@@ -230,7 +232,7 @@ def _value(series: Chebyshev, t: mi.Float) -> mi.Float:
     return dr.fma(t, ahead, float(series.coef[0]) - beyond)
 
 
-def _standard_normal(u: mi.Float) -> mi.Float:
+def _standard_normal(u: Float) -> Float:
     return math.sqrt(2.0) * dr.erfinv(dr.clip(2 * u - 1, -1 + 1e-7, 1 - 1e-7))
 
 
@@ -292,7 +294,7 @@ class PowerTable:
         self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
         self._power_per_step = power_w / self._step
 
-    def at(self, x: mi.Float) -> mi.Float:
+    def at(self, x: Float) -> Float:
         """Power in W per unit of the coordinate."""
         place = (x - self._low) / self._step
         # What is not a number becomes no index that clipping alone would keep within the table.
@@ -300,7 +302,7 @@ class PowerTable:
         share = dr.lerp(*self._ends(cell), place - mi.Float(cell))
         return dr.select((place >= 0) & (place <= self._cells), self._power_per_step * share, 0.0)
 
-    def draw(self, u: mi.Float) -> mi.Float:
+    def draw(self, u: Float) -> Float:
         """The coordinate below which the share ``u`` of the power lies: even ``u`` give places as dense as the power.
 
         Within a cell the share a t + (b - a) t^2 / 2 of its ends' densities a and b is solved for t, 0 to 1.
@@ -311,5 +313,5 @@ class PowerTable:
         t = 2 * rest / dr.maximum(a + dr.safe_sqrt(a * a + 2 * (b - a) * rest), 1e-30)
         return self._low + self._step * (mi.Float(cell) + dr.clip(t, 0.0, 1.0))
 
-    def _ends(self, cell: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    def _ends(self, cell: UInt32) -> tuple[Float, Float]:
         return dr.gather(mi.Float, self._share, cell), dr.gather(mi.Float, self._share, cell + 1)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.arrays import to_jit, to_numpy
+from twin.arrays import Float, to_jit, to_numpy
 from twin.pose import SensorPose, Travel
 from twin.renderer import Renderer
 from uwlts.truth import TruthStatus
@@ -53,13 +53,13 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Tr
     if len(line) == 0:
         return truth
 
-    def position(across: mi.Float, at: mi.Float) -> tuple[mi.Float, mi.Float]:
+    def position(across: Float, at: Float) -> tuple[Float, Float]:
         return (at, across) if along_width else (across, at)
 
-    def travelled(across: mi.Float, at: mi.Float) -> mi.Float | None:
+    def travelled(across: Float, at: Float) -> Float | None:
         return None if travel is None else travel.at(position(across, at)[1], 0.5)
 
-    def distance(across: mi.Float, at: mi.Float) -> mi.Float:
+    def distance(across: Float, at: Float) -> Float:
         bundle = renderer.view.bundle(*position(across, at))
         ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
         hit = renderer.objects.scene.ray_intersect_preliminary(ray)

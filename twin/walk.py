@@ -19,16 +19,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInteraction3f, UInt32, Vector3f
 from twin.camera import Bundle
 from twin.light import Light
 from twin.objects import Objects
 from twin.options import Effects
 from twin.pose import SensorPose
+from twin.sheet import SheetLight
 from twin.water import Scattering
 
 _STEPS = 64
@@ -48,17 +51,17 @@ class _Walks:
     ``away`` tells whether the walk has left the camera's own ray, ``reflected`` whether it has met a surface.
     """
 
-    origin: mi.Point3f
-    direction: mi.Vector3f
-    strength: mi.Float
-    weight: mi.Float
-    cell: mi.UInt32
-    number: mi.UInt32
-    density: mi.Float
-    away: mi.Bool
-    reflected: mi.Bool
+    origin: Point3f
+    direction: Vector3f
+    strength: Float
+    weight: Float
+    cell: UInt32
+    number: UInt32
+    density: Float
+    away: Bool
+    reflected: Bool
 
-    def of(self, kept: mi.UInt32) -> _Walks:
+    def of(self, kept: UInt32) -> _Walks:
         """The walks with the given indices."""
         return _Walks(
             **{f.name: dr.gather(type(getattr(self, f.name)), getattr(self, f.name), kept) for f in fields(self)}
@@ -80,7 +83,7 @@ class Walker:
     def _scatters(self) -> bool:
         return self.effects.multiple_scattering and self.scattering.coefficient > 0
 
-    def radiance(self, bundle: Bundle, cell: mi.UInt32, cells: int, *, seed: int) -> np.ndarray:
+    def radiance(self, bundle: Bundle, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
         width = dr.width(cell)
         total = np.zeros(cells)
@@ -96,7 +99,7 @@ class Walker:
             dr.eval(found, alive, *(getattr(walks, f.name) for f in fields(walks)))
             # Dr.Jit's threads would add in any order, which rounds differently every time.
             total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
-            kept = dr.compress(alive)
+            kept = cast(Any, dr.compress(alive))
             if dr.width(kept) == 0:
                 break
             if dr.width(kept) == 1:
@@ -106,7 +109,7 @@ class Walker:
             walks = walks.of(kept)
         return total
 
-    def _step(self, walks: _Walks, seed: mi.UInt32) -> tuple[_Walks, mi.Float, mi.Bool]:
+    def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
         rng = _random_numbers(seed, walks.number)
         o, d, c = walks.origin, walks.direction, self.scattering.extinction
@@ -127,7 +130,7 @@ class Walker:
         # The walk is scattered on its way or ends on the surface, and goes on if it still promises enough.
         in_water, distance, passed = self._free_path(length, hit, rng)
         vertex = mi.Point3f(o + d * distance)
-        reflected = walks.reflected | ~in_water
+        reflected = cast(Bool, walks.reflected | ~in_water)
         towards_laser = [-light.at(vertex).direction for light in self.lights]
         found *= walks.strength
         strength = walks.strength * passed
@@ -138,7 +141,7 @@ class Walker:
 
         lobes = _TOWARDS_LASER / len(self.lights) if self._scatters else 0.0
 
-        def scattered(onward: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
+        def scattered(onward: Vector3f) -> tuple[Float, Float]:
             """What the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
             reflectance, density = bsdf.eval_pdf(context, si, si.to_local(self.pose.direction(onward)), hit & ~in_water)
             value = dr.select(in_water, self.scattering.phase(_one_minus_cosine(d, onward)), reflectance[0])
@@ -182,7 +185,7 @@ class Walker:
         )  # fmt: skip
         return following, found, alive
 
-    def _promise(self, d: mi.Vector3f, towards_laser: list[mi.Vector3f], in_water: mi.Bool) -> mi.Float:
+    def _promise(self, d: Vector3f, towards_laser: list[Vector3f], in_water: Bool) -> Float:
         """How much more light a walk may find than one in any direction: scattered on, it may run towards the laser."""
         promise = mi.Float(1.0)
         if self._scatters:
@@ -192,8 +195,8 @@ class Walker:
         return promise
 
     def _scattered_by_sheet(
-        self, light: Light, o: mi.Point3f, d: mi.Vector3f, length: mi.Float, active: mi.Bool, u: mi.Float
-    ) -> mi.Float:
+        self, light: Light, o: Point3f, d: Vector3f, length: Float, active: Bool, u: Float
+    ) -> Float:
         """Radiance that the sheet scatters once into rays, from one place on each."""
         t, density = light.pick_in_sheet(o, d, length, u)
         p = mi.Point3f(o + d * t)
@@ -205,8 +208,8 @@ class Walker:
         return dr.select(lit, value, 0.0)
 
     def _lit_end(
-        self, light: Light, walks: _Walks, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, end: mi.Point3f, hit: mi.Bool
-    ) -> mi.Float:
+        self, light: Light, walks: _Walks, si: SurfaceInteraction3f, bsdf: BSDFPtr, end: Point3f, hit: Bool
+    ) -> Float:
         """Radiance of the lit surface at the stretch's end, weighted against connecting to it."""
         here = light.at(end)
         towards = si.to_local(self.pose.direction(-here.direction))
@@ -220,12 +223,12 @@ class Walker:
         by_light = self._light_density(light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
         return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
 
-    def _light_density(self, light: Light, here: object, cosine: mi.Float) -> mi.Float:
+    def _light_density(self, light: Light, here: SheetLight, cosine: Float) -> Float:
         """Density per mm2 of the lit points that `_connected` draws: the share of the power that falls there."""
         unweakened = here.irradiance * dr.exp(self.scattering.extinction * here.exit_mm)
         return unweakened * dr.abs(cosine) / light.sheet.power_w
 
-    def _connected(self, light: Light, vertex: mi.Point3f, scattered, u: mi.Point3f, active: mi.Bool) -> mi.Float:
+    def _connected(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
         """Light of a lit point, drawn in proportion to the power that falls there, that the vertex scatters on."""
         rays = light.rays(u)
         ray = self.pose.ray(rays.origin, rays.direction)
@@ -249,7 +252,7 @@ class Walker:
         light_there = light.sheet.power_w * sent * dr.exp(-self.scattering.extinction * way) / dr.square(distance)
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
-    def _free_path(self, length: mi.Float, hit: mi.Bool, rng: mi.PCG32) -> tuple[mi.Bool, mi.Float, mi.Float]:
+    def _free_path(self, length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
         """Whether walks are scattered before the surface, how far along they then are, and the share of light left.
 
         Scattering is drawn as often as it promises light compared with the surface, whatever the water's clarity;
@@ -270,11 +273,11 @@ class Walker:
         return in_water, dr.select(in_water, distance, length), dr.select(in_water, scattered, through / (1 - likely))
 
 
-def _one_minus_cosine(a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
+def _one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
     """1 - cos of the angle between unit vectors, exact for small angles too."""
     return 0.5 * dr.squared_norm(a - b)
 
 
-def _random_numbers(seed: mi.UInt32, number: mi.UInt32) -> mi.PCG32:
+def _random_numbers(seed: UInt32, number: UInt32) -> PCG32:
     state, sequence = mi.sample_tea_32(seed, number)
-    return mi.PCG32(size=dr.width(number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+    return cast(Any, mi.PCG32)(size=dr.width(number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))

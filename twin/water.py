@@ -7,7 +7,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from twin.arrays import to_jit
+from twin.arrays import Float, Point2f, UInt32, Vector3f, to_jit
 from twin.phase_functions import (
     BACKWARD_END,
     FIRST_PLACE,
@@ -45,7 +45,7 @@ class Scattering:
         self._forward = dr.opaque(mi.Float, table.cumulative[0] / FORWARD_SR)
         self._cumulative = to_jit(mi.Float, table.cumulative)
 
-    def phase(self, one_minus_cosine: mi.Float) -> mi.Float:
+    def phase(self, one_minus_cosine: Float) -> Float:
         """Phase function in 1/sr at 1 - cos of the scattering angle.
 
         Compute it as |w1 - w2|^2 / 2 from the unit directions before and after: 1 minus their product loses small
@@ -58,7 +58,7 @@ class Scattering:
         density = dr.exp(dr.fma(high - low, place - mi.Float(cell), low)) / (math.pi * before * (2 - before))
         return dr.select(one_minus_cosine < FORWARD_END, self._forward, density)
 
-    def sample(self, direction: mi.Vector3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+    def sample(self, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
         """A direction after scattering and its density in 1/sr, which is the phase function there.
 
         The scattering angle grows with ``u.x``, the azimuth with ``u.y``.
@@ -69,7 +69,7 @@ class Scattering:
         turned = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - before)
         return dr.normalize(mi.Frame3f(direction).to_world(turned)), self.phase(before)
 
-    def _heights(self, u: mi.Float) -> tuple[mi.Float, mi.Float]:
+    def _heights(self, u: Float) -> tuple[Float, Float]:
         """1 - cos and 1 + cos of the scattering angle below which the share ``u`` is scattered."""
         node = mi.UInt32(0)
         step = NODES // 2
@@ -93,14 +93,14 @@ class Scattering:
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
         return dr.select(backward, 2 - after, before), dr.select(forward, 2 - before, after)
 
-    def _ends(self, cell: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+    def _ends(self, cell: UInt32) -> tuple[Float, Float]:
         """Logarithm of the density at both ends of a cell of the table."""
         return dr.gather(mi.Float, self._log_density, cell), dr.gather(mi.Float, self._log_density, cell + 1)
 
 
 def single_scattering(
-    scattering: Scattering, light: SheetLight, *, direction: mi.Vector3f, surface_sigmas: mi.Float
-) -> mi.Float:
+    scattering: Scattering, light: SheetLight, *, direction: Vector3f, surface_sigmas: Float
+) -> Float:
     """Radiance that the sheet scatters once into a camera ray where the ray crosses it, in W/mm2/sr.
 
     ``light`` is the sheet at the crossing, where the distance across is about zero; ``surface_sigmas`` the distance

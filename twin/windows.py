@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.arrays import Bool, Float, Point3f, Vector3f, scalar_transform
 from uwlts.errors import DesignError
 from uwlts.sensor import Medium, Window
 
@@ -32,10 +33,10 @@ def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
 class LightPath:
     """Rays in the medium behind a window: origin, unit direction, weight, and whether they got there."""
 
-    origin: mi.Point3f
-    direction: mi.Vector3f
-    weight: mi.Float
-    valid: mi.Bool
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
+    valid: Bool
 
 
 class WindowFaces:
@@ -73,9 +74,9 @@ class WindowFaces:
             )
             to_world[:3, 3] = centre
             bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
-            self._faces.append(mi.load_dict({"type": "disk", "to_world": mi.ScalarTransform4f(to_world), "bsdf": bsdf}))
+            self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
 
-    def through(self, origin: mi.Point3f, direction: mi.Vector3f, *, mode: mi.TransportMode) -> LightPath:
+    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> LightPath:
         """Send rays from the module's side through both faces.
 
         ``mode`` is Radiance for rays traced backwards from the camera (weights carry 1 / n^2) and Importance for light

@@ -22,7 +22,7 @@ RIM_POINTS, NEAREST_PX = 720, 3.0
 
 def circles_table() -> str:
     """Errors of the centres by place and method, px."""
-    from twin.simulate import Studio
+    from twin.studio import Studio
 
     sensor, rows = load_sensor("thesis"), []
     for name, stage in STAGE_MM.items():

@@ -91,7 +91,7 @@ class Rendered:
 @cache
 def render(place: Place) -> Rendered:
     """The place's light: the stripe with many samples, the light around it with all effects of the place."""
-    from twin.simulate import Studio
+    from twin.studio import Studio
     from twin.truth import true_stripe
 
     scene, sensor = place.scene(), place.sensor()

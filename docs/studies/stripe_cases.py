@@ -139,7 +139,7 @@ class Spread:
 def measure(case: Case) -> Frames:
     """Render the case's frames, find the stripe in them, and compare with the truth."""
     # Mitsuba looks for its variant when it is imported.
-    from twin.simulate import Studio
+    from twin.studio import Studio
     from twin.truth import true_stripe
 
     sensor, scene = case.sensor(), case.scene()
@@ -193,7 +193,7 @@ def step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
 @cache
 def _scale(medium: str) -> tuple[np.ndarray, np.ndarray]:
     """Polynomials (degree + 1, L) in Z of every line's row and Y, from the truth of plates all over the volume."""
-    from twin.simulate import Studio
+    from twin.studio import Studio
     from twin.truth import true_stripe
 
     studio = Studio(load_sensor("thesis"), Case(medium=medium).scene(), Options(effects=NONE))

@@ -13,7 +13,7 @@ import pytest
 
 from twin.options import ALL, NONE, Options
 from twin.scene import load_scene
-from twin.simulate import simulate
+from twin.studio import record_scene
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate_sequentially
@@ -45,7 +45,7 @@ def record(
 ) -> Path:
     built = load_sensor(as_built) if as_built else None
     options = Options(spp=64 if ideal else 16, seed=seed, effects=NONE if ideal else ALL)
-    simulate(load_scene(scene, changes=changes), load_sensor("thesis"), path, as_built=built, options=options)
+    record_scene(load_scene(scene, changes=changes), load_sensor("thesis"), path, as_built=built, options=options)
     return path
 
 
@@ -138,7 +138,7 @@ def test_shadowed_lines_give_no_points(tmp_path: Path):
     objects = (*[thing.model_dump() for thing in scene.objects], block)
     path = tmp_path / "plane.h5"
     shaded = type(scene).model_validate(scene.model_dump() | {"objects": objects, "artefact": None})
-    simulate(shaded, load_sensor("thesis"), path, options=Options(effects=NONE))
+    record_scene(shaded, load_sensor("thesis"), path, options=Options(effects=NONE))
     with Capture(path) as capture:
         cloud = reconstruct_capture(capture, true_calibration()).cloud
     on_block = cloud.points_mm[:, 2] < -30

@@ -21,7 +21,7 @@ from twin import cli
 from twin.campaign import load_campaign, takes
 from twin.options import Options
 from twin.reproduce import record_campaigns
-from twin.simulate import simulate
+from twin.studio import record_scene
 from uwlts.capture import Capture, part_path
 from uwlts.errors import DescriptionError
 from uwlts.truth import read_truth, truth_path
@@ -199,7 +199,7 @@ def test_interrupted_takes_are_completed_and_another_seed_adds_a_campaign(
         truth_path(path).unlink()
         with pytest.raises(KeyboardInterrupt):
             options = Options(spp=4, seed=take.seed)
-            simulate(take.scene, take.sensor, path, as_built=take.built, options=options, progress=stop)
+            record_scene(take.scene, take.sensor, path, as_built=take.built, options=options, progress=stop)
         with Capture(part_path(path)) as begun:
             assert len(begun) == 2
         if path == replaced:

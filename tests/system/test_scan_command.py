@@ -15,7 +15,7 @@ import pytest
 from twin.hardware.serve import ServedTwin, serve
 from twin.options import Options
 from twin.scene import Scene, load_scene
-from twin.simulate import simulate
+from twin.studio import record_scene
 from uwlts.capture import Capture, part_path
 from uwlts.library import load_sensor
 from uwlts.sensor import Sensor
@@ -119,7 +119,7 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
     done = run(written(folder, served, top=f"laser_ms = {exposure}"), tmp_path / "scan.h5")
     assert done.returncode == 0, done.stderr
     assert dark(served)
-    simulate(board, sensor, tmp_path / "simulated.h5", options=Options(spp=4))
+    record_scene(board, sensor, tmp_path / "simulated.h5", options=Options(spp=4))
     with Capture(tmp_path / "scan.h5") as scan, Capture(tmp_path / "simulated.h5") as simulated:
         assert len(scan) == len(simulated) == COUNT
         assert scan.laser_on.all()

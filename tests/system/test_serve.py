@@ -17,7 +17,7 @@ from twin.hardware.bench import NAMES, Fault, Track, parse_fault
 from twin.hardware.serve import ServedTwin, serve, wait_for_end
 from twin.options import Options
 from twin.scene import Scene, load_scene
-from twin.simulate import simulate
+from twin.studio import record_scene
 from uwlts.capture import Capture
 from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
 from uwlts.hardware.camera import Camera
@@ -116,7 +116,7 @@ def centres(image: np.ndarray) -> np.ndarray:
 
 def test_a_scan_shows_what_simulate_shows(served, stage, camera, board, sensor, tmp_path):
     """Same places, errors of the stage included: same stripe, but for the noise."""
-    simulate(board, sensor, tmp_path / "board.h5", options=Options(spp=4))
+    record_scene(board, sensor, tmp_path / "board.h5", options=Options(spp=4))
     with Capture(tmp_path / "board.h5") as capture:
         expected = [image for _, image in capture.frames()]
         positions, exposure_ms = capture.stage_mm[:], float(capture.exposure_ms[0])

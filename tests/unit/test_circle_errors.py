@@ -12,7 +12,7 @@ from twin.options import NONE, Options
 from twin.pattern import printed_shifts
 from twin.renderer import Renderer
 from twin.scene import CirclePlate, Motion, Scene, Shot
-from twin.simulate import Studio, simulate, with_window
+from twin.studio import Studio, record_scene, with_window
 from twin.truth import depth_map
 from uwlts.capture import Capture
 from uwlts.sensor import Sensor
@@ -211,7 +211,7 @@ def scan(sensor: Sensor, path: Path, **motion: Any):
     """Capture's facts and truth of three profiles of a plate turned by 30 deg."""
     board = {"kind": "plate", "width_mm": 200.0, "height_mm": 120.0, "rotation_deg": (0.0, 30.0, 0.0)}
     known = {"start_mm": -4.0, "step_mm": 4.0, "count": 3}
-    simulate(scene_of(board, motion=known | motion), sensor, path, options=Options(spp=4, effects=NONE))
+    record_scene(scene_of(board, motion=known | motion), sensor, path, options=Options(spp=4, effects=NONE))
     with Capture(path) as capture:
         return capture.stage_mm.tolist(), capture.header.stage_direction, read_truth(truth_path(path))[1]
 

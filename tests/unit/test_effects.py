@@ -8,7 +8,7 @@ import pytest
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.options import ALL, NONE, Effects, Options
 from twin.renderer import Renderer
-from twin.simulate import Studio
+from twin.studio import Studio
 from uwlts.errors import DescriptionError
 from uwlts.sensor import Sensor
 

@@ -9,7 +9,7 @@ from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sens
 from twin.options import NONE, Options
 from twin.pose import Travel
 from twin.renderer import Renderer
-from twin.simulate import Studio
+from twin.studio import Studio
 from twin.truth import true_stripe
 from uwlts.errors import DesignError
 

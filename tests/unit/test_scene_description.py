@@ -9,7 +9,7 @@ from twin.objects import Objects, build_objects
 from twin.options import Options
 from twin.renderer import Renderer
 from twin.scene import Motion, Pose, Scene, load_scene, scene_names
-from twin.simulate import check_scene, medium_of
+from twin.studio import check_scene, medium_of
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.library import library_folder, load_sensor, names
 from uwlts.sensor import Sensor

@@ -1,14 +1,18 @@
 """Virtual recordings: repeatable, resumable after an interruption, never overwriting unasked, nominal outside."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
+import twin
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.options import NONE, Options
 from twin.scene import Scene
-from twin.simulate import simulate
+from twin.studio import record_scene
 from uwlts.capture import Capture
-from uwlts.errors import CaptureError, OutputError
+from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.sensor import Sensor
 from uwlts.truth import TruthStatus, read_truth, truth_path
 
@@ -34,7 +38,7 @@ def scene() -> Scene:
 def undisturbed(small, scene, tmp_path_factory):
     """Path of a recording made in one go."""
     path = tmp_path_factory.mktemp("undisturbed") / "scan.h5"
-    simulate(scene, small, path, options=OPTIONS)
+    record_scene(scene, small, path, options=OPTIONS)
     return path
 
 
@@ -101,13 +105,13 @@ def test_the_stripe_is_bright_where_the_truth_has_it(undisturbed):
 
 
 def test_one_seed_gives_one_recording(undisturbed, small, scene, tmp_path):
-    simulate(scene, small, tmp_path / "scan.h5", options=OPTIONS)
+    record_scene(scene, small, tmp_path / "scan.h5", options=OPTIONS)
     assert_same(tmp_path / "scan.h5", undisturbed)
 
 
 def test_another_seed_gives_other_noise_and_the_same_truth(undisturbed, small, scene, tmp_path):
     path = tmp_path / "scan.h5"
-    simulate(scene, small, path, options=Options(spp=16, seed=12))
+    record_scene(scene, small, path, options=Options(spp=16, seed=12))
     with Capture(path) as other, Capture(undisturbed) as capture:
         differ = [(other.image(index) != capture.image(index)).mean() for index in range(FRAMES)]
     assert min(differ) > 0.1
@@ -120,7 +124,7 @@ def test_ideal_recordings_have_no_noise(small, scene, tmp_path):
     frames = []
     for seed in (1, 2):
         path = tmp_path / f"ideal-{seed}.h5"
-        simulate(scene, small, path, options=Options(spp=16, seed=seed, effects=NONE))
+        record_scene(scene, small, path, options=Options(spp=16, seed=seed, effects=NONE))
         with Capture(path) as capture:
             frames.append([capture.image(index).astype(int) for index in range(FRAMES)])
     for one, two in zip(*frames, strict=True):
@@ -133,7 +137,7 @@ def test_ideal_recordings_have_no_noise(small, scene, tmp_path):
 def test_an_interrupted_recording_goes_on_where_it_stopped(undisturbed, small, scene, tmp_path, frames):
     path, part = tmp_path / "scan.h5", tmp_path / "scan.h5.part"
     with pytest.raises(KeyboardInterrupt):
-        simulate(scene, small, path, options=OPTIONS, progress=stop_after(frames))
+        record_scene(scene, small, path, options=OPTIONS, progress=stop_after(frames))
     assert not path.exists()
     assert not truth_path(path).exists()
     with Capture(part) as unfinished, Capture(undisturbed) as whole:
@@ -142,29 +146,29 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(undisturbed, small, s
         for index in range(frames):
             np.testing.assert_array_equal(unfinished.image(index), whole.image(index))
     with pytest.raises(OutputError, match="resume"):
-        simulate(scene, small, path, options=OPTIONS)
+        record_scene(scene, small, path, options=OPTIONS)
     with pytest.raises(CaptureError, match="belongs to another recording"):
-        simulate(scene, small, path, options=Options(spp=16, seed=12), resume=True)
-    simulate(scene, small, path, options=OPTIONS, resume=True)
+        record_scene(scene, small, path, options=Options(spp=16, seed=12), resume=True)
+    record_scene(scene, small, path, options=OPTIONS, resume=True)
     assert not part.exists()
     assert_same(path, undisturbed)
 
 
 def test_existing_files_are_replaced_only_when_asked(small, scene, tmp_path):
     path = tmp_path / "scan.h5"
-    simulate(scene, small, path, options=OPTIONS)
+    record_scene(scene, small, path, options=OPTIONS)
     with Capture(path) as capture:
         before = capture.image(1)
     truth = truth_path(path).read_bytes()
     with pytest.raises(OutputError, match=r"scan.*h5 exists already"):
-        simulate(scene, small, path, options=Options(spp=4, seed=99))
+        record_scene(scene, small, path, options=Options(spp=4, seed=99))
     truth_path(path).unlink()
     with pytest.raises(OutputError, match=r"scan\.h5 exists already"):
-        simulate(scene, small, path, options=Options(spp=4, seed=99))
+        record_scene(scene, small, path, options=Options(spp=4, seed=99))
     truth_path(path).write_bytes(truth)
     with Capture(path) as capture:
         np.testing.assert_array_equal(capture.image(1), before)
-    simulate(scene, small, path, options=Options(spp=4, seed=99), overwrite=True)
+    record_scene(scene, small, path, options=Options(spp=4, seed=99), overwrite=True)
     with Capture(path) as capture:
         assert (capture.image(1) != before).any()
 
@@ -172,7 +176,7 @@ def test_existing_files_are_replaced_only_when_asked(small, scene, tmp_path):
 def test_the_capture_states_the_drawings_and_the_truth_the_sensor_as_built(small, scene, tmp_path):
     built = altered(small, {"camera": {"focal_length_mm": 12.9}, "laser": {"roll_deg": 0.3}})
     path = tmp_path / "scan.h5"
-    simulate(scene, small, path, as_built=built, options=OPTIONS)
+    record_scene(scene, small, path, as_built=built, options=OPTIONS)
     with Capture(path) as capture:
         assert capture.header.sensor == small
         assert capture.header.medium == small.media["water"]
@@ -181,4 +185,43 @@ def test_the_capture_states_the_drawings_and_the_truth_the_sensor_as_built(small
 
 def test_a_missing_folder_is_refused(small, scene, tmp_path):
     with pytest.raises(OutputError, match="absent does not exist"):
-        simulate(scene, small, tmp_path / "absent" / "scan.h5", options=OPTIONS)
+        record_scene(scene, small, tmp_path / "absent" / "scan.h5", options=OPTIONS)
+
+
+def test_images_rendered_into_arrays_are_those_of_the_file(small, scene, undisturbed):
+    recording = twin.render(scene, sensor=small, spp=OPTIONS.spp, seed=OPTIONS.seed, frames=(3, 4))
+    _, truth = read_truth(truth_path(undisturbed))
+    with Capture(undisturbed) as capture:
+        for place, index in enumerate((3, 4)):
+            np.testing.assert_array_equal(recording.images[place], capture.image(index))
+            np.testing.assert_array_equal(recording.truth.centre_px[place], truth.centre_px[index])
+        for name in ("stage_mm", "laser_on", "exposure_ms", "time_s"):
+            np.testing.assert_array_equal(getattr(recording, name), np.asarray(getattr(capture, name))[[3, 4]])
+    assert recording.sensor == small and recording.medium == small.media["water"]
+
+
+def test_simulate_writes_what_the_description_gives(small, scene, undisturbed, tmp_path):
+    lines = []
+    out = tmp_path / "{placement}.h5"
+    paths = twin.simulate(scene, out=out, sensor=small, spp=OPTIONS.spp, seed=OPTIONS.seed, report=lines.append)
+    assert paths == [tmp_path / f"{scene.placement}.h5"] and lines == [f"wrote {paths[0]}"]
+    with Capture(undisturbed) as first, Capture(paths[0]) as second:
+        for index in range(FRAMES):
+            np.testing.assert_array_equal(first.image(index), second.image(index))
+
+
+def test_frames_beyond_the_scan_and_several_placements_in_one_file_are_refused(small, scene, tmp_path):
+    with pytest.raises(DescriptionError, match="numbers from 0 to 5"):
+        twin.render(scene, sensor=small, frames=(6,))
+    with pytest.raises(DescriptionError, match="put {placement} into its name"):
+        twin.simulate(scene, sensor=small, out=tmp_path / "a.h5", placement=("near", "far"))
+
+
+def test_the_package_offers_its_functions_without_importing_the_renderer():
+    script = (
+        "import sys, twin; twin.render, twin.simulate, twin.demo\n"
+        "assert not {'mitsuba', 'drjit'} & set(sys.modules)\n"
+        "try: twin.absent\nexcept AttributeError as error: print(error)"
+    )
+    child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert child.stdout.strip() == "module 'twin' has no attribute 'absent'"

@@ -13,7 +13,7 @@ from twin.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.hardware.gige_camera import GigeCamera
 from twin.hardware.grbl_controller import GrblController, StageState
 from twin.scene import Motion, Shot
-from twin.simulate import Studio
+from twin.studio import Studio
 from uwlts.errors import DescriptionError, DesignError
 from uwlts.sensor import Stage
 

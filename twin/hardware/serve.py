@@ -13,7 +13,7 @@ from twin.hardware.gige_camera import GigeCamera
 from twin.hardware.grbl_controller import GrblController
 from twin.options import Options
 from twin.scene import Scene
-from twin.simulate import Studio
+from twin.studio import Studio
 from uwlts.sensor import Sensor
 
 _STEPS_PER_MM, _TRAVEL = 100, 130

@@ -184,12 +184,12 @@ def _record(job: _Job, tell: Callable[[Any], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
 
-    from twin.simulate import simulate
+    from twin.studio import record_scene
 
     recording, threads = job.recording, dr.thread_count()
     dr.set_thread_count(1)
     try:
-        simulate(recording.scene, recording.sensor, job.path, options=job.options, overwrite=True)
+        record_scene(recording.scene, recording.sensor, job.path, options=job.options, overwrite=True)
     except UwltsError as error:
         raise type(error)(f"{recording.scene.title}: {error}") from error
     finally:

@@ -1,7 +1,4 @@
-"""The main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
-
-Runs exactly the commands that it prints, two at a time; each could be typed by hand. Results lie in ``runs/demo``.
-"""
+"""The main job in a row of commands: record a virtual campaign, calibrate, reconstruct, evaluate, report."""
 
 import json
 import shlex
@@ -12,17 +9,18 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 
-from uwlts.console import INTERRUPTED
-
 FOLDER = Path("runs/demo")
+"""Where the results lie unless another folder is given."""
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
+"""Commands of one stage run at a time: no single one keeps all processors busy."""
 PLACEMENTS = ("near", "standoff", "far")
 SPHERES = tuple(f"spheres-{place}" for place in PLACEMENTS)
 
 
-def commands(folder: Path) -> list[tuple[str, str]]:
-    """Stage and command line of everything the demo does, in order."""
+def commands(out: Path) -> list[tuple[str, str]]:
+    """Stage and command line of everything the demo does into a folder, in order."""
+    folder = shlex.quote(str(out))
     as_built = "--sensor thesis --as-built thesis-as-built --overwrite"
     everywhere = f"--placement {' '.join(PLACEMENTS)}"
     recordings = {
@@ -52,24 +50,37 @@ def commands(folder: Path) -> list[tuple[str, str]]:
     return rows
 
 
-def main() -> int:
-    """Run the demo; the exit code of the first command that fails, else 0."""
-    FOLDER.mkdir(parents=True, exist_ok=True)
+def demo(out: str | Path = FOLDER) -> Path:
+    """Run the demo into a folder; returns its report.
+
+    Runs exactly the commands that it prints, two at a time; each could be typed by hand.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        A command failed; what it printed says why.
+    """
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
     seconds: dict[str, float] = {}
     begun = time.perf_counter()
-    for stage, rows in groupby(sorted(commands(FOLDER), key=lambda row: STAGES.index(row[0])), key=lambda row: row[0]):
+    in_order = sorted(commands(folder), key=lambda row: STAGES.index(row[0]))
+    for stage, rows in groupby(in_order, key=lambda row: row[0]):
         if stage == "report":
-            (FOLDER / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
+            (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
         start = time.perf_counter()
-        # Commands of one stage need nothing of each other, and no single one keeps all processors busy.
+        lines = [line for _, line in rows]
+        # Commands of one stage need nothing of each other.
         with ThreadPoolExecutor(AT_ONCE) as pool:
-            codes = list(pool.map(_run, (line for _, line in rows)))
-        if any(codes):
-            return next(code for code in codes if code)
+            codes = list(pool.map(_run, lines))
+        for line, code in zip(lines, codes, strict=True):
+            if code:
+                raise subprocess.CalledProcessError(code, line)
         seconds[stage] = round(time.perf_counter() - start, 2)
     total = ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items())
-    print(f"done in {time.perf_counter() - begun:.1f} s ({total}); open {FOLDER / 'report.html'}")
-    return 0
+    report = folder / "report.html"
+    print(f"done in {time.perf_counter() - begun:.1f} s ({total}); open {report}")
+    return report
 
 
 def _run(line: str) -> int:
@@ -83,11 +94,3 @@ def _run(line: str) -> int:
     print(done.stdout, end="", flush=True)
     print(done.stderr, end="", file=sys.stderr, flush=True)
     return done.returncode
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)

@@ -1,6 +1,6 @@
-"""A virtual recording: renders a scene's shots into a capture, with the ground truth in a file beside it."""
+"""A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +26,7 @@ from uwlts.truth import Truth, TruthHeader, truth_path, write_truth
 
 Progress = Callable[[int, int], None]
 PROBE_SPP = 16
+"""Samples per lit pixel of the images from which the exposure follows."""
 BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
 
@@ -154,6 +155,16 @@ class Studio:
             frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
         )
 
+    def frame(self, shot: Shot, index: int) -> Frame:
+        """Image number ``index`` of the scan with what a capture records of it."""
+        return Frame(
+            image=self.image(shot, index),
+            stage_mm=shot.stage_mm,
+            laser_on=shot.light == "laser",
+            exposure_ms=self.exposure_ms[shot.light],
+            time_s=index * self.period_s,
+        )
+
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
         self._shift_circles(shot, index)
@@ -163,6 +174,12 @@ class Studio:
             shot, spp=self.options.spp, seed=self._seed(index), travel=self.travel(shot.light)
         )
         return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng, pattern=self._pattern)
+
+    def truth(self, shot: Shot) -> FrameTruth:
+        """What every profile line of a shot truly shows."""
+        if shot.light == "lamp":
+            return no_stripe(self.sensor.camera.lines())
+        return true_stripe(self.renderer, self.pose(shot), travel=self.travel("laser"))
 
     def _shift_circles(self, shot: Shot, index: int) -> None:
         """Move the circles of plates with errors of detection to where this image shows them."""
@@ -202,6 +219,12 @@ class Studio:
         return min(longest, level / brightest) if brightest > 0 else longest
 
 
+def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], *, first: Shot) -> Truth:
+    """The truths of a recording's frames as one, with the depth map of its ``first`` shot."""
+    stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
+    return Truth(**stacked, depth_mm=depth_map(studio.renderer, studio.pose(first)))
+
+
 def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> CaptureHeader:
     """What an operator would note in the capture: nominal values only."""
     window_mounted = studio.sensor.camera.window.mounted
@@ -223,7 +246,7 @@ def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> Capture
     )  # fmt: skip
 
 
-def simulate(
+def record_scene(
     scene: Scene,
     sensor: Sensor,
     path: str | Path,
@@ -250,31 +273,18 @@ def simulate(
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):
         raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
-    built = as_built or sensor
-    studio = Studio(built, scene, options)
+    studio = Studio(as_built or sensor, scene, options)
     header = _header(path.stem, sensor, studio, scene)
     shots = list(scene.motion.shots())
     truths: list[FrameTruth] = []
-    dtype = np.uint8 if sensor.detector.bits == 8 else np.uint16
+    dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
     with CaptureWriter(path, header, dtype=dtype, overwrite=overwrite, resume=resume) as writer:
         done = len(writer)
         for index, shot in enumerate(shots):
-            if shot.light == "laser":
-                truths.append(true_stripe(studio.renderer, studio.pose(shot), travel=studio.travel("laser")))
-            else:
-                truths.append(no_stripe(built.camera.lines()))
+            truths.append(studio.truth(shot))
             if index >= done:
-                writer.append(
-                    Frame(
-                        studio.image(shot, index),
-                        shot.stage_mm,
-                        shot.light == "laser",
-                        studio.exposure_ms[shot.light],
-                        index * studio.period_s,
-                    )
-                )
+                writer.append(studio.frame(shot, index))
             progress(index + 1, len(shots))
         truth_header = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
-        stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
-        truth = Truth(**stacked, depth_mm=depth_map(studio.renderer, studio.pose(shots[0])))
+        truth = truth_of_recording(studio, truths, first=shots[0])
         write_truth(truth_path(path), truth_header, truth, overwrite=overwrite or resume)
