@@ -11,24 +11,37 @@ export PIP_NO_INPUT := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test bench setup clean
+.PHONY: help demo test check bench docs setup clean
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
-	@echo "make test    run the tests"
+	@echo "make test    check the code and run the tests"
+	@echo "make check   only check the code: format, lint, layers of imports, types"
 	@echo "make bench   measure speed"
+	@echo "make docs    build the documentation site in docs/_build/html"
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
 	@echo "make clean   remove .venv, .llvm, caches and build results"
 
 demo: setup
 	@$(PYTHON) -m twin.cli demo
 
-test: setup
+test: check
 	@$(PYTHON) -m twin.hardware.aravis_install
 	@$(PYTHON) -m pytest -q
 
+check: setup
+	@$(PYTHON) -m ruff format --check --quiet .
+	@$(PYTHON) -m ruff check --quiet .
+	@$(VENV)/bin/lint-imports --no-logo
+	@$(VENV)/bin/basedpyright
+
 bench: setup
 	@$(PYTHON) -m tests.bench
+
+docs: setup
+	@$(PYTHON) -m pip install --quiet --editable '.[docs]'
+	@$(PYTHON) -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "documentation: docs/_build/html/index.html"
 
 setup: $(INSTALLED)
 	@$(PYTHON) -m twin.llvm --install
@@ -40,7 +53,7 @@ $(INSTALLED): pyproject.toml
 	@touch $@
 
 clean:
-	@rm -rf $(VENV) .llvm .aravis build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .llvm .aravis build dist docs/_build docs/reference/generated *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.
