@@ -1,7 +1,7 @@
 """The certificate of a calibration: what it was made from, where it holds, what lengths measured by it are worth."""
 
 from uwlts.certificate.content import certificate_lines, certificate_of
-from uwlts.certificate.page import certificate_page, refuse_unsuitable_page, write_certificate
+from uwlts.certificate.page import certificate_page, refuse_unsuitable_certificate, write_certificate
 from uwlts.certificate.seal import check_certificate, read_certificate, sealed
 
 __all__ = [
@@ -10,7 +10,7 @@ __all__ = [
     "certificate_page",
     "check_certificate",
     "read_certificate",
-    "refuse_unsuitable_page",
+    "refuse_unsuitable_certificate",
     "sealed",
     "write_certificate",
 ]

@@ -1,4 +1,4 @@
-"""The certificate as a page to read and to print, and its files."""
+"""The certificate as a page to read and to print, its pictures, and its files."""
 
 import json
 import math
@@ -6,37 +6,41 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
 from uwlts.calibration.joint.volume import regions
 from uwlts.calibration.model import Calibration
+from uwlts.calibration.parameter_keys import ParameterKey
 from uwlts.calibration.sources import captures_in
 from uwlts.certificate.changes import change_from, require_same_sensor
 from uwlts.certificate.content import parameter_rows
 from uwlts.certificate.form import form_of
 from uwlts.certificate.lengths import Worth, in_use
-from uwlts.certificate.pictures import correlation_picture, heat_map, image_residuals, length_chart
 from uwlts.errors import OutputError
-from uwlts.files import refuse_unsuitable, written_aside
 from uwlts.report.numbers import fixed
-from uwlts.report.page_toolkit import MISSING, render_page
+from uwlts.report.page_toolkit import (
+    COLOURS,
+    INK,
+    MISSING,
+    json_beside,
+    legend_below,
+    new_figure,
+    refuse_unsuitable_page,
+    render_page,
+    svg_of,
+    write_page,
+)
+from uwlts.report.plot import DEVIATIONS
 
 _WORST_IMAGES = 5
 
 
-def json_beside(page: Path) -> Path:
-    """Where the JSON of a certificate's page goes."""
-    return page.with_suffix(".json")
-
-
-def refuse_unsuitable_page(page: Path, source: Path, *, overwrite: bool) -> None:
-    """OutputError where a certificate cannot be written, or would replace the calibration that it is about."""
+def refuse_unsuitable_certificate(page: Path, source: Path, *, overwrite: bool) -> None:
+    """OutputError if a certificate cannot be written, or would replace the calibration that it is about."""
     if json_beside(page).resolve() == source.resolve() or page.resolve() == source.resolve():
         raise OutputError(f"the certificate's JSON beside {page} would replace the calibration; give another name")
-    if page.suffix == ".json":
-        raise OutputError(f"{page} is the page, which is HTML, and its JSON goes beside it; give a name like cert.html")
-    for path in (page, json_beside(page)):
-        refuse_unsuitable(path, overwrite=overwrite)
+    refuse_unsuitable_page(page, example="cert.html", overwrite=overwrite)
 
 
 def write_certificate(
@@ -53,12 +57,8 @@ def write_certificate(
         As `certificate_page`.
     """
     text = certificate_page(content, calibration, before=before)
-    with (
-        written_aside(json_beside(Path(page)), overwrite=overwrite) as beside,
-        written_aside(page, overwrite=overwrite) as aside,
-    ):
-        beside.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-        aside.write_text(text, encoding="utf-8")
+    beside = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+    write_page(page, text, beside=beside, overwrite=overwrite)
 
 
 def certificate_page(
@@ -94,9 +94,9 @@ def _pictures(
     joint = calibration.joint
     if joint is None:
         return drawn
-    drawn["correlation"] = Markup(correlation_picture(joint.parameters, joint.covariance_matrix()))
+    drawn["correlation"] = correlation_picture(joint.parameters, joint.covariance_matrix())
     if content["images"]:
-        drawn["residuals"] = [Markup(picture) for picture in image_residuals(content["images"])]
+        drawn["residuals"] = image_residuals(content["images"])
         drawn["worst"] = sorted(
             (image for image in content["images"] if image["rms_px"] is not None),
             key=lambda image: -image["rms_px"] / content["scatter_px"][image["kind"]],
@@ -105,21 +105,21 @@ def _pictures(
         return drawn
     region = regions(calibration)[0]
     form = form_of(in_use(calibration, region))
-    drawn["chart"] = Markup(length_chart([Worth(**row) for row in content["lengths"]]))
+    drawn["chart"] = length_chart([Worth(**row) for row in content["lengths"]])
     for what, values in (("calibration", form.calibration_mm), ("single point", form.point_mm)):
         drawn["maps"] += [
-            Markup(heat_map(f"u({axis}), {what}", form.at_mm, 1e3 * values[..., place]))
+            heat_map(f"u({axis}), {what}", form.at_mm, 1e3 * values[..., place])
             for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
         ]
     drawn["maps"] += [
-        Markup(heat_map(f"u of {form.short_mm:g} mm along {axis}", form.at_mm, 1e3 * values))
+        heat_map(f"u of {form.short_mm:g} mm along {axis}", form.at_mm, 1e3 * values)
         for axis, values in (("Y", form.along_y_mm), ("Z", form.along_z_mm))
     ]
     if before is not None:
         change = change_from(calibration, before[1], region)
         drawn["largest_change_um"] = 1e3 * change.largest_mm
         drawn["changes"] = [
-            Markup(heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., place], signed=True))
+            heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., place], signed=True)
             for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
         ]
     return drawn
@@ -166,3 +166,78 @@ def _length_rows(lengths: Sequence[dict[str, Any]]) -> list[tuple[float, list[tu
                               (fixed(1e3 * row["calibration_mm"], 1), fixed(1e3 * row["point_mm"], 1))
                               for row in found]))  # fmt: skip
     return rows
+
+
+def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool = False) -> Markup:
+    """Values (R, C) in µm over a mesh (R, C, 2) of Y and Z, the sensor being above; signed ones from blue to red."""
+    size = np.ptp(at_mm.reshape(-1, 2), axis=0)
+    figure, (ax,) = new_figure(3.7, float(np.clip(2.4 * size[1] / size[0], 1.5, 4.0)) + 0.8)
+    limit = max(float(np.abs(values).max()), 1e-9)
+    drawn = ax.pcolormesh(
+        *np.moveaxis(at_mm, -1, 0), values, shading="gouraud", rasterized=True,
+        cmap=DEVIATIONS if signed else "Blues", vmin=-limit if signed else 0, vmax=limit,
+    )  # fmt: skip
+    ax.set(title=title, xlabel="Y / mm", ylabel="Z / mm, away from the sensor", aspect="equal")
+    ax.invert_yaxis()
+    ax.grid(visible=False)
+    figure.colorbar(drawn, label="µm")
+    return svg_of(figure)
+
+
+def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) -> Markup:
+    """The correlation matrix of parameters, coloured, with their names at the left and numbers above."""
+    std = np.sqrt(np.diag(covariance))
+    std = np.where(std > 0, std, 1.0)
+    correlation = covariance / np.outer(std, std)
+    count = len(keys)
+    # A row of 0.24 inches holds its name in 8 points; names need some 3 inches at the left.
+    figure, (ax,) = new_figure(3.0 + 0.24 * count, 0.5 + 0.24 * count)
+    ax.imshow(correlation, cmap=DEVIATIONS, vmin=-1, vmax=1)
+    for row, column in np.argwhere(np.abs(correlation) >= 0.5):
+        size = abs(correlation[row, column])
+        if row != column:
+            text = f"{size:.2f}"[1:] if size < 0.995 else "1"
+            ax.text(column, row, text, ha="center", va="center", fontsize=6.5, color="white" if size > 0.7 else INK)
+    ax.set_yticks(range(count), [f"{key.quantity.words}  {number}" for number, key in enumerate(keys, 1)], fontsize=8)
+    ax.set_xticks(range(count), [str(number + 1) for number in range(count)], fontsize=8)
+    ax.tick_params(length=0, labeltop=True, labelbottom=False)
+    ax.set_xticks(np.arange(count + 1) - 0.5, minor=True)
+    ax.set_yticks(np.arange(count + 1) - 0.5, minor=True)
+    ax.grid(visible=False, which="major")
+    ax.grid(color="white", which="minor")
+    ax.tick_params(which="minor", length=0)
+    ax.spines[:].set_visible(False)
+    return svg_of(figure)
+
+
+def image_residuals(images: Sequence[dict[str, Any]]) -> Markup:
+    """Root mean square residual of every image, a panel for each kind and two of them in a row."""
+    kinds = list(dict.fromkeys(image["kind"] for image in images))
+    rows = math.ceil(len(kinds) / 2)
+    figure, panels = new_figure(9.0, 2.7 * rows, rows=rows, columns=min(2, len(kinds)))
+    for number, (ax, kind) in enumerate(zip(panels, kinds, strict=False)):
+        rms = [image["rms_px"] for image in images if image["kind"] == kind]
+        values = [np.nan if value is None else value for value in rms]
+        ax.plot(range(1, len(values) + 1), values, "o", color=COLOURS[number % len(COLOURS)], markersize=4)
+        ax.set(title=kind, xlabel="image", ylabel="residual (rms) / px")
+        ax.set_ylim(bottom=0)
+    for ax in panels[len(kinds) :]:
+        ax.set_axis_off()
+    return svg_of(figure)
+
+
+def length_chart(lengths: Sequence[Worth]) -> Markup:
+    """Expanded uncertainty over length, for each axis."""
+    figure, panels = new_figure(9.0, 3.2, columns=2)
+    for ax, title, name in zip(
+        panels, ("surfaces: the calibration alone", "single points"), ("calibration_mm", "point_mm"), strict=True
+    ):
+        for number, axis in enumerate("XYZ"):
+            known = [worth for worth in lengths if worth.axis == axis]
+            y = [1e3 * getattr(worth, name) for worth in known]
+            if known:
+                ax.plot([worth.length_mm for worth in known], y, "o-", color=COLOURS[number], label=f"along {axis}")
+        ax.set(title=title, xlabel="length / mm", ylabel="expanded uncertainty (k = 2) / µm")
+        ax.set_ylim(bottom=0)
+    legend_below(figure)
+    return svg_of(figure)

@@ -150,12 +150,11 @@ def report(
     overwrite
         Replace an existing report, summary and pictures.
     """
-    from uwlts.report.gather import gather_campaign
-    from uwlts.report.page import write_report
+    from uwlts.report.campaign_page import write_report
+    from uwlts.report.gather import gather_campaign, load_reference
     from uwlts.report.pictures import write_pictures
-    from uwlts.report.published import load_reference
     from uwlts.report.summary_file import write_summary
-    from uwlts.report.table import print_table, summary_table
+    from uwlts.report.tables import print_table, summary_table
 
     campaign = gather_campaign(folder)
     published = load_reference(reference) if reference else None

@@ -130,7 +130,7 @@ def certificate(
         certificate_lines,
         certificate_of,
         check_certificate,
-        refuse_unsuitable_page,
+        refuse_unsuitable_certificate,
         write_certificate,
     )
 
@@ -143,7 +143,7 @@ def certificate(
             sys.exit(1)
         return
     page = out or calibration.with_name(f"{calibration.stem}.certificate.html")
-    refuse_unsuitable_page(page, calibration, overwrite=overwrite)
+    refuse_unsuitable_certificate(page, calibration, overwrite=overwrite)
     known = read_calibration(calibration)
     beside = None if before is None else (before.name, read_calibration(before))
     content = certificate_of(known, calibration, issued=datetime.now(UTC).isoformat(timespec="seconds"))

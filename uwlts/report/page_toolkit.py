@@ -21,11 +21,11 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Sequence
+import warnings
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 from markupsafe import Markup
@@ -51,7 +51,7 @@ _STYLE = {
     "font.size": 9.0, "axes.edgecolor": INK, "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK,
     "ytick.color": INK, "axes.titlesize": 10.0, "axes.titleweight": "bold", "axes.titlelocation": "left",
     "axes.grid": True, "axes.axisbelow": True, "grid.color": FAINT, "axes.spines.top": False,
-    "axes.spines.right": False, "legend.frameon": False, "axes.prop_cycle": None,
+    "axes.spines.right": False,
 }  # fmt: skip
 # Text stays text, and the same figure gives the same file.
 _SVG = {"svg.fonttype": "none", "svg.hashsalt": "page"}
@@ -164,18 +164,30 @@ class Comparison:
     rows: tuple[tuple[str, str, tuple[str, ...]], ...]
 
 
-def new_figure(
-    width: float = 5.6, height: float = 3.2, *, rows: int = 1, columns: int = 1
-) -> tuple[Figure, Sequence[Axes]]:
-    """Return an empty matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
-    import matplotlib
+def figure_of(width: float, height: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
+    """An empty matplotlib figure of a size in inches, which no window shows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    figure = Figure(figsize=(width, height), layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def new_figure(
+    width: float = 5.6,
+    height: float = 3.2,
+    *,
+    rows: int = 1,
+    columns: int = 1,
+    height_ratios: list[float] | None = None,
+) -> tuple[Figure, list[Axes]]:  # fmt: skip
+    """A matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
+    import matplotlib
+
+    figure = figure_of(width, height)
     with matplotlib.rc_context(_STYLE | {"axes.prop_cycle": matplotlib.cycler(color=COLOURS)}):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
-        return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+        return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios).flat)
 
 
 def legend_below(figure: Figure, *, columns: int = 4) -> None:
@@ -193,26 +205,35 @@ def legend_below(figure: Figure, *, columns: int = 4) -> None:
 
 def svg_of(figure: Figure) -> Markup:
     """A matplotlib figure as an SVG element to stand in a page."""
-    import matplotlib
-
-    text = io.StringIO()
-    with matplotlib.rc_context(_SVG):
-        figure.savefig(text, format="svg", metadata={"Date": None})
-    drawn = text.getvalue()
+    drawn = _saved(figure, format="svg", metadata={"Date": None}).decode("utf-8")
     # Ids of groups would occur in every figure, and nothing refers to them; within HTML, SVG needs no namespaces.
     drawn = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", drawn, flags=re.S)
     return Markup(drawn[drawn.index("<svg") :].replace("xlink:href", "href"))
 
 
-def png_of(figure: Figure, *, dpi: int = 130) -> bytes:
+def png_of(figure: Figure, *, dpi: int = 100) -> bytes:
     """A matplotlib figure as PNG."""
-    data = io.BytesIO()
     # The software's name with its version would change the file.
-    figure.savefig(data, format="png", dpi=dpi, metadata={"Software": None})
+    return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
+
+
+def _saved(figure: Figure, **options: Any) -> bytes:
+    import matplotlib
+
+    data = io.BytesIO()
+    with matplotlib.rc_context(_SVG), warnings.catch_warnings():
+        # Names from files may have letters that the font lacks; a browser has others.
+        warnings.filterwarnings("ignore", "Glyph .* missing")
+        figure.savefig(data, **options)
     return data.getvalue()
 
 
-def png_data_uri(picture: Figure | bytes, *, dpi: int = 130) -> str:
+def plain_text(text: str) -> str:
+    """Text in which matplotlib finds no formulas."""
+    return text.replace("$", r"\$")
+
+
+def png_data_uri(picture: Figure | bytes, *, dpi: int = 100) -> str:
     """A matplotlib figure, or the bytes of a PNG, as an address that holds the whole picture."""
     data = picture if isinstance(picture, bytes) else png_of(picture, dpi=dpi)
     return "data:image/png;base64," + base64.b64encode(data).decode("ascii")

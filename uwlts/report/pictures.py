@@ -1,15 +1,65 @@
-"""Pictures as PNG files, or inside a page."""
+"""Pictures of a campaign's measurements as PNG: the stripe in one image, and the cloud."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from uwlts.capture import Capture
 from uwlts.files import written_aside
-from uwlts.report.cloud_picture import cloud_picture
+from uwlts.report import plot
 from uwlts.report.gather import Campaign, Measurement
-from uwlts.report.stripe_picture import stripe_picture, stripe_view
+from uwlts.report.page_toolkit import new_figure, png_of
+from uwlts.stripe import Stripe, extract_stripe
+
+_WIDTH_IN, _TALLEST_IN = 11.2, 4.4
+# An image with fewer stripe centres than this shows no stripe to speak of.
+_LEAST_LINES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class StripeView:
+    """A laser image (H, W) of a capture, its number, and the stripe found in it."""
+
+    frame: int
+    image: np.ndarray
+    stripe: Stripe
+
+
+def stripe_view(capture: Capture) -> StripeView | None:
+    """The laser image nearest to the middle of a capture that shows a stripe; None where none does."""
+    header = capture.header
+    laser = np.flatnonzero(capture.laser_on)
+    for place in np.argsort(np.abs(np.arange(len(laser)) - (len(laser) - 1) / 2), kind="stable"):
+        frame = int(laser[place])
+        image = capture.image(frame)
+        stripe = extract_stripe(image, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn)
+        if len(stripe.lines) >= _LEAST_LINES:
+            return StripeView(frame, image, stripe)
+    return None
+
+
+def stripe_picture(view: StripeView) -> Figure:
+    """Above the stripe with its centres, below the brightest part of it pixel by pixel."""
+    shape = view.image.shape if view.stripe.stripe_along == "width" else view.image.T.shape
+    windows = [plot.stripe_window(view.stripe, shape, enlarged=enlarged) for enlarged in (False, True)]
+    # Pixels are square; the axes' labels and titles need some 0.8 inches more.
+    heights = [
+        0.8 + min(_TALLEST_IN, _WIDTH_IN * (bottom - top + 1) / (right - left + 1))
+        for left, right, top, bottom in windows
+    ]
+    figure, (upper, lower) = new_figure(_WIDTH_IN, sum(heights), rows=2, height_ratios=heights)
+    plot.stripe(view.image, view.stripe, upper)
+    plot.stripe(view.image, view.stripe, lower, enlarged=True)
+    left, right, top, bottom = windows[1]
+    part = Rectangle((left - 0.5, top - 0.5), right - left + 1, bottom - top + 1, fill=False, edgecolor="#5ae6e6")
+    upper.add_patch(part)
+    centres = f"{len(view.stripe.lines)} stripe centres (orange)"
+    upper.set_title(f"image {view.frame}: {centres}; square root of grey values", fontsize=9)
+    lower.set_title("the marked part, pixel by pixel, with the centre found on each line", fontsize=9)
+    return figure
 
 
 def stripe_png(measurement: Measurement) -> bytes | None:
@@ -18,12 +68,12 @@ def stripe_png(measurement: Measurement) -> bytes | None:
         return None
     with Capture(measurement.capture.path) as capture:
         view = stripe_view(capture)
-    return None if view is None else png(stripe_picture(view))
+    return None if view is None else png_of(stripe_picture(view))
 
 
 def cloud_png(measurement: Measurement) -> bytes | None:
     """Picture of a measurement's cloud; None without one."""
-    return None if measurement.cloud is None else png(cloud_picture(measurement.cloud))
+    return None if measurement.cloud is None else png_of(plot.cloud(measurement.cloud).figure)
 
 
 def write_pictures(folder: str | Path, campaign: Campaign, *, overwrite: bool = False) -> list[Path]:
@@ -45,11 +95,3 @@ def write_pictures(folder: str | Path, campaign: Campaign, *, overwrite: bool = 
                     aside.write_bytes(picture)
                 written.append(path)
     return written
-
-
-def png(picture: np.ndarray) -> bytes:
-    """A picture (H, W, 3) as the bytes of a PNG file."""
-    done, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    if not done:
-        raise RuntimeError("OpenCV cannot encode a PNG")
-    return encoded.tobytes()

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from uwlts.files import written_aside
-from uwlts.report.gather import Campaign, Measurement
+from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
 from uwlts.report.judged import TruthFigures
-from uwlts.report.published import CALIBRATION, Reference
-from uwlts.report.table import true_window_distance
+from uwlts.report.tables import true_window_distance
 
 KEY_FIGURES = {
     "sphere_spacing_error_mm": ("spheres", "SSE"),

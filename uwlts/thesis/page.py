@@ -10,10 +10,9 @@ from markupsafe import Markup
 import uwlts
 from uwlts.capture import Capture
 from uwlts.cloud import read_cloud
-from uwlts.report.cloud_picture import cloud_picture
+from uwlts.report import plot
 from uwlts.report.page_toolkit import png_data_uri, render_page
-from uwlts.report.pictures import png
-from uwlts.report.stripe_picture import stripe_picture, stripe_view
+from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.thesis.differences import differences, far_off
 from uwlts.thesis.figures import (
     comparison_figure,
@@ -126,6 +125,6 @@ def _pictures(folder: Path) -> list[tuple[str, str, str]]:
         name = cloud.stem.removesuffix("-proposed")
         with Capture(campaign.path / f"{name}.h5") as capture:
             view = stripe_view(capture)
-        stripe = "" if view is None else png_data_uri(png(stripe_picture(view)))
-        found.append((name, stripe, png_data_uri(png(cloud_picture(read_cloud(cloud))))))
+        stripe = "" if view is None else png_data_uri(stripe_picture(view))
+        found.append((name, stripe, png_data_uri(plot.cloud(read_cloud(cloud)).figure)))
     return found

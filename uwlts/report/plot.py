@@ -1,0 +1,528 @@
+"""Static plots of clouds, stripes and calibrations: matplotlib axes in, axes out.
+
+Every function draws into ``ax``, or into a new figure in the style of the pages if none is given, and returns the axes;
+``ax.figure.savefig(...)`` stores them. `page_toolkit.svg_of` turns a figure into a part of a page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING, Any, Literal, assert_never
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D, proj3d
+
+from uwlts.calibration.model import Calibration
+from uwlts.capture import Frame
+from uwlts.cloud import PointCloud
+from uwlts.report.numbers import as_fine_as, is_number, unit_for, unit_of, words_of
+from uwlts.report.page_toolkit import (
+    BLUE,
+    COLOURS,
+    FAINT,
+    INK,
+    RED,
+    figure_of,
+    new_figure,
+    plain_text,
+    typographic,
+)
+from uwlts.stripe import Stripe
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+Colour = Literal["deviation", "depth", "intensity", "uncertainty"]
+
+STOPS = (
+    (0.0, (33, 82, 172)), (0.25, (99, 161, 214)), (0.5, (205, 205, 200)), (0.75, (236, 139, 96)), (1.0, (170, 21, 40)),
+)  # fmt: skip
+"""Colours of deviations: place between -1 and +1 limit (0 to 1), and red-green-blue."""
+
+DEVIATIONS = LinearSegmentedColormap.from_list("deviations", [(place, np.divide(rgb, 255)) for place, rgb in STOPS])
+"""Blue below, grey at zero, red above."""
+
+UNKNOWN, PLAIN, ORANGE, PALE = "#555550", "#5d82a8", "#ff7800", "#9dbad6"
+"""Points without a deviation among others that have one; points of a cloud without any; stripe centres; bars."""
+
+LIMIT_STD = 2.0
+"""The colours of deviations end at this many standard deviations, as in the thesis."""
+
+AZIMUTH_DEG, ELEVATION_DEG = 28.0, 38.0
+"""Direction in which clouds are looked at: turned from +X towards +Y, and down from there (towards +Z)."""
+
+MOST_POINTS = 15_000
+"""An interactive cloud shows at most this many points, with which it still turns smoothly."""
+
+SHORT_LIST = 3
+"""Lists of residuals up to this length are written out in tables; longer ones are drawn."""
+
+# A histogram shows four standard deviations, in which a normal distribution has all but 6 of 100,000 points.
+_BINS, _SHOWN_STD = 81, 4.0
+# Intervals along the stripe, and the points that each needs to have a mean and a scatter.
+_INTERVALS, _LEAST_IN_INTERVAL = 120, 5
+# Residuals that differ by less than this share are drawn as dots: bars must start at zero, where all would look alike.
+_FLAT = 1.2
+# Pixels shown beside a stripe; image lines and pixels beside it in the enlarged part.
+_AROUND_PX, _LINES_ENLARGED, _AROUND_ENLARGED_PX = 24, 44, 7
+
+
+def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviation") -> Axes3D:
+    """Draw all points of a cloud, seen obliquely from the sensor's side, with equal scales and without perspective.
+
+    Parameters
+    ----------
+    cloud
+        The cloud; X, Y and Z in mm, Z pointing away from the sensor.
+    ax
+        Three-dimensional axes.
+    colour
+        What the points' colours show: the deviation from the fitted or true surface, which ends at two standard
+        deviations, the depth Z, the brightness of the stripe, or the standard uncertainty of the position.
+    """
+    if ax is None:
+        # The axes are square: as wide as the room beside the colour bar, and higher than the figure, which cuts them.
+        figure, side, room = figure_of(11.2, 6.0, layout=None), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
+        height = side * 11.2 / 6.0
+        ax = figure.add_axes((0.02, 0.5 - height / 2, side, height), projection="3d")
+        legend_at, bar = figure.transFigure, figure.add_axes((0.92, 0.2, 0.02, 0.6))
+    else:
+        room, legend_at, bar = (0.8, 0.8), ax.transAxes, None
+    ax.view_init(elev=-ELEVATION_DEG, azim=180 + AZIMUTH_DEG, roll=180)
+    ax.set_proj_type("ortho")
+    if not len(cloud):
+        ax.set_axis_off()
+        ax.text2D(0.5, 0.5, "the cloud has no points", transform=ax.transAxes, ha="center")
+        return ax
+    low, high = cloud_limits(cloud.points_mm)
+    # The farthest points come first, so that the nearest stay visible.
+    points = cloud.points_mm[order := np.argsort(-(cloud.points_mm @ view_direction()), kind="stable")]
+    values, label, scale = _coloured_by(cloud, colour)
+    size = float(np.clip(1e5 / len(cloud), 1.0, 16.0))
+    style: dict[str, Any] = {"s": size, "linewidths": 0, "depthshade": False, "rasterized": True}
+    if values is None:
+        ax.scatter(*points.T, color=PLAIN, **style)
+    else:
+        values = values[order]
+        known = np.isfinite(values)
+        if not known.all():
+            ax.scatter(*points[~known].T, color=UNKNOWN, label="not evaluated", **style)
+            ax.legend(loc="upper left", bbox_to_anchor=(0, 1), bbox_transform=legend_at, markerscale=3, frameon=False)
+        drawn = ax.scatter(*points[known].T, c=values[known], **style, **scale)
+        ax.figure.colorbar(drawn, cax=bar, ax=None if bar else ax, label=label)
+    if bar is not None and values is None:
+        bar.remove()
+    for axis, name, start, end in zip((ax.xaxis, ax.yaxis, ax.zaxis), "XYZ", low, high, strict=True):
+        axis.set_label_text(f"{name} / mm")
+        axis.labelpad = 18
+        axis.set_view_interval(start, end, ignore=True)
+        axis.set_major_locator(MaxNLocator(max(2, round(9 * (end - start) / (high - low).max()))))
+        axis.pane.set_facecolor("white")
+    ax.set_box_aspect(high - low)
+    corners = np.array(list(product(*zip(low, high, strict=True)))).T
+    x, y, _ = proj3d.proj_transform(*corners, ax.get_proj())
+    width, height = room[0] * ax.viewLim.width / np.ptp(x), room[1] * ax.viewLim.height / np.ptp(y)
+    ax.set_box_aspect(high - low, zoom=min(width, height))
+    return ax
+
+
+def _coloured_by(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, str, dict[str, Any]]:
+    """Values (N,) with their label and style; None where the cloud does not have them."""
+    match colour:
+        case "deviation":
+            if cloud.deviation_mm is None or not np.isfinite(cloud.deviation_mm).any():
+                return None, "", {}
+            limit = colour_limit_mm(cloud.deviation_mm)
+            unit, factor = unit_for(limit)
+            style = {"cmap": DEVIATIONS, "vmin": -factor * limit, "vmax": factor * limit}
+            return factor * cloud.deviation_mm.astype(np.float64), f"deviation / {unit}", style
+        case "depth":
+            return cloud.points_mm[:, 2], "Z / mm", {"cmap": "viridis"}
+        case "intensity":
+            return cloud.intensity.astype(np.float64), "brightness / grey levels", {"cmap": "cividis"}
+        case "uncertainty":
+            if cloud.uncertainty is None:
+                return None, "", {}
+            std = np.linalg.norm(cloud.uncertainty.std_mm().astype(np.float64), axis=1)
+            unit, factor = unit_for(float(np.median(std)))
+            return factor * std, f"standard uncertainty / {unit}", {"cmap": "viridis"}
+        case _:
+            assert_never(colour)
+
+
+def view_direction() -> np.ndarray:
+    """Unit vector (3,) in the OCS along which clouds are looked at."""
+    azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
+
+
+def cloud_limits(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper ends (3,) of axes that just hold the points, none of them without a length."""
+    low, high = (points_mm.min(axis=0), points_mm.max(axis=0)) if len(points_mm) else (np.zeros(3), np.ones(3))
+    half = np.maximum(0.52 * (high - low), 0.02 * max(1e-6, float((high - low).max())))
+    return (low + high) / 2 - half, (low + high) / 2 + half
+
+
+def colour_limit_mm(deviation_mm: np.ndarray) -> float:
+    """Deviation at which the colours end: `LIMIT_STD` standard deviations, never quite zero."""
+    finite = deviation_mm[np.isfinite(deviation_mm)].astype(np.float64)
+    return max(LIMIT_STD * float(finite.std()), 1e-9) if len(finite) else 1e-9
+
+
+def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
+    """Points in the OCS with equal scales, seen from the sensor's side, to turn by hand; and what it shows."""
+    import plotly.graph_objects as go
+
+    chosen = np.arange(len(cloud))
+    shown = f"All {len(cloud):,} points."
+    if len(cloud) > MOST_POINTS:
+        chosen = np.sort(np.random.default_rng(0).choice(len(cloud), MOST_POINTS, replace=False))
+        shown = f"{MOST_POINTS:,} of {len(cloud):,} points, drawn at random."
+    points = cloud.points_mm[chosen].astype(np.float32)
+    place = "X %{x:.3f}, Y %{y:.3f}, Z %{z:.3f} mm"
+    figure, unknown = go.Figure(), np.ones(len(chosen), bool)
+    if cloud.deviation_mm is not None:
+        limit = colour_limit_mm(cloud.deviation_mm)
+        unit, factor = unit_for(limit)
+        deviation = cloud.deviation_mm[chosen] * np.float32(factor)
+        unknown = np.isnan(deviation)
+        figure.add_scatter3d(
+            **_xyz(points[~unknown]), mode="markers", name="evaluated",
+            marker={
+                "size": 2, "color": deviation[~unknown],
+                "colorscale": [[at, "rgb({}, {}, {})".format(*rgb)] for at, rgb in STOPS],
+                "cmin": -factor * limit, "cmax": factor * limit,
+                "colorbar": {"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
+            },
+            hovertemplate=f"{place}<br>deviation %{{marker.color:.4g}} {unit}<extra></extra>",
+        )  # fmt: skip
+        shown += f" The colours end at {LIMIT_STD:g} standard deviations, ±{factor * limit:.3g} {unit}."
+    if unknown.any():
+        coloured = cloud.deviation_mm is not None
+        figure.add_scatter3d(
+            **_xyz(points[unknown]), mode="markers", name="not evaluated",
+            marker={"size": 1.5, "color": UNKNOWN if coloured else PLAIN},
+            hovertemplate=f"{place}<extra>not evaluated</extra>",
+        )  # fmt: skip
+        shown += (
+            " Dark points were not evaluated: outliers, near an edge, or beside the artefact." if coloured
+            else " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
+        )  # fmt: skip
+    low, high = cloud_limits(cloud.points_mm)
+    axes = {
+        f"{name}axis": {
+            "title": {"text": f"{name.upper()} / mm"}, "gridcolor": FAINT, "color": INK,
+            "range": [low[number], high[number]], "nticks": 8 if number == 1 else 5,
+        }
+        for number, name in enumerate("xyz")
+    }  # fmt: skip
+    figure.update_layout(
+        template="none", height=520, margin={"l": 0, "r": 0, "t": 0, "b": 0}, showlegend=False,
+        font={"size": 12, "color": INK},
+        scene={
+            **axes, "aspectmode": "manual", "aspectratio": _xyz(2.7 * (high - low) / (high - low).max()),
+            "dragmode": "orbit",
+            "camera": {
+                "eye": _xyz(-1.6 * view_direction()), "up": {"x": 0, "y": 0, "z": -1},
+                "projection": {"type": "orthographic"},
+            },
+        },
+    )  # fmt: skip
+    return figure, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor."
+
+
+def _xyz(points: np.ndarray) -> dict[str, Any]:
+    """Columns of points (N, 3), or the numbers of a vector (3,), by axis."""
+    return dict(zip("xyz", points.T if points.ndim == 2 else points.tolist(), strict=True))
+
+
+def stripe(
+    image: np.ndarray | Frame, stripe: Stripe | None = None, ax: Axes | None = None, *, enlarged: bool = False
+) -> Axes:
+    """Draw a laser image, with a stripe the part of it around the stripe and the centres found.
+
+    The stripe always lies: an image in which it runs along the height is shown with rows and columns exchanged. Whole
+    numbers on the axes are pixel centres.
+
+    Parameters
+    ----------
+    image
+        Image (H, W), or a frame of a capture. Its grey values are shown by their square roots, in which the faint ends
+        of a stripe are visible.
+    stripe
+        The stripe found in the image.
+    ax
+        Axes to draw into.
+    enlarged
+        Show the brightest part of the stripe, with linear grey values and the centres joined.
+    """
+    grey = image.image if isinstance(image, Frame) else image
+    if ax is None:
+        _, (ax,) = new_figure(11.2, 4.0)
+    names = ("column u / px", "row v / px")
+    if stripe is not None and stripe.stripe_along == "height":
+        grey, names = grey.T, names[::-1]
+    ax.imshow(
+        grey.astype(np.float32) if enlarged else np.sqrt(np.maximum(grey.astype(np.float32), 0)),
+        cmap="gray", interpolation="nearest" if enlarged else "antialiased", vmin=0,
+    )  # fmt: skip
+    ax.set(xlabel=names[0], ylabel=names[1])
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))
+    ax.grid(visible=False)
+    if stripe is None or not len(stripe.lines):
+        return ax
+    lines = stripe.lines
+    if enlarged:
+        lines = lines[_brightest(stripe, min(_LINES_ENLARGED, len(lines)))]
+    centres = stripe.centre_px[lines]
+    left, right, top, bottom = stripe_window(stripe, grey.shape, enlarged=enlarged)
+    ax.set(xlim=(left - 0.5, right + 0.5), ylim=(bottom + 0.5, top - 0.5))
+    if not enlarged:
+        ax.plot(lines, centres, ".", color=ORANGE, markersize=1.5, label=f"{len(lines)} stripe centres")
+        return ax
+    # A gap between image lines stays a gap.
+    gaps = np.flatnonzero(np.diff(lines) > 1) + 1
+    x, y = (np.insert(values.astype(float), gaps, np.nan) for values in (lines, centres))
+    ax.plot(x, y, ".-", color=ORANGE, linewidth=1, markersize=7, label="centre found on each line")
+    ax.images[0].set_clim(0, float(grey[top : bottom + 1, left : right + 1].max()) or 1)
+    return ax
+
+
+def stripe_window(stripe: Stripe, shape: Sequence[int], *, enlarged: bool = False) -> tuple[int, int, int, int]:
+    """First and last line, first and last pixel that `stripe` shows of an image of a shape (pixels, lines)."""
+    chosen, margin = stripe.lines, _AROUND_PX
+    if enlarged:
+        chosen, margin = chosen[_brightest(stripe, min(_LINES_ENLARGED, len(chosen)))], _AROUND_ENLARGED_PX
+    centres = stripe.centre_px[chosen]
+    return (
+        max(0, int(chosen.min()) - 2),
+        min(shape[1] - 1, int(chosen.max()) + 2),
+        max(0, int(np.floor(centres.min())) - margin),
+        min(shape[0] - 1, int(np.ceil(centres.max())) + margin),
+    )
+
+
+def _brightest(stripe: Stripe, count: int) -> np.ndarray:
+    """Indices into the stripe's lines: the ``count`` neighbouring image lines with the most light in the stripe."""
+    amplitude = np.nan_to_num(stripe.amplitude)
+    first = int(np.argmax(np.convolve(amplitude, np.ones(count), mode="valid")))
+    return np.flatnonzero((stripe.lines >= first) & (stripe.lines < first + count))
+
+
+def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
+    """Draw the distribution of a cloud's deviations beside the normal one of the same mean and standard deviation.
+
+    Raises
+    ------
+    ValueError
+        No point of the cloud has a deviation.
+    """
+    finite = _known_deviations(cloud)
+    if not len(finite):
+        raise ValueError("no point of the cloud has a deviation: evaluate it first")
+    ax = _axes(ax)
+    mean, std = float(finite.mean()), float(finite.std())
+    unit, factor = unit_for(std)
+    reach = max(_SHOWN_STD * std, 1e-9)
+    counts, edges = np.histogram(finite, bins=_BINS, range=(mean - reach, mean + reach))
+    middles, width = (edges[1:] + edges[:-1]) / 2, 2 * reach / _BINS
+    beyond = len(finite) - int(counts.sum())
+    label = f"points; {beyond:,} of {len(finite):,} lie farther out" if beyond else "points"
+    ax.bar(factor * middles, counts, width=factor * width, color=PALE, label=label)
+    if std > 0:
+        normal = len(finite) * width / (std * np.sqrt(2 * np.pi)) * np.exp(-0.5 * ((middles - mean) / std) ** 2)
+        ax.plot(factor * middles, normal, color=INK, linewidth=1.2, label="normal distribution")
+    shown = [typographic(as_fine_as(factor * value, factor * std)) for value in (mean, std)]
+    ax.axvline(factor * mean, color=RED, linewidth=1.2, label=f"mean {shown[0]} {unit}")
+    for sign, text in ((-1, f"standard deviation {shown[1]} {unit}"), (1, None)):
+        ax.axvline(factor * (mean + sign * std), color=RED, linewidth=1.2, linestyle=":", label=text)
+    ax.set(xlabel=f"deviation / {unit}", ylabel="points per bin", ylim=(0, 1.45 * float(counts.max())))
+    ax.legend(loc="upper left", fontsize=8, ncols=2)
+    return ax
+
+
+def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
+    """Draw mean and scatter of a cloud's deviations over all images, in short intervals of Y.
+
+    Raises
+    ------
+    ValueError
+        No interval has enough points.
+    """
+    if not has_profile(cloud):
+        raise ValueError("too few points of the cloud have a deviation: evaluate it first")
+    ax = _axes(ax)
+    edges, count, place, deviation = _intervals(cloud)
+    enough = count >= _LEAST_IN_INTERVAL
+    mean = np.bincount(place, deviation, _INTERVALS)[enough] / count[enough]
+    square = np.bincount(place, deviation**2, _INTERVALS)[enough] / count[enough]
+    std = np.sqrt(np.maximum(square - mean**2, 0))
+    unit, factor = unit_for(float(deviation.std()))
+    # A gap in the stripe stays a gap in the curve.
+    middles, curves = (edges[1:] + edges[:-1]) / 2, np.full((2, _INTERVALS), np.nan)
+    curves[:, enough] = factor * np.array([mean, std])
+    low, high = curves[0] - curves[1], curves[0] + curves[1]
+    ax.fill_between(middles, low, high, color=PALE, alpha=0.6, linewidth=0, label="mean ± standard deviation")
+    ax.plot(middles, curves[0], color=BLUE, linewidth=1.5, label=f"mean of {edges[1] - edges[0]:.2g} mm along Y")
+    ax.axhline(0, color=INK, linewidth=0.8)
+    ax.set(xlabel="Y, along the stripe / mm", ylabel=f"deviation / {unit}")
+    ax.legend(loc="upper left", fontsize=8, ncols=2, bbox_to_anchor=(0, 1.14))
+    return ax
+
+
+def has_profile(cloud: PointCloud) -> bool:
+    """Whether a cloud has enough deviations for `along_stripe`."""
+    return len(_known_deviations(cloud)) > 0 and bool((_intervals(cloud)[1] >= _LEAST_IN_INTERVAL).any())
+
+
+def _known_deviations(cloud: PointCloud) -> np.ndarray:
+    deviation = np.empty(0) if cloud.deviation_mm is None else cloud.deviation_mm.astype(np.float64)
+    return deviation[np.isfinite(deviation)]
+
+
+def _intervals(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Edges of intervals of Y, points in each, and the interval and deviation of every evaluated point."""
+    assert cloud.deviation_mm is not None
+    y = cloud.points_mm[np.isfinite(cloud.deviation_mm), 1]
+    edges = np.linspace(y.min(), y.max(), _INTERVALS + 1)
+    place = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, _INTERVALS - 1)
+    # Points of one Y have no profile.
+    count = np.bincount(place, minlength=_INTERVALS) if np.ptp(y) > 0 else np.zeros(_INTERVALS, int)
+    return edges, count, place, _known_deviations(cloud)
+
+
+@dataclass(frozen=True)
+class ResidualList:
+    """A list of numbers among a calibration's residuals, None where there is none, and the images it belongs to."""
+
+    group: str
+    name: str
+    values: tuple[float | None, ...]
+    images: tuple[str, ...]
+
+
+def residual_lists(calibration: Calibration) -> list[ResidualList]:
+    """All lists of residuals that are long enough to be drawn; matrices are left out."""
+    found = []
+    for group, name, values in _lists(calibration.residuals_in_file(), ""):
+        if len(values) > SHORT_LIST and any(is_number(value) for value in values):
+            table = calibration.residuals.get(group)
+            images = table.get("images") if isinstance(table, dict) else None
+            named = isinstance(images, list) and len(images) == len(values) and all(isinstance(i, str) for i in images)
+            numbers = tuple(value if is_number(value) else None for value in values)
+            found.append(ResidualList(group, name, numbers, tuple(images) if named and images else ()))
+    return found
+
+
+def _lists(table: Mapping[str, Any], group: str) -> Iterator[tuple[str, str, list[Any]]]:
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _lists(value, f"{group} {name}".strip())
+        elif isinstance(value, list) and all(item is None or is_number(item) for item in value):
+            yield group, name, value
+
+
+def residuals(calibration: Calibration, ax: Axes | None = None, *, which: ResidualList | None = None) -> Axes:
+    """Draw one list of a calibration's residuals by image, of `residual_lists` the first one unless ``which`` is given.
+
+    Raises
+    ------
+    ValueError
+        The calibration has no list of residuals.
+    """
+    which = which or next(iter(residual_lists(calibration)), None)
+    if which is None:
+        raise ValueError("the calibration stores no list of residuals")
+    ax = _axes(ax)
+    places = np.arange(1, len(which.values) + 1)
+    heights = np.array([np.nan if value is None else value for value in which.values])
+    if np.nanmin(heights) > 0 and np.nanmax(heights) < _FLAT * np.nanmin(heights):
+        ax.plot(places, heights, "o", color=BLUE, markersize=5)
+    else:
+        ax.bar(places, heights, color="#7fa6cc")
+        ax.axhline(0, color=INK, linewidth=0.8)
+    words, unit = words_of(which.name), unit_of(which.name)
+    ax.set(
+        xlabel="image" if which.images or "image" in which.name else "number",
+        ylabel=plain_text(f"{words} / {unit}" if unit else words),
+    )
+    if which.images:
+        names = [plain_text(name) for name in which.images]
+        ax.set_xticks(places, names, rotation=40, ha="right", rotation_mode="anchor", fontsize=7)
+    return ax
+
+
+def window_curves(
+    calibrations: Mapping[str, Calibration], ax: Axes | None = None, *, true_mm: float | None = None
+) -> Axes:
+    """Draw the step height error over the tried window distance, of all calibrations (by name) that store it.
+
+    A diamond marks each estimate, a dashed line the true distance if it is given.
+
+    Raises
+    ------
+    ValueError
+        None of the calibrations stores it.
+    """
+    if not has_window_curve(calibrations):
+        raise ValueError("none of the calibrations stores the error over the tried window distances")
+    ax = _axes(ax)
+    for number, (name, calibration) in enumerate(calibrations.items()):
+        curve = _window_curve(calibration)
+        if curve is None:
+            continue
+        colour, label, least = COLOURS[number % len(COLOURS)], plain_text(name), None
+        errors = calibration.residuals["window"].get("errors_mm")
+        if calibration.window is not None and isinstance(errors, list) and errors and all(map(is_number, errors)):
+            # The tried distances are too coarse to meet the bottom of the valley.
+            least = calibration.window.distance_mm, float(np.sqrt(np.mean(np.square(errors))))
+            curve = np.vstack([curve, least])
+            curve = curve[np.argsort(curve[:, 0])]
+            label += f": {least[0]:.3f} mm, error {least[1]:.4f} mm"
+        ax.plot(*curve.T, color=colour, label=label)
+        if least is not None:
+            ax.plot(*least, "D", color=colour, markersize=7)
+    if true_mm is not None:
+        ax.axvline(true_mm, color=RED, linestyle="--", label=f"true {true_mm:.3f} mm")
+    ax.set(xlabel="window distance d / mm", ylabel="step height error (rms) / mm")
+    ax.legend(fontsize=8)
+    return ax
+
+
+def has_window_curve(calibrations: Mapping[str, Calibration]) -> bool:
+    """Whether any of the calibrations has what `window_curves` draws."""
+    return any(_window_curve(calibration) is not None for calibration in calibrations.values())
+
+
+def _window_curve(calibration: Calibration) -> np.ndarray | None:
+    """Tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not store them."""
+    window = calibration.residuals.get("window")
+    rows = window.get("curve_mm") if isinstance(window, dict) else None
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, list) and len(row) == 2 for row in rows):
+        return None
+    if not all(value is None or is_number(value) for row in rows for value in row):
+        return None
+    return np.array(rows, dtype=float)
+
+
+def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
+    """Draw the time in s of each stage by its name."""
+    if ax is None:
+        _, (ax,) = new_figure(8.0, 0.8 + 0.3 * len(seconds))
+    bars = ax.barh([plain_text(name) for name in seconds], list(seconds.values()), color="#7fa6cc")
+    ax.bar_label(bars, [f"{value:.3g} s" for value in seconds.values()], padding=4)
+    ax.invert_yaxis()
+    ax.margins(x=0.1)
+    ax.set_xlabel("time / s")
+    return ax
+
+
+def _axes(ax: Axes | None) -> Axes:
+    return new_figure()[1][0] if ax is None else ax
