@@ -1,4 +1,4 @@
-"""Loads one libLLVM and prints its version as JSON; run by `twin.llvm_search` as a script of its own.
+"""Loads one libLLVM and prints its version as JSON; run by `twin.llvm` as a script of its own.
 
 A library of the wrong kind can end the process that loads it, and two libLLVM in one process may disturb each other,
 so this happens in a child process. Needs nothing but the standard library.
@@ -15,9 +15,9 @@ import sys
 from pathlib import Path
 
 
-def load_with_companions(library, companions):
+def load_with_companions(library: str, companions: list[str]) -> ctypes.CDLL:
     """Load a library; what the loader misses is taken from the library's own folder, needed ones first."""
-    asked = set()
+    asked: set[str] = set()
     while True:
         try:
             return ctypes.CDLL(library)
@@ -36,9 +36,9 @@ def load_with_companions(library, companions):
             companions.append(found)
 
 
-def describe(library):
+def describe(library: str) -> dict[str, object]:
     """Version and companions of the library, or the fault that keeps it from being used."""
-    companions = []
+    companions: list[str] = []
     try:
         handle = load_with_companions(library, companions)
     except OSError as error:

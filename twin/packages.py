@@ -15,6 +15,7 @@ from typing import TypeVar
 from uwlts.errors import SetupError
 
 COMMAND_SECONDS = 900
+"""Downloads of some 40 MB over a slow line."""
 
 Library = TypeVar("Library")
 Report = Callable[[str], object]
@@ -62,12 +63,12 @@ def obtain(
         if os.environ.get(choice):
             raise
         nothing_found = error
-    target = target or writable_folder(folders)
+    target = target or _writable_folder(folders)
     refusals = []
     for way in (
-        partial(install_packages, choose),
-        partial(unpack_packages, choose, target),
-        partial(unpack_wheel, wheel, target),
+        partial(_install_packages, choose),
+        partial(_unpack_packages, choose, target),
+        partial(_unpack_wheel, wheel, target),
     ):
         try:
             way(what=what, report=report)
@@ -81,14 +82,8 @@ def obtain(
     raise SetupError(f"{nothing_found}\nTried without success to obtain it:{''.join(refusals)}") from nothing_found
 
 
-def install_packages(choose: Choose, *, what: str, report: Report) -> None:
-    """As root on Debian, Ubuntu and their relatives: install packages of the distribution.
-
-    Raises
-    ------
-    SetupError
-        Not root, no apt-get, or it fails.
-    """
+def _install_packages(choose: Choose, *, what: str, report: Report) -> None:
+    """As root on Debian, Ubuntu and their relatives: install packages of the distribution."""
     if shutil.which("apt-get") is None or os.geteuid() != 0:
         raise SetupError("apt-get install: not possible, needs root and apt-get")
 
@@ -106,14 +101,8 @@ def install_packages(choose: Choose, *, what: str, report: Report) -> None:
         install()
 
 
-def unpack_packages(choose: Choose, target: Path, *, what: str, report: Report) -> None:
-    """Without root: unpack the libraries of packages, and of those they need that the system lacks, into a folder.
-
-    Raises
-    ------
-    SetupError
-        No apt-get, or it fails.
-    """
+def _unpack_packages(choose: Choose, target: Path, *, what: str, report: Report) -> None:
+    """Without root: unpack the libraries of packages, and of those they need that the system lacks, into a folder."""
     if shutil.which("apt-get") is None:
         raise SetupError("apt-get download: not possible, needs apt-get")
     with tempfile.TemporaryDirectory() as scratch:
@@ -142,17 +131,11 @@ def _download_and_unpack(
     run_command(["apt-get", *options, "download", *wanted], folder=scratch)
     for archive in scratch.glob("*.deb"):
         run_command(["dpkg-deb", "--extract", str(archive), str(scratch / "unpacked")])
-    copy_libraries(scratch / "unpacked", target)
+    _copy_libraries(scratch / "unpacked", target)
 
 
-def unpack_wheel(requirement: str, target: Path, *, what: str, report: Report) -> None:
-    """Without apt-get: unpack the libraries of a wheel, by pip, into a folder.
-
-    Raises
-    ------
-    SetupError
-        There is no such wheel for this machine, or the registry is out of reach.
-    """
+def _unpack_wheel(requirement: str, target: Path, *, what: str, report: Report) -> None:
+    """Without apt-get: unpack the libraries of a wheel, by pip, into a folder."""
     with tempfile.TemporaryDirectory() as scratch:
         report(f"{what}: unpacking the wheel {requirement} into {target}")
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
@@ -160,10 +143,10 @@ def unpack_wheel(requirement: str, target: Path, *, what: str, report: Report) -
         for wheel in Path(scratch).glob("*.whl"):
             with zipfile.ZipFile(wheel) as archive:
                 archive.extractall(Path(scratch, "unpacked"))
-        copy_libraries(Path(scratch, "unpacked"), target)
+        _copy_libraries(Path(scratch, "unpacked"), target)
 
 
-def copy_libraries(unpacked: Path, target: Path) -> None:
+def _copy_libraries(unpacked: Path, target: Path) -> None:
     """Copy all shared libraries into one flat folder, in which they find each other."""
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -177,7 +160,7 @@ def copy_libraries(unpacked: Path, target: Path) -> None:
         raise SetupError(f"cannot write to {target}: {error}") from error
 
 
-def writable_folder(folders: Sequence[Path]) -> Path:
+def _writable_folder(folders: Sequence[Path]) -> Path:
     """The first of some folders, there or not, that the user can write to; SetupError if there is none."""
     for folder in folders:
         existing = next(parent for parent in (folder, *folder.parents) if parent.exists())

@@ -14,9 +14,18 @@ from pathlib import Path
 
 import pytest
 
-from twin import llvm_install, llvm_search, packages
-from twin.llvm import LlvmLibrary, find_llvm, install_llvm, main
-from twin.llvm_search import Unsuitable, examine, judge, list_candidates, named_version
+from twin import llvm, packages
+from twin.llvm import (
+    LlvmLibrary,
+    Unsuitable,
+    examine,
+    find_llvm,
+    install_llvm,
+    judge,
+    list_candidates,
+    main,
+    named_version,
+)
 from uwlts.errors import SetupError
 
 NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"
@@ -86,19 +95,19 @@ def test_candidates_are_shared_libraries_named_llvm_each_once(tmp_path):
 
 @pytest.mark.parametrize("major", [14, 15, 16])
 def test_versions_that_abort_are_refused(major):
-    refused = judge(Path("libLLVM.so"), {"version": [major, 0, 6], "companions": []})
+    refused = judge(Path("libLLVM.so"), version=[major, 0, 6])
     assert isinstance(refused, Unsuitable)
     assert f"{major}.0.6" in str(refused) and "17 or newer" in str(refused)
 
 
 def test_library_without_version_function_is_refused_as_too_old():
-    refused = judge(Path("libLLVM.so"), {"version": None, "companions": []})
+    refused = judge(Path("libLLVM.so"), version=None)
     assert isinstance(refused, Unsuitable) and "too old" in refused.fault
 
 
 @pytest.mark.parametrize("major", [17, 19, 22, 23])
 def test_newer_versions_are_accepted(major):
-    assert judge(Path("libLLVM.so"), {"version": [major, 1, 2], "companions": []}) == LlvmLibrary(
+    assert judge(Path("libLLVM.so"), version=[major, 1, 2]) == LlvmLibrary(
         Path("libLLVM.so"), (major, 1, 2)
     )
 
@@ -117,9 +126,9 @@ def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypat
 
     def state(path):
         looked_at.append(path.name)
-        return judge(path, {"version": list(true_versions[path.name]), "companions": []})
+        return judge(path, version=list(true_versions[path.name]))
 
-    monkeypatch.setattr(llvm_search, "examine", state)
+    monkeypatch.setattr(llvm, "examine", state)
     assert find_llvm([tmp_path]).path.name == "libLLVM.so.20.1"
     # Those that cannot be newer than 20.1 by their own claim are left alone: loading one takes about 0.1 s.
     assert looked_at == ["libLLVM.so", "libLLVM.so.22.1", "libLLVM.so.20.1"]
@@ -128,7 +137,7 @@ def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypat
 def test_message_lists_what_was_found_and_how_to_install(tmp_path, monkeypatch):
     (tmp_path / "libLLVM-15.so.1").touch()
     (tmp_path / "libLLVM-14.so.1").touch()
-    monkeypatch.setattr(llvm_search, "examine", lambda path: judge(path, {"version": [15, 0, 7], "companions": []}))
+    monkeypatch.setattr(llvm, "examine", lambda path: judge(path, version=[15, 0, 7]))
     with pytest.raises(SetupError) as caught:
         find_llvm([tmp_path])
     message = str(caught.value)
@@ -213,7 +222,7 @@ def test_users_suitable_choice_is_used(monkeypatch, machine_library, tmp_path):
 
 
 def test_missing_runtime_library_of_drjit_is_reported(monkeypatch, machine_library):
-    monkeypatch.setattr(llvm_search, "RUNTIME_LIBRARY", "libabsent.so.1")
+    monkeypatch.setattr(llvm, "RUNTIME_LIBRARY", "libabsent.so.1")
     with pytest.raises(SetupError, match=r"Dr\.Jit needs libabsent\.so\.1.*\n(.*\n)*.*libatomic1"):
         find_llvm([machine_library.path.parent])
 
@@ -227,7 +236,7 @@ def test_install_leaves_a_suitable_library_alone(machine_library, tmp_path, monk
 
 def test_install_gives_the_reason_of_every_way_that_failed(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(llvm_install, "WHEEL", "")
+    monkeypatch.setattr(llvm, "WHEEL", "")
     with pytest.raises(SetupError) as caught:
         install_llvm(folders=[tmp_path], target=tmp_path / "unpacked")
     message = str(caught.value)
@@ -242,9 +251,10 @@ def test_debian_package_offered_by_the_lists_is_taken(monkeypatch):
         "libllvm17:\n  Installed: 1:17.0.6-1\n  Candidate: 1:17.0.6-1\n  Version table:\n"
     )
     monkeypatch.setattr(packages, "run_command", lambda command: policy)
-    assert llvm_install._debian_package([]) == "libllvm18"
+    assert llvm._offered([]) == ["libllvm18", "libatomic1"]
     monkeypatch.setattr(packages, "run_command", lambda command: "")
-    assert llvm_install._debian_package([]) is None
+    with pytest.raises(SetupError, match="there is none of libllvm19"):
+        llvm._offered([])
 
 
 def test_command_line_shows_what_is_there_and_fails_without(capsys, monkeypatch, machine_library, foreign_library):
