@@ -18,7 +18,7 @@ from twin.scene import load_scene, scene_names
 from uwlts.console import progress_bar, run
 from uwlts.errors import DescriptionError
 from uwlts.library import names
-from uwlts.waters import water_names
+from uwlts.waters import WATERS
 
 app = App(
     name="twin",
@@ -347,7 +347,9 @@ def scenes() -> None:
     print(f"sensors: {', '.join(names('sensors'))}")
     print(f"campaigns: {', '.join(campaign_names())}")
     print(f"studies: {', '.join(names('studies'))}")
-    print(f"waters: {', '.join(water_names())}, or a turbidity from 0 to 3")
+    print(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
+    for name, water in WATERS.items():
+        print(f"  {name}: {water.sentence}")
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from uwlts import media, waters
+from uwlts import media, phase_functions, waters
 from uwlts.errors import DescriptionError
 
 Positive = Annotated[float, Field(gt=0)]
@@ -181,10 +181,11 @@ class Medium(Description):
     these.
 
     ``phase`` is the phase function of the particles, while the molecules of water scatter as molecules do; of
-    everything if ``scattering_per_m`` is given. It is "molecular", "henyey-greenstein" with ``asymmetry``, "petzold"
-    (average particle), or "fournier-forand" with ``particle_index`` (relative to water) and ``particle_slope`` (of the
-    size distribution), which ``backscatter_share`` replaces if given. Unless given it is "petzold" where ``water`` or
-    ``turbidity`` is given, else "molecular".
+    everything if ``scattering_per_m`` is given. It is a name of `uwlts.phase_functions.KINDS`, of which
+    "henyey-greenstein" takes ``asymmetry``, and "fournier-forand" ``particle_index`` (relative to water) and
+    ``particle_slope`` (of the size distribution), which ``backscatter_share`` replaces if given; or a table of a
+    ``kind`` with parameters of its own. Unless given it is that of the named ``water``, "petzold" where ``turbidity``
+    is given, else "molecular".
     """
 
     kind: Literal["air", "fresh", "sea", "custom"]
@@ -195,17 +196,28 @@ class Medium(Description):
     turbidity: Annotated[float, Field(ge=0, le=3)] | None = None
     absorption_per_m: NotNegative | None = None
     scattering_per_m: NotNegative | None = None
-    phase: Literal["molecular", "henyey-greenstein", "petzold", "fournier-forand"] | None = None
-    asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.924
-    particle_index: Annotated[float, Field(gt=1, lt=1.5)] = 1.10
-    particle_slope: Annotated[float, Field(gt=3, lt=5)] = 3.5835
-    backscatter_share: Annotated[float, Field(ge=1e-4, le=0.1)] | None = None
+    phase: str | phase_functions.DescribedPhase | None = None
+    asymmetry: phase_functions.Asymmetry = 0.924
+    particle_index: phase_functions.ParticleIndex = 1.10
+    particle_slope: phase_functions.ParticleSlope = 3.5835
+    backscatter_share: phase_functions.BackscatterShare | None = None
 
     @field_validator("water")
     @classmethod
     def _known_water(cls, value: str | None) -> str | None:
         if value is not None and value not in waters.water_names():
             raise ValueError(f"unknown water; known are {', '.join(waters.water_names())}")
+        return value
+
+    @field_validator("phase")
+    @classmethod
+    def _known_phase(
+        cls, value: str | phase_functions.DescribedPhase | None
+    ) -> str | phase_functions.DescribedPhase | None:
+        if isinstance(value, str):
+            phase_functions.phase_function_kind(value)
+        elif value is not None:
+            value.phase_function()
         return value
 
     @model_validator(mode="after")
@@ -263,17 +275,17 @@ class Medium(Description):
         """Scattering coefficient b in 1/mm; RangeError outside the tables."""
         return sum((part.coefficient_per_mm for part in self.scatterers(wavelength_nm)), 0.0)
 
-    def scatterers(self, wavelength_nm: float) -> tuple[waters.Scatterer, ...]:
+    def scatterers(self, wavelength_nm: float) -> tuple[phase_functions.Scatterer, ...]:
         """What scatters, with its part of b and its phase function; RangeError outside the tables."""
         if self.scattering_per_m is not None:
             parts = [(self.scattering_per_m, self._phase_function())]
         elif self._is_water():
             molecules = media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
             particles = self._particles(wavelength_nm).scattering_per_m
-            parts = [(molecules, waters.Molecular()), (particles, self._phase_function())]
+            parts = [(molecules, phase_functions.Molecular()), (particles, self._phase_function())]
         else:
             parts = []
-        return tuple(waters.Scatterer(1e-3 * b, phase) for b, phase in parts if b > 0)
+        return tuple(phase_functions.Scatterer(1e-3 * b, phase) for b, phase in parts if b > 0)
 
     def _is_water(self) -> bool:
         """Whether absorption and scattering are those of water, pure or not, unless given."""
@@ -284,19 +296,20 @@ class Medium(Description):
             return waters.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
         return waters.particles_of(self.water or "pure", wavelength_nm=wavelength_nm)
 
-    def _phase_function(self) -> waters.PhaseFunction:
-        natural = self.water is not None or self.turbidity is not None
-        match self.phase or ("petzold" if natural else "molecular"):
-            case "henyey-greenstein":
-                return waters.HenyeyGreenstein(self.asymmetry)
-            case "petzold":
-                return waters.PetzoldAverage()
-            case "fournier-forand" if self.backscatter_share is not None:
-                return waters.fournier_forand_of(self.backscatter_share)
-            case "fournier-forand":
-                return waters.FournierForand(self.particle_index, self.particle_slope)
-            case _:
-                return waters.Molecular()
+    def _phase_function(self) -> phase_functions.PhaseFunction:
+        if isinstance(self.phase, phase_functions.DescribedPhase):
+            return self.phase.phase_function()
+        if self.phase is not None:
+            name = self.phase
+        elif self.turbidity is not None:
+            # The scale runs over Petzold's stations.
+            name = "petzold"
+        else:
+            name = "molecular" if self.water is None else waters.named_water(self.water).phase
+        keys = phase_functions.PhaseKeys(
+            self.asymmetry, self.particle_index, self.particle_slope, self.backscatter_share
+        )
+        return phase_functions.phase_function_kind(name).of_keys(keys)
 
     def extinction_per_mm(self, wavelength_nm: float) -> float:
         """Extinction coefficient c = a + b in 1/mm, by which a beam grows weaker."""

@@ -11,9 +11,9 @@ from scipy.special import chdtrc
 
 from tests.virtual_sensors import clear, gauss_legendre
 from twin.arrays import to_jit, to_numpy
-from twin.phase_functions import NODES, node_angles, per_sr, tabulated
+from twin.phase_functions import NODES, node_angles, tabulated
 from twin.water import Scattering
-from uwlts import waters
+from uwlts.phase_functions import FournierForand, HenyeyGreenstein, Molecular, PetzoldAverage, PhaseFunction, Scatterer
 from uwlts.sensor import Medium
 
 import mitsuba as mi  # isort: skip
@@ -49,15 +49,15 @@ def shares(medium: Medium, edges: np.ndarray) -> np.ndarray:
     return (value * math.pi * middle * (2 - middle) * steps).sum(axis=1)
 
 
-def within(table_of: waters.PhaseFunction, degrees: float) -> float:
+def within(table_of: PhaseFunction, degrees: float) -> float:
     """Share scattered by less than an angle."""
-    table = tabulated((waters.Scatterer(1.0, table_of),))
+    table = tabulated((Scatterer(1.0, table_of),))
     return float(np.interp(math.log(math.radians(degrees)), np.log(node_angles()), table.cumulative))
 
 
-def mean_cosine(phase: waters.PhaseFunction) -> float:
+def mean_cosine(phase: PhaseFunction) -> float:
     """1 less the integral of (1 - cos), to which small angles add nothing."""
-    table = tabulated((waters.Scatterer(1.0, phase),))
+    table = tabulated((Scatterer(1.0, phase),))
     return 1 - float(np.diff(table.cumulative) @ (1 - np.cos(np.sqrt(node_angles()[1:] * node_angles()[:-1]))))
 
 
@@ -70,16 +70,16 @@ def test_henyey_and_greenstein_is_its_series(asymmetry):
     orders = np.arange(500)
     # The generating function of the Legendre polynomials; the first order left out adds 1001 * 0.924^500 = 7e-15.
     series = np.polynomial.legendre.legval(np.cos(angle), (2 * orders + 1) * asymmetry**orders) / (4 * math.pi)
-    found = per_sr(waters.HenyeyGreenstein(asymmetry), angle)
+    found = HenyeyGreenstein(asymmetry).per_sr(angle)
     np.testing.assert_allclose(found, series, rtol=1e-9)
 
 
 def test_molecules_scatter_by_their_depolarisation_and_as_much_back_as_forth():
     # Across, light polarised both ways is left: (1 - d) / (1 + d) less than forwards, with d = 0.039.
-    forward, across, backward = per_sr(waters.Molecular(), np.radians([1e-6, 90.0, 180.0]))
+    forward, across, backward = Molecular().per_sr(np.radians([1e-6, 90.0, 180.0]))
     assert forward / across - 1 == pytest.approx((1 - 0.039) / (1 + 0.039), abs=1e-4)
     assert forward == pytest.approx(backward)
-    assert within(waters.Molecular(), 90.0) == pytest.approx(0.5, abs=1e-6)
+    assert within(Molecular(), 90.0) == pytest.approx(0.5, abs=1e-6)
     # 3 / (4 pi (3 + k)) at 90 deg with k = 0.925: 0.0608236
     assert across == pytest.approx(0.0608236, abs=1e-7)
 
@@ -93,18 +93,18 @@ MOBLEY = [
 
 
 def test_petzolds_average_is_mobleys():
-    found = [within(waters.PetzoldAverage(), degrees) for degrees, _ in MOBLEY]
+    found = [within(PetzoldAverage(), degrees) for degrees, _ in MOBLEY]
     # The integral depends on how one passes between the angles: taken as powers of the angle, as here, or as straight
     # lines, it differs by 0.4 % of what lies between 5 and 15 deg, where the angles are farthest apart.
     assert found == pytest.approx([share for _, share in MOBLEY], abs=0.003)
-    shares_found = [within(waters.PetzoldAverage(), degrees) for degrees in (0.1, 1.0, 5.0, 10.0)]
+    shares_found = [within(PetzoldAverage(), degrees) for degrees in (0.1, 1.0, 5.0, 10.0)]
     assert [round(100 * share) for share in shares_found] == [5, 23, 52, 67]
-    assert 1 - within(waters.PetzoldAverage(), 90.0) == pytest.approx(0.0183, abs=0.5e-4)
-    assert mean_cosine(waters.PetzoldAverage()) == pytest.approx(0.924, abs=0.5e-3)
+    assert 1 - within(PetzoldAverage(), 90.0) == pytest.approx(0.0183, abs=0.5e-4)
+    assert mean_cosine(PetzoldAverage()) == pytest.approx(0.924, abs=0.5e-3)
 
 
 def test_petzolds_average_has_the_values_of_the_table_and_its_forward_slope():
-    table = tabulated((waters.Scatterer(1.0, waters.PetzoldAverage()),))
+    table = tabulated((Scatterer(1.0, PetzoldAverage()),))
     per_solid_angle = np.exp(table.log_density) / (math.pi * np.sin(node_angles()) ** 2)
     found = np.exp(
         np.interp(np.log(np.radians([0.1, 1.0, 10.0, 90.0])), np.log(node_angles()), np.log(per_solid_angle))
@@ -125,14 +125,14 @@ FOURNIER_FORAND = [
 
 @pytest.mark.parametrize(("index", "slope", "share", "accuracy"), FOURNIER_FORAND)
 def test_fournier_and_forand_scatters_back_as_much_as_published(index, slope, share, accuracy):
-    phase = waters.FournierForand(index, slope)
+    phase = FournierForand(index, slope)
     back = 1 - within(phase, 90.0)
     # Printed with one or three digits, for an index printed to 0.001: at 1.021 that is 5 % of index - 1.
     assert back == pytest.approx(share, rel=accuracy)
     # The angles' integral, from the pole's share on, against the whole, which is 1 in closed form.
     nodes, weights = gauss_legendre(math.log(1e-3), math.log(math.pi), 400)
     angle = np.exp(nodes)
-    beyond = 2 * math.pi * weights @ (per_sr(phase, angle) * np.sin(angle) * angle)
+    beyond = 2 * math.pi * weights @ (phase.per_sr(angle) * np.sin(angle) * angle)
     # The table's logarithm is linear over 0.0088 with second derivatives below 1: 1e-5.
     assert 1 - within(phase, math.degrees(1e-3)) == pytest.approx(beyond, rel=3e-5)
 
@@ -143,11 +143,11 @@ def test_fournier_and_forand_is_positive_and_smooth(index, slope):
     # The formula is 0 / 0 where sin^2(angle / 2) is 3 (index - 1)^2 / 4, about which it must stay smooth.
     middle = 2 * math.asin(math.sqrt(3) * (index - 1) / 2)
     angle = middle * np.exp(np.linspace(-0.2, 0.2, 401))
-    value = np.log(per_sr(waters.FournierForand(index, slope), angle))
+    value = np.log(FournierForand(index, slope).per_sr(angle))
     assert np.isfinite(value).all()
     # Steps of 0.001 of a function of slope and curvature below 10: 1e-5, less the rounding.
     assert np.abs(np.diff(value, 2)).max() < 1e-5
-    everywhere = per_sr(waters.FournierForand(index, slope), node_angles())
+    everywhere = FournierForand(index, slope).per_sr(node_angles())
     assert (everywhere > 0).all()
 
 
@@ -155,11 +155,11 @@ def test_what_is_least_forward_is_close_to_petzold():
     # Fournier and Forand's (1.10, 3.5835) is known as the average particle's equivalent: the same to 30 % over six
     # orders of magnitude, while Henyey and Greenstein's, of the same mean cosine, is three times too low at 1 deg.
     angle = np.radians(np.geomspace(0.2, 150, 100))
-    petzold = per_sr(waters.PetzoldAverage(), angle)
-    ratio = per_sr(waters.FournierForand(1.10, 3.5835), angle) / petzold
+    petzold = PetzoldAverage().per_sr(angle)
+    ratio = FournierForand(1.10, 3.5835).per_sr(angle) / petzold
     assert 0.65 < ratio.min() < ratio.max() < 1.35
     degree = np.radians([1.0])
-    blunt = per_sr(waters.HenyeyGreenstein(0.924), degree) / per_sr(waters.PetzoldAverage(), degree)
+    blunt = HenyeyGreenstein(0.924).per_sr(degree) / PetzoldAverage().per_sr(degree)
     assert blunt[0] == pytest.approx(0.34, abs=0.01)
 
 
@@ -192,8 +192,8 @@ def test_what_is_evaluated_is_the_mixture_of_the_functions(name):
     parts = medium.scatterers(635.0)
     # Petzold's own integral is 0.993723 by the trapezoidal rule over the logarithm of the angle, with 1e6 steps, and
     # its forward power in closed form.
-    whole = {waters.PetzoldAverage(): petzold_integral()}
-    expected = sum(p.coefficient_per_mm * per_sr(p.phase, angle) / whole.get(p.phase, 1.0) for p in parts)
+    whole = {PetzoldAverage(): petzold_integral()}
+    expected = sum(p.coefficient_per_mm * p.phase.per_sr(angle) / whole.get(p.phase, 1.0) for p in parts)
     expected /= sum(p.coefficient_per_mm for p in parts)
     # Within a cell of 0.0088 a curvature of 0.5 leaves 5e-6; one of Petzold's corners, where the slope changes by 0.25
     # at most, leaves a quarter of the cell times that, 5.5e-4. 32 bits leave 1e-6 of the logarithm.
@@ -205,7 +205,7 @@ def petzold_integral() -> float:
     """The integral of the average particle's function over all directions before it is normalised."""
     start = math.radians(0.1)
     log_angle = np.linspace(math.log(start), math.log(math.pi) - 1e-12, 10**6)
-    value = per_sr(waters.PetzoldAverage(), np.exp(log_angle)) * np.sin(np.exp(log_angle)) * np.exp(log_angle)
+    value = PetzoldAverage().per_sr(np.exp(log_angle)) * np.sin(np.exp(log_angle)) * np.exp(log_angle)
     return 2 * math.pi * (np.trapezoid(value, log_angle) + 1772 * start**2 / (2 - 1.346))
 
 

@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 # of GigE Vision is found. Nothing of how the software computes:
 # camera, refraction, sheet, stripe, targets, calibration, reconstruction, metrology.
 SHARED_WITH_TWIN = {
-    "errors", "sensor", "media", "waters", "placement", "library", "capture", "truth", "files", "unfinished",
-    "file_label", "console", "workers", "aravis_library", "report.page_toolkit",
+    "errors", "sensor", "media", "waters", "phase_functions", "placement", "library", "capture", "truth", "files",
+    "unfinished", "file_label", "console", "workers", "aravis_library", "report.page_toolkit",
 }  # fmt: skip
 
 RENDERER = {"mitsuba", "drjit"}

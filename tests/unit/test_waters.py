@@ -1,6 +1,7 @@
 """Named waters and turbidity against the numbers of their sources, and what a description may ask for."""
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +12,15 @@ from pydantic import ValidationError
 
 from uwlts import waters
 from uwlts.errors import DescriptionError, RangeError
+from uwlts.phase_functions import (
+    KINDS,
+    FournierForand,
+    HenyeyGreenstein,
+    Molecular,
+    PetzoldAverage,
+    PhaseFunction,
+    Scatterer,
+)
 from uwlts.sensor import Medium
 
 NODES_NM = (400, 425, 450, 475, 500, 525, 550, 575, 600, 625, 650, 675, 700)
@@ -156,19 +166,19 @@ def test_turbidity_has_equal_factors_above_clear_water():
 
 def test_molecules_scatter_as_molecules_and_particles_as_the_phase_says():
     molecules, particles = sea(water="coastal").scatterers(635.0)
-    assert molecules == waters.Scatterer(pytest.approx(0.937e-6, rel=1e-3), waters.Molecular())
-    assert particles.phase == waters.PetzoldAverage()
+    assert molecules == Scatterer(pytest.approx(0.937e-6, rel=1e-3), Molecular())
+    assert particles.phase == PetzoldAverage()
     named = {
-        "molecular": waters.Molecular(),
-        "henyey-greenstein": waters.HenyeyGreenstein(0.924),
-        "petzold": waters.PetzoldAverage(),
-        "fournier-forand": waters.FournierForand(1.10, 3.5835),
+        "molecular": Molecular(),
+        "henyey-greenstein": HenyeyGreenstein(0.924),
+        "petzold": PetzoldAverage(),
+        "fournier-forand": FournierForand(1.10, 3.5835),
     }
     for phase, expected in named.items():
         medium = sea(turbidity=1.5, phase=phase)
-        assert [part.phase for part in medium.scatterers(635.0)] == [waters.Molecular(), expected]
+        assert [part.phase for part in medium.scatterers(635.0)] == [Molecular(), expected]
         free = sea(water="harbour", scattering_per_m=2.0, phase=phase)
-        assert free.scatterers(635.0) == (waters.Scatterer(2e-3, expected),)
+        assert free.scatterers(635.0) == (Scatterer(2e-3, expected),)
 
 
 def test_given_coefficients_win():
@@ -176,7 +186,7 @@ def test_given_coefficients_win():
     assert per_metre(medium, 635.0) == (0.5, per_metre(sea(water="harbour"), 635.0)[1])
     medium = sea(turbidity=3.0, scattering_per_m=0.25)
     assert per_metre(medium, 635.0) == (per_metre(sea(turbidity=3.0), 635.0)[0], 0.25)
-    assert medium.scatterers(635.0) == (waters.Scatterer(0.25e-3, waters.PetzoldAverage()),)
+    assert medium.scatterers(635.0) == (Scatterer(0.25e-3, PetzoldAverage()),)
     assert sea(water="harbour", scattering_per_m=0.0).scatterers(635.0) == ()
 
 
@@ -198,7 +208,7 @@ def test_a_custom_medium_scatters_only_if_told_to():
 def test_media_stored_before_there_were_named_waters_mean_the_same(stored):
     medium = Medium.model_validate(stored)
     assert len(medium.scatterers(635.0)) == 1
-    kind = waters.HenyeyGreenstein if stored.get("phase") == "henyey-greenstein" else waters.Molecular
+    kind = HenyeyGreenstein if stored.get("phase") == "henyey-greenstein" else Molecular
     assert isinstance(medium.scatterers(635.0)[0].phase, kind)
 
 
@@ -253,7 +263,7 @@ def test_names_and_turbidities_are_checked_where_they_are_used():
             waters.particles_at(turbidity, wavelength_nm=635.0)
     for share in (0.9e-4, 0.11, math.nan):
         with pytest.raises(RangeError, match="backscatter_share"):
-            waters.fournier_forand_of(share)
+            FournierForand.of_backscatter(share)
 
 
 # Ocean Optics Web Book, page on the function of Fournier and Forand: index, slope and share scattered backwards.
@@ -262,8 +272,45 @@ def test_names_and_turbidities_are_checked_where_they_are_used():
     [(1.021, 3.0742, 1e-4), (1.04, 3.201, 1e-3), (1.08, 3.483, 0.01), (1.10, 3.5835, 0.0183), (1.175, 4.065, 0.1)],
 )
 def test_particles_follow_from_the_share_scattered_backwards(index, slope, share):
-    found = waters.fournier_forand_of(share)
+    found = FournierForand.of_backscatter(share)
     # The published pairs are printed to two or three decimals of the index, which the line meets to 0.003; the slope is
     # held by the share, with 0.1542 for one of the index.
     assert found.index == pytest.approx(index, abs=0.003)
     assert found.slope == pytest.approx(slope, abs=0.003 / 0.1542)
+
+
+@dataclass(frozen=True)
+class Even(PhaseFunction):
+    """Scatters the same in all directions, with a share of it left out."""
+
+    name = "even"
+    sentence = "the same in all directions"
+
+    left_out: float = 0.0
+
+    def per_sr(self, angle: np.ndarray) -> np.ndarray:
+        """1 / (4 pi) of what is scattered."""
+        return np.full_like(angle, (1 - self.left_out) / (4 * math.pi))
+
+
+def test_a_new_phase_function_is_one_class_in_the_list_of_kinds(monkeypatch):
+    monkeypatch.setitem(KINDS, "even", Even)
+    by_name = Medium.model_validate({"kind": "custom", "index": 1.3, "scattering_per_m": 1.0, "phase": "even"})
+    assert by_name.scatterers(635.0) == (Scatterer(1e-3, Even()),)
+    table = {"kind": "even", "left_out": 0.5}
+    by_table = Medium.model_validate({"kind": "custom", "index": 1.3, "scattering_per_m": 1.0, "phase": table})
+    assert by_table.scatterers(635.0) == (Scatterer(1e-3, Even(0.5)),)
+    assert Medium.model_validate_json(by_table.model_dump_json()) == by_table
+
+
+@pytest.mark.parametrize(
+    ("phase", "message"),
+    [
+        ({"kind": "rayleigh"}, "known are molecular"),
+        ({"kind": "henyey-greenstein", "asymmetry": 1.5}, "asymmetry"),
+        ({"kind": "henyey-greenstein", "slope": 1.5}, "slope"),
+    ],
+)
+def test_a_phase_function_in_a_table_is_checked(phase, message):
+    with pytest.raises(ValidationError, match=message):
+        sea(phase=phase)
