@@ -15,12 +15,10 @@ from uwlts.calibration.model import KnownMedium, read_calibration, write_calibra
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.certificate import certificate_of, certificate_page, check_certificate, write_certificate
-from uwlts.certificate.changes import change_from
-from uwlts.certificate.content import NOT_JOINT
-from uwlts.certificate.form import form_of, without_rigid_motion
-from uwlts.certificate.lengths import ends_over, in_use, worth_of_lengths
+from uwlts.certificate.content import NOT_JOINT, JointCertificate
 from uwlts.certificate.page import refuse_unsuitable_certificate
-from uwlts.certificate.seal import canonical, read_certificate, sealed
+from uwlts.certificate.seal import canonical, read_certificate, seal_of
+from uwlts.certificate.volume import change_from, ends_over, form_of, in_use, length_uncertainties, without_rigid_motion
 from uwlts.errors import CalibrationError, CaptureError, OutputError
 from uwlts.reconstruction import reconstruct_pixels
 
@@ -57,10 +55,11 @@ def content(calibration, path):
 
 def test_the_same_calibration_gives_the_same_json(calibration, path, content):
     again = certificate_of(read_calibration(path), path, issued=ISSUED)
-    assert json.dumps(again) == json.dumps(content)
+    stored = content.in_file()
+    assert json.dumps(again.in_file()) == json.dumps(stored)
     # What is sealed does not depend on the order of keys, nor on the seal itself.
-    assert canonical(dict(reversed(content.items()))) == canonical(content)
-    assert sealed(content) == content
+    assert canonical(dict(reversed(stored.items()))) == canonical(stored)
+    assert seal_of(stored) == content.sha256 == stored["sha256"]
 
 
 def test_a_changed_byte_is_found(calibration, path, content, tmp_path):
@@ -97,20 +96,20 @@ def test_the_calibration_itself_is_never_replaced(path):
 
 def test_it_says_where_it_holds(calibration, content, thesis):
     """Stripes lie on the plate of 235 mm and in the image, over the travel of 180 mm less where they miss it."""
-    validity = content["validity"][0]
-    assert validity["name"] == "water"
-    assert validity["index"] == calibration.media[0].index
-    assert 0 < validity["index_std"] <= 1.01e-4
-    assert 100 < np.ptp(validity["z_mm"]) < 190
-    assert 100 < np.ptp(validity["y_mm"]) < 235
-    depth = validity["camera_depth_mm"]
-    assert 0.8 * np.ptp(validity["z_mm"]) < depth[1] - depth[0] < np.ptp(validity["z_mm"])
-    assert sum(image["residuals"] for image in content["images"]) == content["residuals"]
-    assert {image["source"] for image in content["images"]} == {f"target, frame {n}" for n in range(6)}
-    assert content["made_from"]["target"]["kind"] == "circles"
-    tilt = next(row for row in content["parameters"] if row["name"] == "window_slope_x")
-    assert tilt["unit"] == "°"
-    assert tilt["std_before"] == pytest.approx(thesis.uncertainty.window_tilt_deg, rel=1e-3)
+    validity = content.validity[0]
+    assert validity.name == "water"
+    assert validity.index == calibration.media[0].index
+    assert 0 < validity.index_std <= 1.01e-4
+    assert 100 < np.ptp(validity.z_mm) < 190
+    assert 100 < np.ptp(validity.y_mm) < 235
+    depth = validity.camera_depth_mm
+    assert 0.8 * np.ptp(validity.z_mm) < depth[1] - depth[0] < np.ptp(validity.z_mm)
+    assert sum(image.residual_count for image in content.images) == content.residuals
+    assert {image.source for image in content.images} == {f"target, frame {n}" for n in range(6)}
+    assert content.made_from["target"]["kind"] == "circles"
+    tilt = next(row for row in content.parameters if row.name == "window_slope_x")
+    assert tilt.unit == "°"
+    assert tilt.std_before == pytest.approx(thesis.uncertainty.window_tilt_deg, rel=1e-3)
 
 
 def points(calibration, known, values, pixels):
@@ -134,7 +133,7 @@ def test_lengths_are_worth_what_draws_say(calibration, use):
     known = use.known
     drawn = np.random.default_rng(1).multivariate_normal(known.values, use.covariance, DRAWS, method="svd")
     compared = 0
-    for worth in worth_of_lengths(use):
+    for worth in length_uncertainties(use):
         if worth.axis == "X" or worth.length_mm not in (20.0, 100.0):
             continue
         pixels = pixels_at(calibration, known, ends_over(use.region, worth.axis, worth.length_mm).reshape(-1, 2))
@@ -149,7 +148,7 @@ def test_lengths_are_worth_what_draws_say(calibration, use):
 def test_along_x_the_stage_counts(use, thesis):
     """Two positions and the scale of 100 mm, twice: k = 2."""
     known = thesis.uncertainty
-    worth = next(w for w in worth_of_lengths(use) if w.axis == "X" and w.length_mm == 100.0)
+    worth = next(w for w in length_uncertainties(use) if w.axis == "X" and w.length_mm == 100.0)
     assert worth.calibration_mm == pytest.approx(
         2 * np.sqrt(2 * known.stage_position_mm**2 + (100 * known.stage_scale) ** 2)
     )
@@ -164,7 +163,7 @@ def test_drift_of_the_water_counts(calibration):
     for kelvin in (0.0, 5.0):
         provenance = calibration.provenance | {"known_before": known | {"drift_k": kelvin}}
         warmer = calibration.model_copy(update={"media": (medium,), "provenance": provenance})
-        found = worth_of_lengths(in_use(warmer, regions(warmer)[0]))
+        found = length_uncertainties(in_use(warmer, regions(warmer)[0]))
         std.append(next(w.calibration_mm for w in found if w.axis == "Y" and w.length_mm == 100.0))
     assert std[1] > 2 * std[0]
 
@@ -221,7 +220,7 @@ def test_against_another_calibration(calibration, thesis):
 def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, content, thesis):
     page = certificate_page(content, calibration, before=("drawings", nominal_calibration(thesis)))
     for words in ("What lengths are worth", "cannot tell", "Correlation of the parameters", "Against drawings",
-                  content["sha256"], content["calibration"]["sha256"], "turn of the laser&#39;s window"):  # fmt: skip
+                  content.sha256, content.calibration.sha256, "turn of the laser&#39;s window"):  # fmt: skip
         assert words in page, words
     assert "://" not in page.replace("http://www.w3.org/2000/svg", "")
     assert "<script" not in page
@@ -236,9 +235,9 @@ def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path
     write_calibration(path, nominal_calibration(thesis))
     known = read_calibration(path)
     content = certificate_of(known, path, issued=ISSUED)
-    assert content["remark"] == NOT_JOINT
-    assert not content["uncertainty_known"]
-    assert "lengths" not in content
+    assert content.remark == NOT_JOINT
+    assert not content.uncertainty_known
+    assert not isinstance(content, JointCertificate) and "lengths" not in content.in_file()
     page = certificate_page(content, known)
     assert NOT_JOINT[1:] in page
     assert "What lengths are worth" not in page

@@ -2,7 +2,7 @@
 
 from uwlts.certificate.content import certificate_lines, certificate_of
 from uwlts.certificate.page import certificate_page, refuse_unsuitable_certificate, write_certificate
-from uwlts.certificate.seal import check_certificate, read_certificate, sealed
+from uwlts.certificate.seal import check_certificate, read_certificate
 
 __all__ = [
     "certificate_lines",
@@ -11,6 +11,5 @@ __all__ = [
     "check_certificate",
     "read_certificate",
     "refuse_unsuitable_certificate",
-    "sealed",
     "write_certificate",
 ]

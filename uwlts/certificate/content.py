@@ -1,29 +1,177 @@
-"""What a certificate says, as plain JSON."""
+"""The content of a certificate as typed objects, which are plain JSON in its file."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, JsonValue, field_serializer
 
 import uwlts
 from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.joint.next_shot import Outlook, next_shots
 from uwlts.calibration.joint.stored import require_joint
-from uwlts.calibration.joint.volume import Region, lengths_over, regions
+from uwlts.calibration.joint.volume import lengths_over, regions
 from uwlts.calibration.joint.weakness import told, weaknesses
+from uwlts.calibration.joint_estimate import ImageFit
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.calibration.sources import sha256_of
-from uwlts.certificate.lengths import InUse, in_use, index_key, worth_of_lengths
-from uwlts.certificate.seal import FORMAT, VERSION, sealed
+from uwlts.certificate.seal import FORMAT, VERSION, seal_of
+from uwlts.certificate.volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
+from uwlts.sensor import Medium
 
-_BEST_SHOTS = 3
 NOT_JOINT = "the calibration was not estimated jointly: what lengths measured by it are worth is not known"
+# Shots that are listed besides the best one of each kind.
+_BEST_SHOTS = 3
+
+_Pair = tuple[float, float]
 
 
-def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> dict[str, Any]:
+class _Stored(BaseModel):
+    """Base of what a certificate's file holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class CertifiedFile(_Stored):
+    """The calibration's file: name, SHA-256, the digest by which clouds name it, when and by what it was made."""
+
+    file: str
+    sha256: str
+    digest: str
+    date: JsonValue
+    software: JsonValue
+
+
+class ParameterRow(_Stored):
+    """A parameter in words with its unit, value, and standard uncertainties after and before; None for unknown."""
+
+    name: str
+    words: str
+    unit: str
+    value: float
+    std: float | None
+    std_before: float | None
+
+
+class CalibratedMedium(_Stored):
+    """A medium and its refractive index."""
+
+    medium: Medium
+    index: float
+
+    @field_serializer("medium")
+    def _stored_medium(self, medium: Medium) -> dict[str, JsonValue]:
+        return medium.model_dump(mode="json", exclude_none=True)
+
+
+class Validity(_Stored):
+    """A region that the evidence covers, in which medium, and how well its index is known."""
+
+    name: str
+    medium: Medium
+    through_window: bool
+    index: float
+    index_std: float | None
+    camera_depth_mm: _Pair
+    y_mm: _Pair
+    z_mm: _Pair
+    outline_mm: tuple[_Pair, ...]
+    stripe_points: int
+
+    @field_serializer("medium")
+    def _stored_medium(self, medium: Medium) -> dict[str, JsonValue]:
+        return medium.model_dump(mode="json", exclude_none=True)
+
+
+class WeaknessRow(_Stored):
+    """Parameters that the evidence determines badly; see `uwlts.calibration.joint.weakness.Weakness`."""
+
+    parameters: tuple[str, ...]
+    confused: bool
+    cost_mm: float
+    length_mm: float
+    along: str
+    depth_mm: float
+
+
+class NextShot(_Stored):
+    """A further shot: what it is, the standard uncertainty of lengths before and after, and the advice to take it."""
+
+    words: str
+    before_mm: float
+    after_mm: float
+    advice: str
+
+
+class Certificate(_Stored):
+    """What every certificate says. Fields that are not given are left out of the file."""
+
+    format: str
+    version: int
+    sensor: str
+    issued: str
+    software: str
+    calibration: CertifiedFile
+    wavelength_nm: float
+    made_from: dict[str, JsonValue]
+    parameters: tuple[ParameterRow, ...]
+    uncertainty_known: bool
+
+    def in_file(self) -> dict[str, JsonValue]:
+        """The content as plain JSON with the keys of files."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+
+class JointCertificate(Certificate):
+    """Certificate of a joint calibration; without a covered area (see ``remark``) no lengths are known."""
+
+    validity: tuple[Validity, ...]
+    scatter_px: dict[str, float]
+    shared_variance: dict[str, float]
+    residuals: int
+    strays: int
+    images: tuple[ImageFit, ...]
+    remark: str | None = None
+    lengths: tuple[LengthUncertainty, ...] = ()
+    lengths_std_mm: float | None = None
+    cannot_tell: tuple[str, ...] = ()
+    weaknesses: tuple[WeaknessRow, ...] = ()
+    next_shots: tuple[NextShot, ...] = ()
+    sha256: str = ""
+
+
+class SequentialCertificate(Certificate):
+    """Certificate of a calibration in steps, which knows no uncertainty of lengths."""
+
+    remark: str
+    use: str
+    media: tuple[CalibratedMedium, ...]
+    residuals: dict[str, dict[str, JsonValue]]
+    sha256: str = ""
+
+
+AnyCertificate = JointCertificate | SequentialCertificate
+
+
+class _Shared(TypedDict):
+    """Fields of `Certificate`."""
+
+    format: str
+    version: int
+    sensor: str
+    issued: str
+    software: str
+    calibration: CertifiedFile
+    wavelength_nm: float
+    made_from: dict[str, JsonValue]
+    parameters: tuple[ParameterRow, ...]
+    uncertainty_known: bool
+
+
+def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
     """The sealed content of a certificate.
 
     Parameters
@@ -39,47 +187,48 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
     CalibrationError
         Its joint estimate is damaged.
     """
-    content: dict[str, Any] = {
+    shared: _Shared = {
         "format": FORMAT,
         "version": VERSION,
         "sensor": calibration.sensor_name,
         "issued": issued,
         "software": f"uwlts {uwlts.__version__}",
-        "calibration": {
-            "file": Path(path).name, "sha256": sha256_of(path), "digest": calibration_digest(calibration),
-            "date": calibration.provenance.get("date"), "software": calibration.provenance.get("software"),
-        },
+        "calibration": CertifiedFile(
+            file=Path(path).name, sha256=sha256_of(path), digest=calibration_digest(calibration),
+            date=calibration.provenance.get("date"), software=calibration.provenance.get("software"),
+        ),
         "wavelength_nm": calibration.wavelength_nm,
         "made_from": calibration.provenance,
         "parameters": parameter_rows(calibration),
         "uncertainty_known": calibration.joint is not None,
     }  # fmt: skip
-    return sealed(content | (_joint(calibration) if calibration.joint is not None else _by_turns(calibration)))
+    content = _sequential(shared, calibration) if calibration.joint is None else _joint(shared, calibration)
+    return content.model_copy(update={"sha256": seal_of(content.in_file())})
 
 
-def certificate_lines(content: dict[str, Any]) -> list[str]:
+def certificate_lines(content: AnyCertificate) -> list[str]:
     """The gist of a certificate for the terminal."""
-    if "lengths" not in content:
-        return [content["remark"]]
-    longest = {row["axis"]: row for row in content["lengths"]}
-    volume = content["validity"][0]
+    if content.remark is not None:
+        return [content.remark]
+    assert isinstance(content, JointCertificate)
+    longest = {row.axis: row for row in content.lengths}
+    volume = content.validity[0]
     return [
-        f"in {volume['name']}, {volume['camera_depth_mm'][0]:.0f} to {volume['camera_depth_mm'][1]:.0f} mm from the "
+        f"in {volume.name}, {volume.camera_depth_mm[0]:.0f} to {volume.camera_depth_mm[1]:.0f} mm from the "
         "camera's pupil, expanded uncertainty (k = 2) by the calibration: "
         + ", ".join(
-            f"{1e3 * row['calibration_mm']:.1f} µm of {row['length_mm']:g} mm along {axis}"
-            for axis, row in longest.items()
+            f"{1e3 * row.calibration_mm:.1f} µm of {row.length_mm:g} mm along {axis}" for axis, row in longest.items()
         ),
-        *content["cannot_tell"],
-        *(f"next: {shot['advice']}" for shot in content["next_shots"][:1]),
+        *content.cannot_tell,
+        *(f"next: {shot.advice}" for shot in content.next_shots[:1]),
     ]
 
 
-def parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """Every parameter in words with its unit, value, and standard uncertainties after and before; None for unknown."""
+def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
+    """Every parameter that was estimated."""
     if (joint := calibration.joint) is not None:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
-        return [_row(*row) for row in rows]
+        return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
     figures = calibration.residuals
     std = figures.get("camera", {}).get("std", {})
@@ -93,95 +242,92 @@ def parameter_rows(calibration: Calibration) -> list[dict[str, Any]]:
         if window.refractions == 2:
             rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm, None, None))
             rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index, None, None))
-    return rows
+    return tuple(rows)
 
 
-def _row(key: ParameterKey, value: float, std: float | None, before: float | None) -> dict[str, Any]:
+def _row(key: ParameterKey, value: float, std: float | None, before: float | None) -> ParameterRow:
     quantity = key.quantity
-    return {
-        "name": key.text,
-        "words": quantity.words,
-        "unit": quantity.unit,
-        "value": value * quantity.factor,
-        "std": None if std is None else std * quantity.factor,
-        "std_before": None if before is None else before * quantity.factor,
-    }
+    return ParameterRow(
+        name=key.text,
+        words=quantity.words,
+        unit=quantity.unit,
+        value=value * quantity.factor,
+        std=None if std is None else std * quantity.factor,
+        std_before=None if before is None else before * quantity.factor,
+    )
 
 
-def _by_turns(calibration: Calibration) -> dict[str, Any]:
-    """What is known of a calibration without a joint estimate."""
+def _sequential(shared: _Shared, calibration: Calibration) -> SequentialCertificate:
     figures, window = calibration.residuals, calibration.window
-    media = [
-        {"medium": found.medium.model_dump(mode="json", exclude_none=True), "index": found.index}
-        for found in calibration.media
-    ]
     rms = {step: {key: value for key, value in table.items() if key in ("rms_px", "rms_mm", "max_mm", "images")
                   and not isinstance(value, list)} for step, table in figures.items()}  # fmt: skip
-    return {
-        "remark": NOT_JOINT,
-        "use": f"in {calibration.medium_kind} only" if window is None else "in air and in water",
-        "media": media,
-        "residuals": {step: table for step, table in rms.items() if table},
-    }
+    return SequentialCertificate(
+        **shared,
+        remark=NOT_JOINT,
+        use=f"in {calibration.medium_kind} only" if window is None else "in air and in water",
+        media=tuple(CalibratedMedium(medium=found.medium, index=found.index) for found in calibration.media),
+        residuals={step: table for step, table in rms.items() if table},
+    )
 
 
-def _joint(calibration: Calibration) -> dict[str, Any]:
+def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
     joint, found = require_joint(calibration), regions(calibration)
-    stored = joint.in_file()
-    content: dict[str, Any] = {
-        "validity": [_validity(in_use(calibration, region)) for region in found],
-        "scatter_px": joint.scatter_px,
-        "shared_variance": joint.shared_variance,
-        "residuals": joint.residual_count,
-        "strays": joint.outlier_count,
-        "images": stored.get("images", []),
-    }
+    content = JointCertificate(
+        **shared,
+        validity=tuple(_validity(in_use(calibration, region)) for region in found),
+        scatter_px=joint.scatter_px,
+        shared_variance=joint.shared_variance,
+        residuals=joint.residual_count,
+        strays=joint.outlier_count,
+        images=joint.images,
+    )
     if not found:
-        return content | {"remark": "the calibration does not tell what volume its evidence covers: calibrate again"}
+        remark = "the calibration does not tell what volume its evidence covers: calibrate again"
+        return content.model_copy(update={"remark": remark})
     if not found[0].has_area():
-        return content | {"remark": "the stripes of the evidence cover no area: what lengths are worth is not known"}
+        remark = "the stripes of the evidence cover no area: what lengths are worth is not known"
+        return content.model_copy(update={"remark": remark})
     use = in_use(calibration, found[0])
     lengths, known = lengths_over(calibration, use.known, found[0]), use.known
     weak = weaknesses(lengths, known.parameters.keys, known.covariance)
-    return content | {
-        "lengths": [asdict(worth) for worth in worth_of_lengths(use)],
-        "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
-        "cannot_tell": told(weak),
-        "weaknesses": [asdict(each) | {"parameters": [key.text for key in each.parameters]} for each in weak],
-        "next_shots": _shots(next_shots(calibration)),
-    }
+    return content.model_copy(
+        update={
+            "lengths": tuple(length_uncertainties(use)),
+            "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
+            "cannot_tell": tuple(told(weak)),
+            "weaknesses": tuple(
+                WeaknessRow(**asdict(each) | {"parameters": tuple(key.text for key in each.parameters)})
+                for each in weak
+            ),
+            "next_shots": _shots(next_shots(calibration)),
+        }
+    )
 
 
-def _shots(outlooks: Sequence[Outlook]) -> list[dict[str, Any]]:
-    return [
-        {"words": o.words.rstrip(","), "before_mm": o.before_mm, "after_mm": o.after_mm, "advice": o.advice()}
-        for o in _worth_telling(outlooks)
-    ]
-
-
-def _worth_telling(outlooks: Sequence[Outlook]) -> list[Outlook]:
+def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
     """The best shots, and the best of each kind, in their order."""
     kinds: dict[str, Outlook] = {}
     for outlook in outlooks:
         kinds.setdefault(outlook.words.split(",")[0], outlook)
-    return [o for place, o in enumerate(outlooks) if place < _BEST_SHOTS or o in kinds.values()]
+    return tuple(
+        NextShot(words=o.words.rstrip(","), before_mm=o.before_mm, after_mm=o.after_mm, advice=o.advice())
+        for place, o in enumerate(outlooks)
+        if place < _BEST_SHOTS or any(o is best for best in kinds.values())
+    )
 
 
-def _validity(use: InUse) -> dict[str, Any]:
-    """Where evidence covers the volume, in which medium, and how well its index is known."""
-    region: Region = use.region
-    known, index = use.known, index_key(use.known)
-    std = None if index is None else require_joint(use.calibration).std_of(index)
+def _validity(use: InUse) -> Validity:
+    region, known, index = use.region, use.known, index_key(use.known)
     low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
-    return {
-        "name": region.name,
-        "medium": region.medium.model_dump(mode="json", exclude_none=True),
-        "through_window": region.view.window,
-        "index": known.parameters.medium_index(known.values, known.view),
-        "index_std": std,
-        "camera_depth_mm": region.camera_depth_mm.tolist(),
-        "y_mm": [float(low[0]), float(high[0])],
-        "z_mm": [float(low[1]), float(high[1])],
-        "outline_mm": region.outline_mm.tolist(),
-        "stripe_points": region.points,
-    }
+    return Validity(
+        name=region.name,
+        medium=region.medium,
+        through_window=region.view.window,
+        index=known.parameters.medium_index(known.values, known.view),
+        index_std=None if index is None else require_joint(use.calibration).std_of(index),
+        camera_depth_mm=region.camera_depth_mm.tolist(),
+        y_mm=(float(low[0]), float(high[0])),
+        z_mm=(float(low[1]), float(high[1])),
+        outline_mm=region.outline_mm.tolist(),
+        stripe_points=region.points,
+    )

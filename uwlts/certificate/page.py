@@ -3,20 +3,20 @@
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from uwlts.calibration.joint.stored import require_joint
 from uwlts.calibration.joint.volume import regions
+from uwlts.calibration.joint_estimate import ImageFit
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.parameter_keys import ParameterKey
 from uwlts.calibration.sources import captures_in
-from uwlts.certificate.changes import change_from, require_same_sensor
-from uwlts.certificate.content import parameter_rows
-from uwlts.certificate.form import form_of
-from uwlts.certificate.lengths import Worth, in_use
+from uwlts.certificate.content import AnyCertificate, JointCertificate, ParameterRow, parameter_rows
+from uwlts.certificate.volume import LengthUncertainty, change_from, form_of, in_use, require_same_sensor
 from uwlts.errors import OutputError
 from uwlts.report.numbers import fixed
 from uwlts.report.page_toolkit import (
@@ -44,7 +44,7 @@ def refuse_unsuitable_certificate(page: Path, source: Path, *, overwrite: bool) 
 
 
 def write_certificate(
-    page: str | Path, content: dict[str, Any], calibration: Calibration, *,
+    page: str | Path, content: AnyCertificate, calibration: Calibration, *,
     before: tuple[str, Calibration] | None = None, overwrite: bool = False,
 ) -> None:  # fmt: skip
     """Write a certificate's page, and its JSON beside it, each whole or not at all.
@@ -57,12 +57,12 @@ def write_certificate(
         As `certificate_page`.
     """
     text = certificate_page(content, calibration, before=before)
-    beside = json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+    beside = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
     write_page(page, text, beside=beside, overwrite=overwrite)
 
 
 def certificate_page(
-    content: dict[str, Any], calibration: Calibration, *, before: tuple[str, Calibration] | None = None
+    content: AnyCertificate, calibration: Calibration, *, before: tuple[str, Calibration] | None = None
 ) -> str:
     """The page as text; ``before`` is another calibration of the sensor with its name, set beside this one.
 
@@ -77,93 +77,100 @@ def certificate_page(
         "uwlts.certificate",
         "template.html.j2",
         c=content,
-        captures=captures_in(content["made_from"]),
-        warnings=content["made_from"].get("warnings", []),
-        known_before=content["made_from"].get("known_before", {}),
-        parameters=_parameters(content["parameters"], before),
+        captures=captures_in(content.made_from),
+        warnings=content.made_from.get("warnings", []),
+        known_before=content.made_from.get("known_before", {}),
+        parameters=_parameters(content.parameters, before),
         before=None if before is None else before[0],
-        lengths=_length_rows(content.get("lengths", [])),
-        **_pictures(content, calibration, before),
-    )  # fmt: skip
+        lengths=_length_rows(content.lengths) if isinstance(content, JointCertificate) else [],
+        drawn=_pictures(content, calibration, before) if isinstance(content, JointCertificate) else _Pictures(),
+    )
 
 
-def _pictures(
-    content: dict[str, Any], calibration: Calibration, before: tuple[str, Calibration] | None
-) -> dict[str, Any]:
-    drawn: dict[str, Any] = {"maps": [], "changes": [], "largest_change_um": None, "worst": []}
-    joint = calibration.joint
-    if joint is None:
-        return drawn
-    drawn["correlation"] = correlation_picture(joint.parameters, joint.covariance_matrix())
-    if content["images"]:
-        drawn["residuals"] = image_residuals(content["images"])
-        drawn["worst"] = sorted(
-            (image for image in content["images"] if image["rms_px"] is not None),
-            key=lambda image: -image["rms_px"] / content["scatter_px"][image["kind"]],
-        )[:_WORST_IMAGES]  # fmt: skip
-    if "lengths" not in content:
+@dataclass(frozen=True)
+class _Pictures:
+    """Pictures of the page; ``worst`` are the images whose residuals lie farthest above their kind."""
+
+    correlation: Markup | None = None
+    residuals: Markup | None = None
+    worst: tuple[ImageFit, ...] = ()
+    lengths: Markup | None = None
+    maps: tuple[Markup, ...] = ()
+    changes: tuple[Markup, ...] = ()
+    largest_change_um: float | None = None
+
+
+def _pictures(content: JointCertificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> _Pictures:
+    joint = require_joint(calibration)
+    fits = [image for image in content.images if image.rms_px is not None]
+    fits.sort(key=lambda image: -(image.rms_px or 0.0) / content.scatter_px[image.kind])
+    drawn = _Pictures(
+        correlation=correlation_picture(joint.parameters, joint.covariance_matrix()),
+        residuals=image_residuals(content.images) if content.images else None,
+        worst=tuple(fits[:_WORST_IMAGES]),
+    )
+    if not content.lengths:
         return drawn
     region = regions(calibration)[0]
     form = form_of(in_use(calibration, region))
-    drawn["chart"] = length_chart([Worth(**row) for row in content["lengths"]])
-    for what, values in (("calibration", form.calibration_mm), ("single point", form.point_mm)):
-        drawn["maps"] += [
-            heat_map(f"u({axis}), {what}", form.at_mm, 1e3 * values[..., place])
-            for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
-        ]
-    drawn["maps"] += [
+    maps = [
+        heat_map(f"u({axis}), {what}", form.at_mm, 1e3 * values[..., place])
+        for what, values in (("calibration", form.calibration_mm), ("single point", form.point_mm))
+        for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
+    ] + [
         heat_map(f"u of {form.short_mm:g} mm along {axis}", form.at_mm, 1e3 * values)
         for axis, values in (("Y", form.along_y_mm), ("Z", form.along_z_mm))
     ]
-    if before is not None:
-        change = change_from(calibration, before[1], region)
-        drawn["largest_change_um"] = 1e3 * change.largest_mm
-        drawn["changes"] = [
-            heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., place], signed=True)
-            for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
-        ]
-    return drawn
+    drawn = replace(drawn, lengths=length_chart(content.lengths), maps=tuple(maps))
+    if before is None:
+        return drawn
+    change = change_from(calibration, before[1], region)
+    changes = [
+        heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., place], signed=True)
+        for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
+    ]
+    return replace(drawn, changes=tuple(changes), largest_change_um=1e3 * change.largest_mm)
 
 
 def _parameters(
-    rows: Sequence[dict[str, Any]], before: tuple[str, Calibration] | None
+    rows: Sequence[ParameterRow], before: tuple[str, Calibration] | None
 ) -> list[tuple[str, str, str, str, str, str, str]]:
     """Words, unit, value, standard uncertainty, that before; value and uncertainty by the other calibration."""
-    other = {} if before is None else {row["name"]: row for row in parameter_rows(before[1])}
-    shown = []
-    for row in rows:
-        beside = other.get(row["name"])
-        shown.append((row["words"], row["unit"], *_with_std(row), _number(row["std_before"]), *_with_std(beside)))
-    mine = {row["name"] for row in rows}
+    other = {} if before is None else {row.name: row for row in parameter_rows(before[1])}
+    shown = [
+        (row.words, row.unit, *_with_std(row), _number(row.std_before), *_with_std(other.get(row.name))) for row in rows
+    ]
+    mine = {row.name for row in rows}
     shown += [
-        (row["words"], row["unit"], MISSING, MISSING, MISSING, *_with_std(row))
-        for name, row in other.items() if name not in mine
-    ]  # fmt: skip
+        (row.words, row.unit, MISSING, MISSING, MISSING, *_with_std(row))
+        for name, row in other.items()
+        if name not in mine
+    ]
     return shown
 
 
-def _with_std(row: dict[str, Any] | None) -> tuple[str, str]:
+def _with_std(row: ParameterRow | None) -> tuple[str, str]:
     """A value with as many decimals as two digits of its uncertainty have, and that."""
     if row is None:
         return MISSING, MISSING
-    if row["std"] is None or not row["std"] > 0:
-        return f"{row['value']:.6g}", MISSING
-    decimals = max(0, 1 - math.floor(math.log10(row["std"])))
-    return fixed(row["value"], decimals), fixed(row["std"], decimals)
+    if row.std is None or not row.std > 0:
+        return f"{row.value:.6g}", MISSING
+    decimals = max(0, 1 - math.floor(math.log10(row.std)))
+    return fixed(row.value, decimals), fixed(row.std, decimals)
 
 
 def _number(value: float | None) -> str:
     return MISSING if value is None else fixed(value, max(0, 1 - math.floor(math.log10(value))))
 
 
-def _length_rows(lengths: Sequence[dict[str, Any]]) -> list[tuple[float, list[tuple[str, str]]]]:
+def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:
     """Length, and for X, Y and Z its expanded uncertainties in µm; a dash where it does not fit."""
-    table = {(row["length_mm"], row["axis"]): row for row in lengths}
+    table = {(row.length_mm, row.axis): row for row in lengths}
     rows = []
-    for length in dict.fromkeys(sorted(row["length_mm"] for row in lengths)):
+    for length in dict.fromkeys(sorted(row.length_mm for row in lengths)):
         found = [table.get((length, axis)) for axis in "XYZ"]
         rows.append((length, [(MISSING, MISSING) if row is None else
-                              (fixed(1e3 * row["calibration_mm"], 1), fixed(1e3 * row["point_mm"], 1))
+                              (fixed(1e3 * row.calibration_mm, 1), fixed(1e3 * row.point_mm, 1))
                               for row in found]))  # fmt: skip
     return rows
 
@@ -210,13 +217,13 @@ def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) ->
     return svg_of(figure)
 
 
-def image_residuals(images: Sequence[dict[str, Any]]) -> Markup:
+def image_residuals(images: Sequence[ImageFit]) -> Markup:
     """Root mean square residual of every image, a panel for each kind and two of them in a row."""
-    kinds = list(dict.fromkeys(image["kind"] for image in images))
+    kinds = list(dict.fromkeys(image.kind for image in images))
     rows = math.ceil(len(kinds) / 2)
     figure, panels = new_figure(9.0, 2.7 * rows, rows=rows, columns=min(2, len(kinds)))
     for number, (ax, kind) in enumerate(zip(panels, kinds, strict=False)):
-        rms = [image["rms_px"] for image in images if image["kind"] == kind]
+        rms = [image.rms_px for image in images if image.kind == kind]
         values = [np.nan if value is None else value for value in rms]
         ax.plot(range(1, len(values) + 1), values, "o", color=COLOURS[number % len(COLOURS)], markersize=4)
         ax.set(title=kind, xlabel="image", ylabel="residual (rms) / px")
@@ -226,7 +233,7 @@ def image_residuals(images: Sequence[dict[str, Any]]) -> Markup:
     return svg_of(figure)
 
 
-def length_chart(lengths: Sequence[Worth]) -> Markup:
+def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
     """Expanded uncertainty over length, for each axis."""
     figure, panels = new_figure(9.0, 3.2, columns=2)
     for ax, title, name in zip(
