@@ -298,22 +298,16 @@ def sweep(
         Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
     from twin.study.description import load_study
-    from twin.study.sweep import clear, outcome_lines
     from twin.study.sweep import sweep as run_sweep
-    from uwlts.workers import open_workers
 
-    if workers is not None and workers < 1:
-        raise DescriptionError(f"workers is {workers}; it must be at least 1")
     described = load_study(study, designs=designs, verify=verify)
-    folder = out or Path("runs") / Path(study).stem
-    if overwrite:
-        clear(folder)
-    with open_workers(workers=workers, scheduler=scheduler) as pool, progress_bar(described.title) as progress:
-        outcome = run_sweep(
-            described, folder, pool, variant=variant, progress=lambda what, done, total: progress(done, total)
-        )
-    print("\n".join(outcome_lines(described, outcome)))
-    print(f"wrote {folder / 'report.html'}, designs.csv, summary.json and winner.toml")
+    with progress_bar(described.title) as progress:
+        result = run_sweep(
+            described, out=out or Path("runs") / Path(study).stem, workers=workers, scheduler=scheduler,
+            overwrite=overwrite, variant=variant, progress=lambda what, done, total: progress(done, total),
+        )  # fmt: skip
+    print("\n".join(result.lines()))
+    print(f"wrote {result.paths.page}, designs.csv, summary.json and winner.toml")
 
 
 @app.command

@@ -40,26 +40,26 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- | --- |")
     for number, (name, medium, changes) in enumerate(CASES):
         sensor = validated(Sensor, merged(load_sensor("thesis").model_dump(), changes), name)
-        found = followed(np, parameters_of([sensor], [sensor.medium(medium)]), FOLLOW)
+        set_by = followed(np, parameters_of([sensor], [sensor.medium(medium)]), FOLLOW)
         set_up = {
-            "camera": {"focus_distance_mm": found.focus_mm.item()},
-            "laser": {"waist_distance_mm": found.waist_distance_mm.item()},
-            "volume": {"near_mm": found.near_mm.item(), "far_mm": found.far_mm.item()},
+            "camera": {"focus_distance_mm": set_by.focus_mm.item()},
+            "laser": {"waist_distance_mm": set_by.waist_distance_mm.item()},
+            "volume": {"near_mm": set_by.near_mm.item(), "far_mm": set_by.far_mm.item()},
         }
         built = validated(Sensor, merged(sensor.model_dump(), set_up), name)
         study = Study.model_validate(
             {"title": name, "medium": medium, "variables": {"laser.power_mw": {"least": 1.0, "most": 10.0}}}
         )
-        row = verified(Verification(study, Candidate(name, number, built), 2, CPU))
-        if row["failure"]:
-            print(f"| {name} | | | | | {row['failure']} |", flush=True)
+        found = verified(Verification(study, Candidate(name, number, built), 2, CPU))
+        if found.failure:
+            print(f"| {name} | | | | | {found.failure} |", flush=True)
             continue
-        foretold, measured = ([f"{1e3 * row[key][k]:.0f}" for k in (0, len(row[key]) // 2, -1)]
-                              for key in ("predicted_mm", "rendered_mm"))  # fmt: skip
+        foretold, measured = ([f"{1e3 * scatter[k]:.0f}" for k in (0, len(scatter) // 2, -1)]
+                              for scatter in (found.predicted_mm, found.rendered_mm))  # fmt: skip
         print(
-            f"| {name} | {' / '.join(foretold)} | {' / '.join(measured)} | {row['rendered_over_predicted']:.2f} | "
-            f"{row['predicted_exposure_ms']:.2f} / {row['exposure_ms']:.2f} | "
-            f"{1e3 * np.nanmax(np.abs(row['error_mm'])):.0f} |", flush=True,
+            f"| {name} | {' / '.join(foretold)} | {' / '.join(measured)} | {found.rendered_over_predicted:.2f} | "
+            f"{found.predicted_exposure_ms:.2f} / {found.exposure_ms:.2f} | "
+            f"{1e3 * np.nanmax(np.abs(found.error_mm)):.0f} |", flush=True,
         )  # fmt: skip
 
 

@@ -11,8 +11,19 @@ from twin.study.description import Study
 from twin.study.designs import Design, built
 from twin.study.figures import scatter_at
 from twin.study.parameters import parameters_of
-from twin.study.verification import Candidate, Rendered, Verification, compared, render, verified
+from twin.study.verification import (
+    Agreement,
+    CalibrationFigures,
+    Candidate,
+    Rendered,
+    Verification,
+    compared,
+    render,
+    verified,
+)
 from uwlts.workers import open_workers
+
+CALIBRATION = CalibrationFigures(None, None, None, 0.1, 5000.0, 9, 0.01, [])
 
 
 @pytest.fixture
@@ -28,32 +39,32 @@ def test_formulas_foretell_what_a_rendered_design_measures(study):
     # Unlike the thesis's in baseline, angle, stand-off and volume.
     design = Design(0, {"laser.baseline_mm": 200.0, "laser.triangulation_angle_deg": 30.0})
     row = verified(Verification(study, Candidate("slim", 0, built(study, design)), 2, CPU))
-    assert row["failure"] == ""
-    assert row["agrees"] and row["ratio"] < 1.25
-    found, foretold = np.array(row["rendered_mm"]), np.array(row["predicted_mm"])
+    assert row.failure == ""
+    assert row.agrees and row.ratio < 1.25
+    found, foretold = np.array(row.rendered_mm), np.array(row.predicted_mm)
     # At every depth, from sharp to blurred; nine depths differ more than twofold.
     assert len(found) >= 5 and found.max() > 2 * found.min()
     assert (np.abs(found / foretold - 1) < 0.35).all()
-    assert row["exposure_ms"] == pytest.approx(row["predicted_exposure_ms"], rel=0.3)
-    assert np.abs(row["error_mm"]).max() < 0.1
+    assert row.exposure_ms == pytest.approx(row.predicted_exposure_ms, rel=0.3)
+    assert np.abs(row.error_mm).max() < 0.1
 
 
-def test_a_disagreement_is_told(study, thesis):
+def test_a_disagreement_is_reported(study, thesis):
     z = np.linspace(-50.0, 80.0, 5)
     foretold = scatter_at(parameters_of([thesis], [thesis.media["water"]]), z, np.full(5, 60.0), reflectance=0.5)
 
-    def measured(factor: float) -> dict[str, object]:
+    def measured(factor: float) -> Agreement:
         rendered = Rendered(
             z_mm=z, points=np.full(5, 1000), scatter_mm=factor * foretold, error_mm=np.zeros(5),
-            line_mm=np.full(5, 120.0), exposure_ms=1.0, calibration={}, seconds={"render": 1.0},
+            line_mm=np.full(5, 120.0), exposure_ms=1.0, calibration=CALIBRATION, seconds={"render": 1.0},
         )  # fmt: skip
-        return compared(study, thesis, rendered)
+        return compared(study, Candidate("thesis", -1, thesis), rendered)
 
     for factor, agrees in ((1.0, True), (1.45, True), (1 / 1.45, True), (1.55, False), (1 / 1.55, False)):
         row = measured(factor)
-        assert row["agrees"] is agrees
-        assert row["ratio"] == pytest.approx(max(factor, 1 / factor))
-        assert row["rendered_over_predicted"] == pytest.approx(factor)
+        assert row.agrees is agrees
+        assert row.ratio == pytest.approx(max(factor, 1 / factor))
+        assert row.rendered_over_predicted == pytest.approx(factor)
 
 
 def test_a_candidate_that_fails_is_kept_with_its_reason_and_tried_again(study, thesis, tmp_path):
@@ -64,31 +75,32 @@ def test_a_candidate_that_fails_is_kept_with_its_reason_and_tried_again(study, t
         (path,) = (tmp_path / "verified").iterdir()
         first = path.stat().st_mtime_ns
         (again,) = render(study, tmp_path / "verified", candidates, pool, variant=CPU)
-    assert row["label"] == "hopeless" and not row["agrees"]
-    assert "volume" in row["failure"] and again["failure"] == row["failure"]
+    assert row.label == "hopeless" and not row.agrees
+    assert "volume" in row.failure and again.failure == row.failure
     assert path.stat().st_mtime_ns > first
 
 
 def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkeypatch):
     folder: Path = tmp_path / "verified"
     candidates = [Candidate("thesis", -1, thesis)]
-    monkeypatch.setattr("twin.study.agreement.verified", _counted)
+    monkeypatch.setattr("twin.study.verification.verified", _counted)
     with open_workers(workers=1) as pool:
         for label in ("thesis", "renamed"):
             candidates = [Candidate(label, -1, thesis)]
             (row,) = render(study, folder, candidates, pool, variant=CPU)
-            assert (row["label"], row["ratio"]) == (label, 1.25)
+            assert (row.label, row.ratio) == (label, 1.25)
     assert len(list(folder.iterdir())) == 1
     # The worker would have said another ratio the second time.
     with open_workers(workers=1) as pool:
         (other,) = render(study, folder, [Candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool,
                           variant=CPU)  # fmt: skip
-    assert other["ratio"] == 1.25 and len(list(folder.iterdir())) == 2
+    assert other.ratio == 1.25 and len(list(folder.iterdir())) == 2
 
 
-def _counted(job: Verification) -> dict[str, object]:
-    lists = {name: [1.0] for name in ("z_mm", "predicted_mm", "rendered_mm", "error_mm", "line_mm")}
-    numbers = dict.fromkeys(("rendered_over_predicted", "exposure_ms", "predicted_exposure_ms", "seconds"), 1.25)
+def _counted(job: Verification) -> Agreement:
     first = job.candidate.label != "renamed"
-    return {"label": job.candidate.label, "design": -1, "ratio": 1.25 if first else 9.0, "agrees": True,
-            "failure": ""} | lists | numbers  # fmt: skip
+    return Agreement(
+        job.candidate.label, -1, z_mm=[1.0], predicted_mm=[1.0], rendered_mm=[1.0], error_mm=[1.0], line_mm=[1.0],
+        ratio=1.25 if first else 9.0, rendered_over_predicted=1.25, agrees=True, exposure_ms=1.25,
+        predicted_exposure_ms=1.25, seconds=1.25,
+    )  # fmt: skip

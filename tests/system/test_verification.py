@@ -194,18 +194,18 @@ def test_scatter_error_and_length_of_known_profiles_are_found():
     rng, count = np.random.default_rng(5), 4000
     known = {2: (0.02, 0.03), 0: (0.05, -0.01)}
     points = np.vstack([profile(rng, frame, count, scatter=s, error=e) for frame, (s, e) in known.items()])
-    points[100, 2] += 3.0  # one stray
+    points[100, 2] += 3.0  # one outlier
     found = _judged(points, np.array([-120.0, -60.0, 10.0]))
-    assert found["z_mm"].tolist() == [-10.0, 60.0, 120.0]
-    assert found["points"].tolist() == [count, 0, count]
+    assert found.z_mm.tolist() == [-10.0, 60.0, 120.0]
+    assert found.points.tolist() == [count, 0, count]
     for place, frame in ((0, 2), (2, 0)):
         scatter, error = known[frame]
         # Standard errors: s / sqrt(2 n) = 0.011 s of the scatter, s / sqrt(n) = 0.016 s of the mean; four of them. The
         # limit of five standard deviations cuts 6e-7 of all points.
-        assert found["scatter_mm"][place] == pytest.approx(scatter, abs=0.045 * scatter)
-        assert found["error_mm"][place] == pytest.approx(error, abs=0.063 * scatter)
-        assert found["line_mm"][place] == pytest.approx(160.0)
-    assert np.isnan([found["scatter_mm"][1], found["error_mm"][1]]).all() and found["line_mm"][1] == 0
+        assert found.scatter_mm[place] == pytest.approx(scatter, abs=0.045 * scatter)
+        assert found.error_mm[place] == pytest.approx(error, abs=0.063 * scatter)
+        assert found.line_mm[place] == pytest.approx(160.0)
+    assert np.isnan([found.scatter_mm[1], found.error_mm[1]]).all() and found.line_mm[1] == 0
 
 
 def test_a_cloud_with_too_few_points_everywhere_is_refused():
@@ -229,9 +229,9 @@ def test_the_thesiss_sensor_measures_a_plane_in_water(thesis, tmp_path):
     assert (np.diff(found.line_mm) > 0).all()
     assert ((found.line_mm > 100) & (found.line_mm < 220)).all()
     # Seven step images give the window's distance with a standard deviation of 0.07 mm; seven of them.
-    assert found.calibration["window_mm"] == pytest.approx(thesis.camera.window.distance_mm, abs=0.5)
-    assert found.calibration["focal_length_px"] == pytest.approx(thesis.camera.focal_length_px(), rel=1e-3)
-    assert found.calibration["target_images"] == TARGET_POSES and found.calibration["warnings"] == []
+    assert found.calibration.window_mm == pytest.approx(thesis.camera.window.distance_mm, abs=0.5)
+    assert found.calibration.focal_length_px == pytest.approx(thesis.camera.focal_length_px(), rel=1e-3)
+    assert found.calibration.target_images == TARGET_POSES and found.calibration.warnings == []
     assert 0 < found.exposure_ms < thesis.exposure.longest_ms
     assert set(found.seconds) == {"render", "calibrate", "measure"}
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]

@@ -174,7 +174,7 @@ def test_a_design_as_built_is_judged_as_in_the_sweep(study):
     assert sensor.camera.focus_distance_mm != load_sensor("thesis").camera.focus_distance_mm
     swept, alone = row_of(judged(study, [design]), 0), described(study, "built", sensor)
     for name in FIGURES:
-        assert swept[name] == pytest.approx(alone[name], rel=1e-12, nan_ok=True)
+        assert swept.figures[name] == pytest.approx(alone.figures[name], rel=1e-12, nan_ok=True)
 
 
 def test_designs_that_fail_are_told_with_their_reason(study):

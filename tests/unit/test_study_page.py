@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -12,16 +13,16 @@ from hypothesis import strategies as st
 
 from twin.study.choice import pareto
 from twin.study.description import Study, load_study
-from twin.study.designs import Design, Marked, built, described, judged, row_of
+from twin.study.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of
 from twin.study.figures import FIGURES, figures_of
 from twin.study.parameters import parameters_of
 from twin.study.report.charts import Point, bars, curves, map_of, parallel_chart, pareto_chart, sample, trade_off
 from twin.study.report.drawing import views_of
-from twin.study.report.page import page_text, write_page
+from twin.study.report.page import page_text, write_study_page
 from twin.study.report.tables import (
     FIGURE_NAMES,
     Judged,
-    agreement,
+    agreement_text,
     label_of,
     misses,
     number_text,
@@ -30,6 +31,7 @@ from twin.study.report.tables import (
     without_numbers,
     words_of,
 )
+from twin.study.verification import Agreement
 from uwlts.errors import DesignError, EvaluationError, RangeError
 from uwlts.sensor import Sensor
 
@@ -288,7 +290,7 @@ def test_a_grid_is_shown_as_it_is(swept):
     assert found.values["line_mm"].shape == (6, 5)
     checked = 0
     for place in range(len(columns["design"])):
-        row = row_of(columns, place)
+        row = row_of(columns, place).table()
         k = int(np.argmin(abs(found.x - row["laser.baseline_mm"])))
         i = int(np.argmin(abs(found.y - row["laser.triangulation_angle_deg"])))
         if row["failure"]:
@@ -362,16 +364,19 @@ def test_one_variable_gives_curves_and_none_gives_bars():
     study = small(variables={"laser.power_mw": {"least": 1, "most": 20, "steps": 4}}, choices={"lens": lens}, follow=())
     _, columns = grid(study)
     base = Point("base", {"laser.power_mw": 7.0, "line_mm": 9.0}, 0, True)
-    figure = curves(Judged(study, columns), [base], "laser.power_mw").figure
-    assert [trace.name for trace in figure.data] == ["f/4", "f/8", "base"]
-    assert list(figure.data[0].x) == rounded([1, 22 / 3, 41 / 3, 20])
-    button = next(b for b in figure.layout.updatemenus[0].buttons if b.label == "line length in the middle (mm)")
-    assert button.args[0]["y"][2] == [9.0] and button.args[1]["annotations[0].y"] == 9.0
+    panels = curves(Judged(study, columns), [base], "laser.power_mw").figure.axes
+    assert [line.get_label() for line in panels[0].lines][:2] == ["f/4", "f/8"]
+    assert panels[0].lines[0].get_xdata().tolist() == pytest.approx([1, 22 / 3, 41 / 3, 20])
+    lengths = next(axes for axes in panels if axes.get_title() == "line length in the middle (mm)")
+    (marked,) = (line for line in lengths.lines if line.get_label() == "base")
+    assert (list(marked.get_xdata()), list(marked.get_ydata())) == ([7.0], [9.0])
     study = small(variables={}, choices={"lens": lens})
     _, columns = grid(study)
-    (trace,) = bars(Judged(study, columns)).figure.data
+    axes = bars(Judged(study, columns)).figure.axes[0]
     best = columns["sigma_z_rms_mm"].argmin()
-    assert trace.x[0] == list(lens)[best] and len(trace.x) == 2
+    assert axes.get_yticklabels()[0].get_text() == list(lens)[best] and len(axes.patches) == 2
+    assert axes.patches[0].get_width() == columns["sigma_z_rms_mm"][best]
+
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -416,13 +421,13 @@ class Page(HTMLParser):
         return re.sub(r"\s+", " ", " ".join(self.words))
 
 
-def verification(**changes) -> dict:
-    row = {
-        "label": "best", "design": 3, "z_mm": [-50.0, 0.0, 50.0], "predicted_mm": [0.01, 0.02, 0.03],
-        "rendered_mm": [0.011, 0.022, math.nan], "error_mm": [0.001, -0.004, math.nan], "line_mm": [150.0, 160.0, 0.0],
-        "ratio": 1.1, "agrees": True, "exposure_ms": 1.25, "predicted_exposure_ms": 1.2, "seconds": 80.0, "failure": "",
-    }  # fmt: skip
-    return row | changes
+def verification(**changes) -> Agreement:
+    found = Agreement(
+        "best", 3, z_mm=[-50.0, 0.0, 50.0], predicted_mm=[0.01, 0.02, 0.03], rendered_mm=[0.011, 0.022, math.nan],
+        error_mm=[0.001, -0.004, math.nan], line_mm=[150.0, 160.0, 0.0], ratio=1.1, agrees=True, exposure_ms=1.25,
+        predicted_exposure_ms=1.2, seconds=80.0,
+    )  # fmt: skip
+    return replace(found, **changes)
 
 
 def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
@@ -432,11 +437,11 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     rows = [verification(), bad]
     path = tmp_path / "report.html"
     path.write_text("older")
-    write_page(path, study, columns, marked=marked, verified=rows, notes=["A note & more."])
+    write_study_page(path, study, columns, marked=marked, agreements=rows, notes=["A note & more."])
     raw = path.read_text(encoding="utf-8")
     page = Page(raw)
     assert not page.open
-    text, chosen = page.text(), marked[-1].row
+    text, chosen = page.text(), marked[-1].design.table()
     assert (columns["violation"] == 0).sum() > 5
     works = (columns["failure"] == "").sum()
     assert f"30 judged, all of a grid; {works} work, {(columns['violation'] == 0).sum()} meet all constraints" in text
@@ -448,28 +453,30 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     assert "20 µm were predicted and 50 µm rendered" in text
     assert "the measuring volume would begin … mm behind the window's outer face" in text
     # Nothing is asked of the network: links lead within the page, and the policy forbids the rest.
-    assert page.loads and all(link.startswith("#") for link in page.loads)
+    assert page.loads and all(link.startswith(("#", "data:image/png")) for link in page.loads)
     styles = raw.split("<script")[0]
     assert "default-src 'none'" in styles and "@import" not in styles and not re.findall(r"url\((?!#)", styles)
-    assert len(page.figures) == 5
+    # Front and parallel axes; drawing, maps and two verifications.
+    assert len(page.figures) == 2 and styles.count("<svg") == 4
     assert len(raw) < 7e6
 
 
 def test_figures_hold_rounded_numbers_only(swept):
     study, designs, columns = swept
-    page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), verified=[]))
-    numbers = [z for row in page.figures[0]["data"][0]["z"] for z in row if z is not None]
-    assert len(numbers) == (columns["failure"] == "").sum()
-    assert all(float(f"{z:.5g}") == z for z in numbers)
+    page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[]))
+    shown = [trace for trace in page.figures[0]["data"] if trace.get("showlegend", True)]
+    numbers = [value for trace in shown for value in (*trace["x"], *trace["y"])]
+    assert len(numbers) == 2 * (columns["failure"] == "").sum()
+    assert all(float(f"{value:.5g}") == value for value in numbers)
 
 
 def test_labels_are_escaped():
     lens = {'<script>alert("1")</script>': {"camera.f_number": 4.0}, "f & 8": {"camera.f_number": 8.0}}
     study = small(title="<b>bold</b>", choices={"<i>lens</i>": lens})
     designs, columns = grid(study)
-    marked = [Marked("<u>me</u>", m.sensor, m.row) for m in marked_of(study, designs, columns)]
+    marked = [Marked("<u>me</u>", m.sensor, m.design) for m in marked_of(study, designs, columns)]
     row = verification(label="<u>me</u>", failure="no <marks>", agrees=False)
-    raw = page_text(study, columns, marked=marked, verified=[row], notes=["<hr>"])
+    raw = page_text(study, columns, marked=marked, agreements=[row], notes=["<hr>"])
     page = Page(raw)
     assert not page.open
     before, _, _ = raw.partition('<script type="application/json"')
@@ -490,13 +497,13 @@ def failing(study: Study) -> dict[str, np.ndarray]:
 
 
 def test_a_page_without_designs_says_so():
-    page = Page(page_text(small(), {}, marked=[], verified=[]))
+    page = Page(page_text(small(), {}, marked=[], agreements=[]))
     assert "No design has been judged." in page.text() and "0 judged" in page.text() and not page.figures
 
 
 def test_a_page_of_failures_says_why():
     study = small()
-    page = Page(page_text(study, failing(study), marked=[], verified=[]))
+    page = Page(page_text(study, failing(study), marked=[], agreements=[]))
     assert "None of the designs works" in page.text()
     assert "the lens is … mm too short" in page.text() and not page.figures
 
@@ -504,11 +511,11 @@ def test_a_page_of_failures_says_why():
 def test_a_page_where_nothing_meets_the_constraints():
     study = small(constraints={"coverage": {"least": 2.0}})
     designs, columns = grid(study)
-    page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), verified=[]))
+    page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[]))
     assert "No design meets all constraints." in page.text()
     assert "None meets all constraints: the front is that of all that work." in page.text()
     assert "misses its bound: at least 200 % is asked" in page.text()
-    assert len(page.figures) == 2
+    assert len(page.figures) == 1
 
 
 @pytest.mark.parametrize("kind", ["grid", "scattered"])
@@ -518,7 +525,7 @@ def test_a_page_of_one_design(kind):
     place = int(np.flatnonzero(columns["violation"] == 0)[0])
     one = {name: values[place : place + 1] for name, values in columns.items()}
     marked = [Marked("only", built(study, designs[place]), row_of(columns, place))]
-    page = Page(page_text(study, one, marked=marked, verified=[]))
+    page = Page(page_text(study, one, marked=marked, agreements=[]))
     assert "1 judged" in page.text() and not page.open
 
 
@@ -531,7 +538,7 @@ def test_designs_in_a_row_span_no_area():
             Design(design.number, design.values | {"laser.triangulation_angle_deg": angle})
             for design, angle in zip(designs, angles, strict=True)
         ]
-        page = Page(page_text(study, judged(study, row), marked=[], verified=[]))
+        page = Page(page_text(study, judged(study, row), marked=[], agreements=[]))
         assert not page.open
     assert "span no area" in page.text()
 
@@ -540,8 +547,8 @@ def test_a_chosen_design_that_cannot_be_drawn_is_said():
     study = small()
     _, columns = grid(study)
     sensor = changed(laser__baseline_mm=20.0, laser__triangulation_angle_deg=60.0)
-    marked = [Marked("bad", sensor, dict.fromkeys(FIGURES, math.nan))]
-    page = Page(page_text(study, columns, marked=marked, verified=[]))
+    marked = [Marked("bad", sensor, EvaluatedDesign(-1, {}, dict.fromkeys(FIGURES, math.nan), 0.0, ""))]
+    page = Page(page_text(study, columns, marked=marked, agreements=[]))
     assert "The design cannot be drawn: the sheet crosses" in page.text()
 
 
@@ -549,15 +556,15 @@ def test_results_of_another_study_are_refused(swept):
     _, _, columns = swept
     other = small(variables={"camera.f_number": {"least": 2, "most": 8}})
     with pytest.raises(EvaluationError, match=r"no camera\.f_number"):
-        page_text(other, columns, marked=[], verified=[])
+        page_text(other, columns, marked=[], agreements=[])
 
 
 def test_verdicts():
     study = small()
-    assert agreement(study, verification()).startswith("Formulas and rendering agree")
-    assert "no marks" in agreement(study, verification(failure="no marks", agrees=False))
+    assert agreement_text(study, verification()).startswith("Formulas and rendering agree")
+    assert "no marks" in agreement_text(study, verification(failure="no marks", agrees=False))
     lost = verification(agrees=False, ratio=math.nan, rendered_mm=[math.nan] * 3)
-    assert "could not be compared" in agreement(study, lost)
+    assert "could not be compared" in agreement_text(study, lost)
 
 
 def test_missed_bounds_in_words():

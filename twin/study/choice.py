@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from twin.study.description import Study
-from twin.study.designs import Design, Marked, built, described, judged, row_of
+from twin.study.designs import Columns, Design, Marked, built, described, judged, row_of
 from twin.study.refinement import refined
 from uwlts.errors import DesignError, RangeError, UwltsError
 
@@ -78,7 +77,7 @@ class Chosen:
     notes: tuple[str, ...]
 
 
-def choose(study: Study, columns: dict[str, np.ndarray]) -> Chosen:
+def choose(study: Study, columns: Columns) -> Chosen:
     """The best design by the first objective among those that meet the constraints, and others to be looked at.
 
     Where none meets them, the one that misses them least is taken, and said so. ``further`` are designs spread over
@@ -108,19 +107,19 @@ def choose(study: Study, columns: dict[str, np.ndarray]) -> Chosen:
     costs[~meets] = np.inf
     best = int(np.argmin(costs[:, 0]))
     front = np.flatnonzero(meets)[pareto(costs[meets])]
-    winner = _design(study, columns, best)
+    winner = _design(columns, best)
     marked.append(Marked(f"best of the sweep (design {winner.number})", built(study, winner), row_of(columns, best)))
     if study.refine and (better := refined(study, winner, _better_than(study, columns, best))) is not None:
         marked.append(Marked("refined along the gradient", built(study, better), row_of(judged(study, [better]), 0)))
     front = front[np.argsort(costs[front, 0])]
     spread = front[np.unique(np.linspace(0, len(front) - 1, study.verify + 1).round().astype(int))]
-    others = [_design(study, columns, int(place)) for place in spread if place != best][: max(study.verify - 1, 0)]
+    others = [_design(columns, int(place)) for place in spread if place != best][: max(study.verify - 1, 0)]
     further = [Marked(f"on the Pareto front (design {d.number})", built(study, d), row_of(judged(study, [d]), 0))
                for d in others]  # fmt: skip
     return Chosen(tuple(marked), tuple(further), tuple(notes))
 
 
-def _better_than(study: Study, columns: dict[str, np.ndarray], place: int) -> Callable[[Design], bool]:
+def _better_than(study: Study, columns: Columns, place: int) -> Callable[[Design], bool]:
     """Whether a design is better than one of the sweep, judged alike."""
     objective = study.objectives[0]
     best = _cost(columns[objective.figure][place], objective.goal)
@@ -133,12 +132,12 @@ def _better_than(study: Study, columns: dict[str, np.ndarray], place: int) -> Ca
     return better
 
 
-def _cost(values: Any, goal: str) -> Any:
+def _cost(values: np.ndarray, goal: str) -> np.ndarray:
     """What is to be small; NaN, where the objective has no value, is the worst."""
     cost = values if goal == "minimise" else -values
     return np.where(np.isnan(cost), np.inf, cost)
 
 
-def _design(study: Study, columns: dict[str, np.ndarray], place: int) -> Design:
-    row = row_of(columns, place)
-    return Design(row["design"], {name: row[name] for name in study.free()})
+def _design(columns: Columns, place: int) -> Design:
+    found = row_of(columns, place)
+    return Design(found.number, found.values)

@@ -1,4 +1,4 @@
-"""Description of a study: a base sensor, what is free, what is wanted, and how the designs are chosen."""
+"""Description of a study: a base sensor, free variables, objectives, constraints, and the choice of designs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from uwlts.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
 OTHER_COLUMNS = ("design", "violation", "failure")
-"""What results tell of a design besides its values and figures."""
+"""Columns of results besides values and figures."""
 FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
 """What follows the stand-off and could be free as well."""
 MOST_DESIGNS = 10**8
@@ -47,23 +47,38 @@ class Variable(Description):
                 raise ValueError("values is empty")
             if len({isinstance(value, str) for value in self.values}) > 1:
                 raise ValueError(f"values mix words and numbers, {self.values}: make them choices, or two studies")
-        elif not self.least < self.most:
-            raise ValueError(f"least {self.least:g} must be smaller than most {self.most:g}")
-        elif self.scale == "log" and self.least <= 0:
-            raise ValueError(f"a log scale needs a least above 0, found {self.least:g}")
+            return self
+        least, most = self.ends()
+        if not least < most:
+            raise ValueError(f"least {least:g} must be smaller than most {most:g}")
+        if self.scale == "log" and least <= 0:
+            raise ValueError(f"a log scale needs a least above 0, found {least:g}")
         return self
+
+    def ends(self) -> tuple[float, float]:
+        """Least and most value of a range.
+
+        Raises
+        ------
+        DescriptionError
+            The variable is a list of values.
+        """
+        if self.least is None or self.most is None:
+            raise DescriptionError(f"a variable with the values {self.values} has no least and most")
+        return self.least, self.most
 
     def at(self, share: float) -> Value:
         """The value at a share from 0 to 1 of the range, not rounded, or of the list."""
         if self.values is not None:
             return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
+        least, most = self.ends()
         if self.scale == "log":
-            return float(math.exp(math.log(self.least) + share * math.log(self.most / self.least)))
-        return self.least + share * (self.most - self.least)
+            return float(math.exp(math.log(least) + share * math.log(most / least)))
+        return least + share * (most - least)
 
     def taken(self, value: Value) -> Value:
         """The value as a design takes it: rounded if it has to be whole."""
-        return round(value) if self.whole and self.values is None else value
+        return round(float(value)) if self.whole and self.values is None else value
 
     def grid(self) -> list[Value]:
         """All values of a grid."""

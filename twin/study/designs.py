@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -12,12 +12,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import qmc
 
-from twin.study.description import Study, Value
+from twin.study.description import OTHER_COLUMNS, Study, Value
 from twin.study.figures import FIGURES, Figures, figures_of
 from twin.study.parameters import followed, numbers_of, parameters_of, stacked
 from uwlts.errors import DesignError, UwltsError
 from uwlts.library import validated
 from uwlts.sensor import Sensor
+
+Columns = dict[str, np.ndarray]
+"""A study's results by column: "design", what is free, `Figures`, "violation" and "failure", one row per design."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +32,33 @@ class Design:
 
 
 @dataclass(frozen=True)
+class EvaluatedDesign:
+    """A design with what the formulas say of it.
+
+    ``number`` is -1 for a sensor that is none of the study's designs; ``values`` are those of what is free, ``figures``
+    those of `Figures`, NaN where the design fails. ``violation`` is by how much the constraints are missed together (0:
+    not at all), ``failure`` why the design cannot work ("" if it can).
+    """
+
+    number: int
+    values: dict[str, Value]
+    figures: dict[str, float]
+    violation: float
+    failure: str
+
+    def table(self) -> dict[str, Value]:
+        """All columns of a study's results for this design."""
+        ends = {"violation": self.violation, "failure": self.failure}
+        return {"design": self.number} | self.values | self.figures | ends
+
+
+@dataclass(frozen=True)
 class Marked:
-    """A design to point out: what it is called, its sensor as built, and its row of values and figures."""
+    """A design to point out: its label, its sensor as built, and its values and figures."""
 
     label: str
     sensor: Sensor
-    row: dict[str, Any]
+    design: EvaluatedDesign
 
 
 def sensor_of(study: Study, design: Design) -> Sensor:
@@ -45,10 +69,9 @@ def sensor_of(study: Study, design: Design) -> Sensor:
     DescriptionError, RangeError
         The values make no valid description.
     """
-    changes: dict[str, Any] = {}
+    changes: dict[str, Value] = {}
     for name, value in design.values.items():
-        for path, one in study.choices[name][value].items() if name in study.choices else ((name, value),):
-            changes[path] = one
+        changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
     return validated(Sensor, _changed(study.sensor, changes), f"design {design.number}")
 
 
@@ -66,7 +89,7 @@ def built(study: Study, design: Design) -> Sensor:
     return validated(Sensor, table, f"design {design.number}")
 
 
-def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def _changed(table: dict[str, Any], changes: Mapping[str, Value]) -> dict[str, Any]:
     """A table with values at paths replaced; the table itself stays as it is."""
     table = dict(table)
     for path, value in changes.items():
@@ -79,12 +102,11 @@ def _changed(table: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return table
 
 
-def judged(study: Study, designs: Sequence[Design]) -> dict[str, np.ndarray]:
+def judged(study: Study, designs: Sequence[Design]) -> Columns:
     """What the formulas say of N designs, as columns (N,).
 
-    "design" is the number; the values of what is free and all `Figures` follow by their names; "violation" tells by how
-    much the constraints are missed (0: not at all), "failure" why a design cannot work (""). A design that fails has
-    figures NaN and an infinite violation.
+    "design" is the number; the values of what is free and all `Figures` follow by their names, then "violation" and
+    "failure", see `EvaluatedDesign`. A design that fails has figures NaN and an infinite violation.
     """
     numbers, failures = {}, [""] * len(designs)
     for place, design in enumerate(designs):
@@ -112,8 +134,8 @@ def judged(study: Study, designs: Sequence[Design]) -> dict[str, np.ndarray]:
     return columns | {"failure": np.array(failures, dtype=object)}
 
 
-def described(study: Study, label: str, sensor: Sensor) -> dict[str, Any]:
-    """The row of a sensor that is not one of the study's designs; nothing in it follows the stand-off.
+def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
+    """A sensor that is not one of the study's designs, evaluated; nothing in it follows the stand-off.
 
     Raises
     ------
@@ -125,16 +147,20 @@ def described(study: Study, label: str, sensor: Sensor) -> dict[str, Any]:
     if reason:
         raise DesignError(f"{label}: {reason}")
     table = sensor.model_dump()
-    row: dict[str, Any] = {"design": -1}
-    for name in study.free():
-        row[name] = label if name in study.choices else reduce(lambda place, key: place[key], name.split("."), table)
-    row |= {name: column.item() for name, column in vars(figures).items()}
-    return row | {"violation": violations(study, figures).item(), "failure": ""}
+    values: dict[str, Value] = {
+        name: label if name in study.choices else reduce(lambda place, key: place[key], name.split("."), table)
+        for name in study.free()
+    }
+    numbers = {name: column.item() for name, column in vars(figures).items()}
+    return EvaluatedDesign(-1, values, numbers, violations(study, figures).item(), "")
 
 
-def row_of(columns: dict[str, np.ndarray], place: int) -> dict[str, Any]:
-    """One design's row as plain values."""
-    return {name: values[place].item() if values.dtype != object else values[place] for name, values in columns.items()}
+def row_of(columns: Columns, place: int) -> EvaluatedDesign:
+    """One design of a study's columns."""
+    row = {name: one[place].item() if one.dtype != object else one[place] for name, one in columns.items()}
+    values = {name: value for name, value in row.items() if name not in (*FIGURES, *OTHER_COLUMNS)}
+    figures = {name: value for name, value in row.items() if name in FIGURES}
+    return EvaluatedDesign(row["design"], values, figures, row["violation"], row["failure"] or "")
 
 
 def violations(study: Study, figures: Figures) -> np.ndarray:

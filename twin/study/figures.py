@@ -12,6 +12,7 @@ import numpy as np
 from twin.study.geometry import (
     Array,
     Vector,
+    across_mm,
     added,
     degrees,
     direction_outside,
@@ -20,6 +21,7 @@ from twin.study.geometry import (
     pixels_per_mm,
     scaled,
     seen,
+    snell_root,
     standoff_mm,
 )
 from twin.study.parameters import Follow, Parameters, followed
@@ -115,7 +117,7 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     laser_window = p.laser_window(pose.axis)
     offset = dot(added(middle, scaled(pose.origin, -1.0)), pose.fan)
     height = dot(added(middle, scaled(pose.origin, -1.0)), pose.axis)
-    edges = [_fan_edge_mm(xp, laser_window, height, angle) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
+    edges = [across_mm(xp, laser_window, height, xp.tan(angle)) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
     low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
     high = xp.minimum(xp.maximum(ends[0], ends[1]), edges[1])
     half = 0.5 * (high - low)
@@ -145,16 +147,6 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
         exposure_ms=used, required_ms=required,
         standoff_mm=standoff,
     )  # fmt: skip
-
-
-def _fan_edge_mm(xp: ModuleType, window, height_mm: Array, angle_rad: Array) -> Array:
-    """How far from the laser's axis the fan's edge is, where the axis has run ``height_mm``."""
-    p = xp.tan(angle_rad)
-    layers = (
-        (window.distance_mm, 1.0), (window.thickness_mm, window.glass_index),
-        (height_mm - window.outer_mm, window.medium_index),
-    )  # fmt: skip
-    return sum(extent * p / xp.sqrt(n * n + (n * n - 1) * p * p) for extent, n in layers)
 
 
 def _angle(xp: ModuleType, a: Vector, b: Vector) -> Array:
@@ -329,10 +321,10 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
         return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (n,))
 
     corner = np.hypot(p.width_px, p.height_px) / 2 * p.pixel_mm / p.focal_mm
-    glass = corner / np.sqrt(p.window_index**2 + (p.window_index**2 - 1) * corner**2)
+    glass = corner / snell_root(np, p.window_index, corner)
     cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
     spread = np.tan(p.fan_half_rad)
-    inside = spread / np.sqrt(p.laser_window_index**2 + (p.laser_window_index**2 - 1) * spread**2)
+    inside = spread / snell_root(np, p.laser_window_index, spread)
     fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
     fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
     checks = (

@@ -15,14 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.placement import LaserPose
-from uwlts.sensor import Camera, Medium, Sensor, Window
-
 Array = Any
 """A NumPy or Dr.Jit array, or a number that goes with one."""
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4
+_UNDISTORTING_STEPS, _UNDISTORTED_PX = 100, 1e-3
+"""Strong distortion converges slowly; what is left is far below what a drawing shows."""
 _TINY_MM = 1e-9
 """Keeps the direction of a point on the window's normal defined; far below anything that matters."""
 
@@ -87,6 +86,14 @@ class FlatWindow:
         """Distance of the outer face along the normal."""
         return self.distance_mm + self.thickness_mm
 
+    def layers(self, height_mm: Array) -> tuple[tuple[Array, Array], ...]:
+        """Extents along the normal up to a height, and indices, of the air, the glass and the medium."""
+        return (
+            (self.distance_mm, 1.0),
+            (self.thickness_mm, self.glass_index),
+            (height_mm - self.outer_mm, self.medium_index),
+        )
+
 
 @dataclass(frozen=True)
 class Path:
@@ -107,6 +114,38 @@ class Path:
     growth_mm: Array
 
 
+def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:
+    """The root sqrt(n^2 + (n^2 - 1) p^2) by which Snell's law divides the slope p that a ray has in air.
+
+    From n sin(b) = sin(a) with p = tan(a): tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2).
+    """
+    return xp.sqrt(index * index + (index * index - 1) * slope * slope)
+
+
+def across_mm(xp: ModuleType, window: FlatWindow, height_mm: Array, slope: Array) -> Array:
+    """Distance from the normal through the origin that a ray of some slope in air has at a height along the normal."""
+    return sum(extent * slope / snell_root(xp, n, slope) for extent, n in window.layers(height_mm))
+
+
+def traced(window: FlatWindow, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3, 3) where rays (N, 3) start and meet both faces of a window, and their directions behind it.
+
+    NaN for rays that lead away from the window.
+    """
+    normal = np.array(window.normal)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead = directions @ normal
+        sideways = directions / np.where(ahead > 0, ahead, np.nan)[:, None] - normal
+        slope = np.sqrt((sideways**2).sum(axis=1))
+        leaning = sideways / np.maximum(slope, 1e-300)[:, None]
+    at_faces = ((window.distance_mm, window.distance_mm * slope),
+                (window.outer_mm, across_mm(np, window, window.outer_mm, slope)))  # fmt: skip
+    points = [origin + height * normal + aside[:, None] * leaning for height, aside in at_faces]
+    points = [np.broadcast_to(origin, directions.shape), *points]
+    outside = slope / snell_root(np, window.medium_index, slope)
+    return np.stack(points, axis=1), normal + outside[:, None] * leaning
+
+
 def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
     """The ray to points beyond a window, by Snell's law, with the module's origin at 0.
 
@@ -117,15 +156,12 @@ def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
     height = dot(point, window.normal)
     sideways = added(point, scaled(window.normal, -height))
     rho = xp.sqrt(dot(sideways, sideways) + _TINY_MM**2)
-    layers = (
-        (window.distance_mm, 1.0), (window.thickness_mm, window.glass_index),
-        (height - window.outer_mm, window.medium_index),
-    )  # fmt: skip
+    layers = window.layers(height)
 
     def reach(p: Array) -> tuple[Array, Array, Array]:
         total, growth, last = 0.0, 0.0, None
         for extent, n in layers:
-            last = 1 / xp.sqrt(n * n + (n * n - 1) * p * p)
+            last = 1 / snell_root(xp, n, p)
             total, growth = total + extent * last, growth + extent * n * n * last**3
         return total, growth, last
 
@@ -176,16 +212,38 @@ class Seen:
     jacobian: tuple[Array, Array, Array, Array]
 
 
+def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Image points (x, y) of slopes (a, b), and the radial factor; distortion after Brown 1971, in OpenCV's form."""
+    r2 = a * a + b * b
+    radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
+    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
+    return x, y, radial
+
+
+def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Rays (N, 3) of pixels (N, 2); distortion undone by fixed-point steps. NaN where they do not converge."""
+    wanted = (pixels - (lens.cx, lens.cy)) / lens.focal_px
+    found = wanted.copy()
+    missed = np.full(len(found), np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(_UNDISTORTING_STEPS):
+            x, y, radial = distorted(lens, *found.T)
+            image = np.stack([x, y], axis=1)
+            missed = np.abs(image - wanted).max(axis=1)
+            found += (wanted - image) / radial[:, None]
+        found[~(missed * lens.focal_px < _UNDISTORTED_PX)] = np.nan
+    return np.column_stack([found, np.ones(len(found))])
+
+
 def seen(xp: ModuleType, lens: Lens, window: FlatWindow, point: Vector) -> Seen:
-    """Pixels at which points beyond the window appear; distortion after Brown 1971, in OpenCV's form."""
+    """Pixels at which points beyond the window appear."""
     path = path_to(xp, window, point)
     ray = added(window.normal, scaled(path.across, path.slope))
     a, b = ray[0] / ray[2], ray[1] / ray[2]
     r2 = a * a + b * b
-    radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    x, y, radial = distorted(lens, a, b)
     slope = 2 * (lens.k1 + r2 * (2 * lens.k2 + r2 * 3 * lens.k3))
-    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
-    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
     mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
     jacobian = (
         lens.focal_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a), lens.focal_px * mixed,
@@ -228,89 +286,3 @@ def window_normal(xp: ModuleType, *, tilt_x_rad: Array, tilt_y_rad: Array) -> Ve
 def degrees(angle: Array) -> Array:
     """An angle in rad in degrees."""
     return angle * (180 / math.pi)
-
-
-_BORDER = 41
-"""Pixels along each side of the image."""
-
-Face = tuple[np.ndarray, np.ndarray, float, float]
-"""A flat face: a point of it, its normal along the light, and the indices before and behind it."""
-
-
-def faces(sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> list[Face]:
-    """Both faces of a module's window in the camera frame; none where it is left out."""
-    if not window.mounted:
-        return []
-    wavelength = sensor.laser.wavelength_nm
-    glass, normal = window.index(wavelength), rotation @ window.normal()
-    inner = origin + window.distance_mm * rotation[:, 2]
-    outer = inner + window.thickness_mm * normal
-    return [(inner, normal, 1.0, glass), (outer, normal, glass, medium.refractive_index(wavelength))]
-
-
-def frame(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """A module's frame (3, 3), columns x, y, z: z along its axis, x along ``across``."""
-    return np.stack([across, np.cross(axis, across), axis], axis=1)
-
-
-def traced(origin: np.ndarray, directions: np.ndarray, faces: list[Face]) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, K, 3) where rays (N, 3) start and meet faces, and their directions behind the last.
-
-    Snell's law in vector form: with r = n1 / n2 and c = d . n, d' = r d + (sqrt(1 - r^2 (1 - c^2)) - r c) n.
-    """
-    d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    points = [np.broadcast_to(origin, d.shape)]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        for place, normal, before, behind in faces:
-            points.append(points[-1] + ((place - points[-1]) @ normal / (d @ normal))[:, None] * d)
-            r, c = before / behind, d @ normal
-            d = r * d + (np.sqrt(1 - r**2 * (1 - c**2)) - r * c)[:, None] * normal
-    return np.stack(points, axis=1), d
-
-
-def to_plane(points: np.ndarray, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Rays carried on to a plane, (N, K + 1, 3); NaN for a ray that does not get there."""
-    last = points[:, -1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        way = (place - last) @ normal / (directions @ normal)
-        end = last + np.where(way > 0, way, np.nan)[:, None] * directions
-    return np.concatenate([points, end[:, None]], axis=1)
-
-
-def borders_on_sheet(camera: Camera, faces: list[Face], pose: LaserPose) -> list[np.ndarray]:
-    """Where the image's four sides lie in the sheet, (N, 3) each."""
-    width, height = camera.width_px - 0.5, camera.height_px - 0.5
-    corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
-    share = np.linspace(0, 1, _BORDER)[:, None]
-    sides = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    return [
-        to_plane(*traced(np.zeros(3), directions(camera, side), faces), pose.origin_mm, pose.normal)[:, -1]
-        for side in sides
-    ]
-
-
-def border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
-    """Pixels (2, 2) where lines from the principal point along +-``across`` (2,) leave the image."""
-    centre = np.array(camera.principal_point())
-    least, most = np.array([-0.5, -0.5]), np.array([camera.width_px - 0.5, camera.height_px - 0.5])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = [np.where(d > 0, most - centre, least - centre) / d for d in (across, -across)]
-    lengths = [float(np.min(end[np.abs(across) > 1e-12])) for end in ends]
-    return np.stack([centre + lengths[0] * across, centre - lengths[1] * across])
-
-
-def directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Rays (N, 3) of pixels (N, 2); Brown-Conrady undone by fixed-point steps. NaN where they do not converge."""
-    wanted = (pixels - camera.principal_point()) / camera.focal_length_px()
-    d, found = camera.distortion, wanted.copy()
-    with np.errstate(all="ignore"):
-        for _ in range(100):
-            x, y = found.T
-            r2 = x * x + y * y
-            radial = 1 + r2 * (d.k1 + r2 * (d.k2 + r2 * d.k3))
-            aside = 2 * d.p1 * x * y + d.p2 * (r2 + 2 * x * x), d.p1 * (r2 + 2 * y * y) + 2 * d.p2 * x * y
-            shift = np.stack(aside, axis=1)
-            missed = np.abs(found * radial[:, None] + shift - wanted).max(axis=1)
-            found = (wanted - shift) / radial[:, None]
-        found[~(missed * camera.focal_length_px() < 1e-3)] = np.nan
-    return np.column_stack([found, np.ones(len(found))])

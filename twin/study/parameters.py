@@ -1,4 +1,4 @@
-"""What the formulas need of designs: plain arrays, one value per design, taken from sensor descriptions."""
+"""Parameters of designs for the formulas: plain arrays, one value per design, taken from sensor descriptions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.polynomial import Chebyshev
@@ -199,28 +199,37 @@ def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> Paramet
     return stacked([numbers_of(sensor, medium) for sensor, medium in zip(sensors, media, strict=True)])
 
 
-def stacked(rows: Sequence[dict[str, Any]]) -> Parameters:
-    """Parameters from the numbers of N sensors, as arrays (N, 1, 1)."""
+def stacked(rows: Sequence[Parameters]) -> Parameters:
+    """Parameters of N sensors, each of plain numbers, as arrays (N, 1, 1)."""
     names = [field.name for field in fields(Parameters) if field.name not in ("placed", "fan_nodes_rad", "fan_powers")]
-    columns = {name: _column([row[name] for row in rows]) for name in names}
-    placed = np.array([row["placed"] for row in rows])
-    vectors = tuple(tuple(_column(placed[:, i, k]) for k in range(3)) for i in range(4))
-    nodes = max(len(row["fan_table"]) for row in rows)
-    # Short tables are filled up with their last node, which adds nothing.
-    tables = np.array([list(r["fan_table"]) + [r["fan_table"][-1]] * (nodes - len(r["fan_table"])) for r in rows])
+    columns = {name: _column([getattr(row, name) for row in rows]) for name in names}
+    placed = np.array([row.placed for row in rows])
+    origin, axis, fan, normal = (_vector([_column(placed[:, i, k]) for k in range(3)]) for i in range(4))
+    nodes = max(len(row.fan_nodes_rad) for row in rows)
+
+    def filled(table: Sequence[float]) -> list[float]:
+        # Short tables are filled up with their last node, which adds nothing.
+        return [*table, *[table[-1]] * (nodes - len(table))]
+
+    angles = np.array([filled(row.fan_nodes_rad) for row in rows])
+    powers = np.array([filled(row.fan_powers) for row in rows])
     return Parameters(
-        **columns, placed=vectors,
-        fan_nodes_rad=tuple(_column(tables[:, k, 0]) for k in range(nodes)),
-        fan_powers=tuple(_column(tables[:, k, 1]) for k in range(nodes)),
+        **columns, placed=(origin, axis, fan, normal),
+        fan_nodes_rad=tuple(map(_column, angles.T)), fan_powers=tuple(map(_column, powers.T)),
     )  # fmt: skip
+
+
+def _vector(parts: Sequence[Array]) -> Vector:
+    x, y, z = parts
+    return x, y, z
 
 
 def _column(values: Sequence[float]) -> np.ndarray:
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
-def numbers_of(sensor: Sensor, medium: Medium) -> dict[str, Any]:
-    """The numbers of one sensor in a medium, by the names of `Parameters`.
+def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
+    """Parameters of one sensor in a medium, as plain numbers.
 
     Raises
     ------
@@ -238,19 +247,20 @@ def numbers_of(sensor: Sensor, medium: Medium) -> dict[str, Any]:
         raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
     glass, laser_glass = (w.index(wavelength) if w.mounted else 1.0 for w in (window, laser.window))
     by_axis = laser.origin_mm is not None
-    placed = np.full((4, 3), math.nan)
+    placed = [np.full(3, math.nan)] * 4
     if by_axis:
         pose = laser_pose(sensor)
-        placed = np.stack([pose.origin_mm, pose.axis, pose.fan, pose.normal])
+        placed = [pose.origin_mm, pose.axis, pose.fan, pose.normal]
+    origin, axis, fan, normal = (_vector(vector.tolist()) for vector in placed)
     table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
     cx, cy = camera.principal_point()
     d = camera.distortion
-    return {
+    numbers = {
         "baseline_mm": math.nan if by_axis else laser.baseline_mm,
         "angle_rad": math.nan if by_axis else math.radians(laser.triangulation_angle_deg),
-        "roll_rad": math.radians(laser.roll_deg), "placed": placed,
+        "roll_rad": math.radians(laser.roll_deg),
         "along_width": float(camera.stripe_along == "width"),
         "width_px": camera.width_px, "height_px": camera.height_px,
         "pixel_mm": 1e-3 * camera.pixel_size_um, "focal_mm": camera.focal_length_mm, "cx_px": cx, "cy_px": cy,
@@ -263,7 +273,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> dict[str, Any]:
         "window_aperture_mm": window.aperture_diameter_mm if window.mounted else math.inf,
         "wavelength_mm": 1e-6 * wavelength, "power_w": 1e-3 * laser.power_mw, "fan_half_rad": half,
         "lit_from_rad": lit[0], "lit_to_rad": lit[1], "gaussian_fan": float(laser.fan_profile == "gaussian"),
-        "tabulated_fan": float(bool(table)), "fan_table": _normalised(table) if table else ((0.0, 0.0),),
+        "tabulated_fan": float(bool(table)),
         "waist_mm": laser.waist_radius_mm, "waist_distance_mm": laser.waist_distance_mm,
         "beam_quality": laser.beam_quality_m2,
         "laser_window_distance_mm": laser.window.distance_mm * laser.window.mounted,
@@ -288,6 +298,11 @@ def numbers_of(sensor: Sensor, medium: Medium) -> dict[str, Any]:
         "stage_resolution_mm": sensor.stage.resolution_mm,
         "near_mm": sensor.volume.near_mm, "far_mm": sensor.volume.far_mm,
     }  # fmt: skip
+    nodes = _normalised(table) if table else ((0.0, 0.0),)
+    return Parameters(
+        **{name: float(value) for name, value in numbers.items()}, placed=(origin, axis, fan, normal),
+        fan_nodes_rad=tuple(float(angle) for angle, _ in nodes), fan_powers=tuple(float(power) for _, power in nodes),
+    )  # fmt: skip
 
 
 def _passes(glass_index: float, medium_index: float, depth: float) -> float:

@@ -1,10 +1,10 @@
-"""Improves a design along the gradient of its objective, which Dr.Jit derives from the same formulas that judge it."""
+"""Refinement of a design along the gradient of its objective, which Dr.Jit derives from the formulas of all designs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -16,7 +16,7 @@ from twin.study.description import Study
 from twin.study.designs import Design, sensor_of
 from twin.study.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
 from twin.study.geometry import Array
-from twin.study.parameters import Parameters, followed, parameters_of
+from twin.study.parameters import Parameters, followed, numbers_of
 
 PARAMETER_OF: dict[str, tuple[str, float]] = {
     "laser.baseline_mm": ("baseline_mm", 1.0),
@@ -121,7 +121,7 @@ class DerivedFigures:
             and _is_placed(path, sensor.laser.baseline_mm)
         ]  # fmt: skip
         self._figures, self._study = figures, study
-        self._parameters = _plain(parameters_of([sensor], [study.medium_of(sensor)]))
+        self._parameters = numbers_of(sensor, study.medium_of(sensor))
         shares, places = np.meshgrid(np.linspace(0, 1, DEPTHS), np.linspace(-1, 1, PLACES), indexing="ij")
         self._shares, self._places = Float64(shares.ravel()), Float64(places.ravel() * (1 - 1e-9))
 
@@ -177,8 +177,8 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
     figures = DerivedFigures(study, design, [objective.figure, *(name for name, _ in bounds)])
     if not figures.paths:
         return None
-    low = np.array([study.variables[path].least for path in figures.paths])
-    wide = np.array([study.variables[path].most for path in figures.paths]) - low
+    low, most = np.array([study.variables[path].ends() for path in figures.paths]).T
+    wide = most - low
     start = (np.array([design.values[path] for path in figures.paths]) - low) / wide
     known: dict[bytes, Derived] = {}
 
@@ -221,12 +221,3 @@ def _is_placed(path: str, baseline_mm: float | None) -> bool:
     return baseline_mm is not None or path not in (
         "laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg"
     )  # fmt: skip
-
-
-def _plain(parameters: Parameters) -> Parameters:
-    """Parameters of one design as plain numbers."""
-
-    def plain(value: Any) -> Any:
-        return tuple(plain(one) for one in value) if isinstance(value, tuple) else float(value.item())
-
-    return Parameters(**{field.name: plain(getattr(parameters, field.name)) for field in fields(Parameters)})

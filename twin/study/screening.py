@@ -26,7 +26,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
 
 from twin.study.description import Study, Variable
-from twin.study.designs import Design, designs_of, judged, number_of_designs
+from twin.study.designs import Columns, Design, designs_of, judged, number_of_designs
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files import written_aside
 from uwlts.workers import Lost, Workers
@@ -37,7 +37,7 @@ def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
     return folder / f"{'lost' if lost else 'part'}-{first:09d}.parquet"
 
 
-def as_part(columns: dict[str, np.ndarray]) -> bytes:
+def as_part(columns: Columns) -> bytes:
     """A batch's columns as the content of a part."""
     sink = pa.BufferOutputStream()
     pq.write_table(pa.table(columns), sink)
@@ -66,7 +66,7 @@ def rows_in(path: Path) -> int:
         return 0
 
 
-def read_parts(folder: Path) -> dict[str, np.ndarray]:
+def read_parts(folder: Path) -> Columns:
     """Columns of all designs of a folder, in the order of their numbers; empty where there are none.
 
     Raises
@@ -74,7 +74,7 @@ def read_parts(folder: Path) -> dict[str, np.ndarray]:
     CaptureError
         A part is damaged or foreign.
     """
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     tables = []
     for path in parts(folder):
         try:
@@ -96,7 +96,7 @@ def read_parts(folder: Path) -> dict[str, np.ndarray]:
     return columns
 
 
-def write_csv(path: Path, columns: dict[str, np.ndarray], *, names: Iterable[str] | None = None) -> None:
+def write_csv(path: Path, columns: Columns, *, names: Iterable[str] | None = None) -> None:
     """Write columns as CSV, replacing an older file."""
     chosen = list(columns if names is None else names)
     with written_aside(path, overwrite=True) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
@@ -143,8 +143,8 @@ class Search:
         free = self._study.free()
         return [Design(trial.number, {name: free[name].taken(trial.params[name]) for name in free}) for trial in trials]
 
-    def tell(self, columns: dict[str, np.ndarray]) -> None:
-        """What the designs are worth, in columns as `judged` returns them; those told before are left alone."""
+    def tell(self, columns: Columns) -> None:
+        """Report columns of designs as `judged` returns them; those reported before are left alone."""
         trials = {trial.number: trial for trial in self._optuna.get_trials(deepcopy=False)}
         for place, number in enumerate(columns["design"].tolist()):
             trial = trials.get(number)

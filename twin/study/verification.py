@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,34 @@ _LARGEST_RESIDUAL = 5.0
 _MAD_TO_STD = 1.4826
 
 
+@dataclass(frozen=True)
+class CalibrationFigures:
+    """Figures of a calibration: the window's distance found and the step heights' error with it (None where no window
+    was sought), the residuals of camera and sheet, and warnings."""
+
+    window_mm: float | None
+    window_std_mm: float | None
+    step_rms_mm: float | None
+    camera_rms_px: float
+    focal_length_px: float
+    target_images: int
+    sheet_rms_mm: float
+    warnings: list[str]
+
+
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class Profiles:
+    """Depths, points, scatter, error and line length of a measured plane, as in `Rendered`."""
+
+    z_mm: np.ndarray
+    points: np.ndarray
+    scatter_mm: np.ndarray
+    error_mm: np.ndarray
+    line_mm: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered(Profiles):
     """What a rendered sensor measures of a plane square to the laser's axis, at K depths.
 
     Attributes
@@ -71,21 +97,13 @@ class Rendered:
         Length along Y over which points were found, outliers left out; 0 where there are fewer than 20.
     exposure_ms : float
         That of the plane's images.
-    calibration : dict
-        Figures of the calibration: ``window_mm`` and ``window_std_mm``, the window's distance found (None where
-        none was sought), ``step_rms_mm``, the step heights' error with it, ``camera_rms_px``, ``focal_length_px``,
-        ``target_images``, ``sheet_rms_mm`` and ``warnings``.
+    calibration : CalibrationFigures
     seconds : dict
         Time taken to ``render``, ``calibrate`` and ``measure``.
     """
 
-    z_mm: np.ndarray
-    points: np.ndarray
-    scatter_mm: np.ndarray
-    error_mm: np.ndarray
-    line_mm: np.ndarray
     exposure_ms: float
-    calibration: dict[str, Any]
+    calibration: CalibrationFigures
     seconds: dict[str, float]
 
 
@@ -151,7 +169,7 @@ def verify(
     finally:
         if not keep:
             _remove([path for job in jobs for path in job.files()] + [cloud])
-    return Rendered(**profiles, exposure_ms=exposure, calibration=_figures(calibration), seconds=seconds)
+    return Rendered(**vars(profiles), exposure_ms=exposure, calibration=_figures(calibration), seconds=seconds)
 
 
 # --- the twin's part --------------------------------------------------------------------------------------------------
@@ -211,21 +229,21 @@ def _run(command: str, *arguments: str, fails_as: type[UwltsError]) -> None:
     raise SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
 
 
-def _figures(path: Path) -> dict[str, Any]:
-    """What a calibration says of itself, as in `Rendered`."""
+def _figures(path: Path) -> CalibrationFigures:
+    """Figures of a calibration file."""
     content = json.loads(path.read_text(encoding="utf-8"))
     camera, sheet = content["residuals"]["camera"], content["residuals"]["sheet"]
     window = content["residuals"].get("window")
-    return {
-        "window_mm": window and window["distance_mm"],
-        "window_std_mm": window and window["std_mm"],
-        "step_rms_mm": window and float(np.sqrt(np.mean(np.square(window["errors_mm"])))),
-        "camera_rms_px": camera["rms_px"],
-        "focal_length_px": content["camera"]["fx_px"],
-        "target_images": camera["images"],
-        "sheet_rms_mm": sheet["rms_mm"],
-        "warnings": content["provenance"]["warnings"],
-    }
+    return CalibrationFigures(
+        window_mm=window and window["distance_mm"],
+        window_std_mm=window and window["std_mm"],
+        step_rms_mm=window and float(np.sqrt(np.mean(np.square(window["errors_mm"])))),
+        camera_rms_px=camera["rms_px"],
+        focal_length_px=content["camera"]["fx_px"],
+        target_images=camera["images"],
+        sheet_rms_mm=sheet["rms_mm"],
+        warnings=content["provenance"]["warnings"],
+    )
 
 
 # --- the comparison ---------------------------------------------------------------------------------------------------
@@ -240,8 +258,8 @@ def _points(cloud: Path) -> np.ndarray:
         raise CaptureError(f"{cloud} is not the cloud of the plane standard: {error}") from error
 
 
-def _judged(points: np.ndarray, stage_mm: np.ndarray) -> dict[str, np.ndarray]:
-    """Profiles of `Rendered`, nearest first, from points (N, 3) with frame, Y and Z about the plane Z = 0.
+def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Profiles:
+    """Profiles, nearest first, from points (N, 3) with frame, Y and Z about the plane Z = 0.
 
     The stage stood at ``stage_mm`` (K,) along Z.
     """
@@ -253,13 +271,10 @@ def _judged(points: np.ndarray, stage_mm: np.ndarray) -> dict[str, np.ndarray]:
             f"the plane standard shows {len(points)} points at {len(order)} depths, at least {_FEWEST_POINTS} are "
             "needed at one depth: check that the stripe is bright enough and in focus"
         )
-    nothing = (np.nan, np.nan, 0.0)
+    nothing = (math.nan, math.nan, 0.0)
     figures = np.array([_profile(p) if good else nothing for p, good in zip(found, enough, strict=True)])
     scatter, error, line = figures.T
-    return {
-        "z_mm": -stage_mm[order], "points": np.array([len(profile) for profile in found]),
-        "scatter_mm": scatter, "error_mm": error, "line_mm": line,
-    }  # fmt: skip
+    return Profiles(-stage_mm[order], np.array([len(profile) for profile in found]), scatter, error, line)
 
 
 def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
@@ -313,13 +328,33 @@ class Verification:
     seed: int = 0
 
 
-def verified(job: Verification) -> dict[str, Any]:
-    """A row that says what rendering found of a candidate, what the formulas had said, and whether they agree.
+@dataclass(frozen=True)
+class Agreement:
+    """Rendered and predicted scatter of a candidate at depths Z, and whether they agree.
 
-    "ratio" is the root mean square over all points of the rendered scatter over that of the predicted one, or its
+    ``ratio`` is the root mean square over all points of the rendered scatter over that of the predicted one, or its
     inverse if that is larger; they agree up to the study's tolerance. What the software or the renderer refuses stands
-    in "failure".
+    in ``failure``; the depths are empty then. Values read from files may be None where they are NaN.
     """
+
+    label: str
+    design: int
+    z_mm: list[float] = field(default_factory=list)
+    predicted_mm: list[float] = field(default_factory=list)
+    rendered_mm: list[float] = field(default_factory=list)
+    error_mm: list[float] = field(default_factory=list)
+    line_mm: list[float] = field(default_factory=list)
+    ratio: float = math.nan
+    rendered_over_predicted: float = math.nan
+    agrees: bool = False
+    exposure_ms: float = math.nan
+    predicted_exposure_ms: float = math.nan
+    seconds: float = math.nan
+    failure: str = ""
+
+
+def verified(job: Verification) -> Agreement:
+    """Render a candidate and compare its scatter with the predicted one."""
     study, candidate = job.study, job.candidate
     try:
         with tempfile.TemporaryDirectory(prefix="verify-") as folder:
@@ -328,13 +363,13 @@ def verified(job: Verification) -> dict[str, Any]:
                 seed=job.seed, variant=job.variant, workers=job.workers,
             )  # fmt: skip
     except (UwltsError, OSError) as error:
-        return _failed(candidate, str(error))
-    return _named(candidate) | compared(study, candidate.sensor, rendered)
+        return Agreement(candidate.label, candidate.number, failure=str(error))
+    return compared(study, candidate, rendered)
 
 
-def compared(study: Study, sensor: Sensor, rendered: Rendered) -> dict[str, Any]:
-    """Rendered and predicted figures of a sensor side by side."""
-    p = parameters_of([sensor], [study.medium_of(sensor)])
+def compared(study: Study, candidate: Candidate, rendered: Rendered) -> Agreement:
+    """Rendered and predicted figures of a candidate side by side."""
+    p = parameters_of([candidate.sensor], [study.medium_of(candidate.sensor)])
     predicted = scatter_at(p, rendered.z_mm, 0.5 * rendered.line_mm, reflectance=study.reflectance)
     figures, _ = figures_of(p, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     found = np.isfinite(rendered.scatter_mm) & (predicted > 0)
@@ -344,30 +379,21 @@ def compared(study: Study, sensor: Sensor, rendered: Rendered) -> dict[str, Any]
                    for sigma in (rendered.scatter_mm, predicted)]  # fmt: skip
         ratio = math.sqrt(squares[0] / squares[1])
     factor = max(ratio, 1 / ratio)
-    return {
-        "z_mm": rendered.z_mm.tolist(), "predicted_mm": predicted.tolist(), "rendered_mm": rendered.scatter_mm.tolist(),
-        "error_mm": rendered.error_mm.tolist(), "line_mm": rendered.line_mm.tolist(),
-        "ratio": factor, "rendered_over_predicted": ratio, "agrees": bool(factor <= study.verify_tolerance),
-        "exposure_ms": rendered.exposure_ms, "predicted_exposure_ms": figures.exposure_ms.item(),
-        "seconds": sum(rendered.seconds.values()), "failure": "",
-    }  # fmt: skip
-
-
-def _named(candidate: Candidate) -> dict[str, Any]:
-    return {"label": candidate.label, "design": candidate.number}
-
-
-def _failed(candidate: Candidate, reason: str) -> dict[str, Any]:
-    lists = {name: [] for name in ("z_mm", "predicted_mm", "rendered_mm", "error_mm", "line_mm")}
-    numbers = ("ratio", "rendered_over_predicted", "exposure_ms", "predicted_exposure_ms", "seconds")
-    return _named(candidate) | lists | dict.fromkeys(numbers, math.nan) | {"agrees": False, "failure": reason}
+    return Agreement(
+        candidate.label, candidate.number,
+        z_mm=rendered.z_mm.tolist(), predicted_mm=predicted.tolist(), rendered_mm=rendered.scatter_mm.tolist(),
+        error_mm=rendered.error_mm.tolist(), line_mm=rendered.line_mm.tolist(),
+        ratio=factor, rendered_over_predicted=ratio, agrees=bool(factor <= study.verify_tolerance),
+        exposure_ms=rendered.exposure_ms, predicted_exposure_ms=figures.exposure_ms.item(),
+        seconds=sum(rendered.seconds.values()),
+    )  # fmt: skip
 
 
 def render(
     study: Study, folder: Path, candidates: Sequence[Candidate], workers: Workers, *, variant: str,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Rows of the candidates' verifications, in their order; each is kept in a file of ``folder``.
+) -> list[Agreement]:  # fmt: skip
+    """Verify candidates, in their order; each result is kept in a file of ``folder``.
 
     What was rendered before is taken from there, but what failed is tried again.
 
@@ -380,31 +406,32 @@ def render(
     """
     made_folder(folder)
     paths = [folder / f"{_digest(study, candidate, variant)}.parquet" for candidate in candidates]
-    rows = [_row_in(path) for path in paths]
-    waiting = [place for place, row in enumerate(rows) if row is None or row["failure"]]
+    known = {place: kept for place, path in enumerate(paths) if (kept := _kept_in(path)) and not kept.failure}
+    waiting = [place for place in range(len(candidates)) if place not in known]
     each = workers.processes_for(len(waiting))
     jobs = {place: Verification(study, candidates[place], each, variant) for place in waiting}
-    done = len(candidates) - len(waiting)
-    progress(done, len(candidates))
+    progress(len(known), len(candidates))
     for job, result in workers.completed(verified, jobs.values()):
         place = next(place for place, one in jobs.items() if one is job)
-        row = _failed(job.candidate, result.reason) if isinstance(result, Lost) else result
+        if isinstance(result, Lost):
+            result = Agreement(job.candidate.label, job.candidate.number, failure=result.reason)
         with written_aside(paths[place], overwrite=True) as aside:
-            pq.write_table(pa.Table.from_pylist([row]), aside)
-        rows[place] = row
-        done += 1
-        progress(done, len(candidates))
-    # Name and tolerance may be others than when a row was kept.
+            pq.write_table(pa.Table.from_pylist([asdict(result)]), aside)
+        known[place] = result
+        progress(len(known), len(candidates))
+    # Name and tolerance may be others than when a result was kept.
     return [
-        row | {"label": one.label, "design": one.number, "agrees": bool(row["ratio"] <= study.verify_tolerance)}
-        for row, one in zip(rows, candidates, strict=True)
+        replace(
+            known[place], label=one.label, design=one.number, agrees=known[place].ratio <= study.verify_tolerance
+        )
+        for place, one in enumerate(candidates)
     ]
 
 
-def _row_in(path: Path) -> dict[str, Any] | None:
-    """The row that a file holds, None if there is none."""
+def _kept_in(path: Path) -> Agreement | None:
+    """The result that a file holds, None if there is none."""
     try:
-        return pq.read_table(path).to_pylist()[0] if path.is_file() else None
+        return Agreement(**pq.read_table(path).to_pylist()[0]) if path.is_file() else None
     except (pa.ArrowInvalid, OSError):
         return None
 

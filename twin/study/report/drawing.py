@@ -7,24 +7,29 @@ the sheet. The measuring volume is that of the formulas.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from markupsafe import Markup, escape
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from twin.study.figures import depths_in_view, field_of
-from twin.study.geometry import Face, border_towards, borders_on_sheet, directions, faces, frame, to_plane, traced
+from twin.study.geometry import FlatWindow, Lens, directions_of, traced
 from twin.study.parameters import Parameters, parameters_of
 from twin.study.report.tables import number_text
 from uwlts.errors import DesignError
 from uwlts.placement import LaserPose, laser_pose
-from uwlts.sensor import Medium, Sensor, Window
+from uwlts.report.page_toolkit import INK, SOFT, new_figure
+from uwlts.sensor import Camera, Medium, Sensor, Window
 
 _BEYOND = 1.06
 """Rays and sheet are drawn so much farther than the volume's far end."""
 _DEPTHS, _PLACES = 201, 21
-_HOUSING_MM, _WALL_MM = 42.0, 5.0
+"""Points at which the part of the volume is sought that camera and laser reach: depths, and places along the stripe."""
+_BORDER = 41
+"""Pixels along each side of the image."""
+_HOUSING_MM, _WALL_MM, _BARE_FRONT_MM, _BARE_HALF_MM = 42.0, 5.0, 12.0, 15.0
+"""The description does not contain the housing: its depth, its wall, and its size where there is no window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +130,20 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     pose, p = laser_pose(sensor), parameters_of([sensor], [medium])
     outer = float(p.outer_mm(np).item())
     _require_crossing(pose, outer)
-    rotation = frame(pose.axis, pose.normal)
-    camera_faces = faces(sensor, sensor.camera.window, medium, np.zeros(3), np.eye(3))
-    laser_faces = faces(sensor, sensor.laser.window, medium, pose.origin_mm, rotation)
+    # Camera and laser are modules of one kind: a frame with z along the axis, and perhaps a window.
+    along = np.cross(pose.axis, pose.normal)
+    camera = _mounted(sensor, sensor.camera.window, medium, np.zeros(3), np.eye(3))
+    laser = _mounted(sensor, sensor.laser.window, medium, pose.origin_mm,
+                     np.stack([pose.normal, along, pose.axis], axis=1))  # fmt: skip
     far = _on_sheet(pose, np.array([outer + sensor.volume.far_mm]))[0]
     end = pose.origin_mm + _BEYOND * ((far - pose.origin_mm) @ pose.axis) * pose.axis
     middle, low, high = 0.0, p.lit_from_rad.item(), p.lit_to_rad.item()
     fan = np.stack([math.cos(a) * pose.axis + math.sin(a) * pose.fan for a in (middle, low, high)])
-    sheet_rays = to_plane(*traced(pose.origin_mm, fan, laser_faces), end, pose.axis)
+    sheet_rays = laser.rays(fan, end, pose.axis)
     reach = _reach(sensor, p, pose, outer)
     return (
-        _side_view(sensor, pose, camera_faces, laser_faces, sheet_rays[0], reach),
-        _front_view(sensor, pose, camera_faces, laser_faces, sheet_rays[1:], reach),
+        _side_view(sensor, pose, camera, laser, sheet_rays[0], reach),
+        _front_view(sensor, pose, camera, laser, sheet_rays[1:], reach),
     )
 
 
@@ -153,18 +160,18 @@ def _require_crossing(pose: LaserPose, outer: float) -> None:
 
 
 def _side_view(
-    sensor: Sensor, pose: LaserPose, camera_faces: list[Face], laser_faces: list[Face], axis: np.ndarray, reach: _Reach
+    sensor: Sensor, pose: LaserPose, camera: _Mounted, laser: _Mounted, axis: np.ndarray, reach: _Reach
 ) -> SideView:
-    camera, axes = sensor.camera, _side_axes(pose)
+    axes = _side_axes(pose)
     near, far = reach.depths_mm[[0, -1]]
-    edges = directions(camera, border_towards(camera, axes[0, :2]))
+    edges = directions_of(_lens(sensor.camera), _border_towards(sensor.camera, axes[0, :2]))
     ahead = np.array([0.0, 0.0, 1.0])
-    rays = to_plane(*traced(np.zeros(3), edges, camera_faces), far * _BEYOND * ahead, ahead)
+    rays = camera.rays(edges, far * _BEYOND * ahead, ahead)
     seen = reach.depths_mm[np.isfinite(reach.low_mm)]
     return SideView(
-        camera=_module_of(camera.window, camera_faces, np.zeros(3), ahead, axes),
-        laser=_module_of(sensor.laser.window, laser_faces, pose.origin_mm, pose.axis, axes),
-        pupil_mm=camera.focal_length_mm / camera.f_number, baseline_mm=math.hypot(*pose.origin_mm[:2]),
+        camera=camera.seen_along(axes, 0.0),
+        laser=laser.seen_along(axes, 0.0),
+        pupil_mm=sensor.camera.focal_length_mm / sensor.camera.f_number, baseline_mm=math.hypot(*pose.origin_mm[:2]),
         edges=tuple(rays @ axes.T), sheet=axis @ axes.T, volume=_on_sheet(pose, np.array([near, far])) @ axes.T,
         in_view=_on_sheet(pose, seen[[0, -1]]) @ axes.T if len(seen) else None,
         crossing=np.array([0.0, _crossing_mm(pose)]), outer_mm=float(near - sensor.volume.near_mm),
@@ -174,17 +181,19 @@ def _side_view(
 
 
 def _front_view(
-    sensor: Sensor, pose: LaserPose, camera_faces: list[Face], laser_faces: list[Face], edges: np.ndarray, reach: _Reach
+    sensor: Sensor, pose: LaserPose, camera: _Mounted, laser: _Mounted, edges: np.ndarray, reach: _Reach
 ) -> FrontView:
     axes = np.stack([pose.fan, pose.axis])
     heights, shown = ((_on_sheet(pose, d) - pose.origin_mm) @ pose.axis for d in (reach.depths_mm, reach.shown_mm))
     reached = np.isfinite(reach.low_mm)
     low, high = (np.stack([y, heights], axis=1)[reached] for y in (reach.low_mm, reach.high_mm))
     return FrontView(
-        laser=_module_of(sensor.laser.window, laser_faces, pose.origin_mm, pose.axis, axes, about=pose.origin_mm),
+        laser=laser.seen_along(axes, pose.origin_mm),
         fan=tuple((edges - pose.origin_mm) @ axes.T),
         borders=tuple(
-            (points - pose.origin_mm) @ axes.T for points in borders_on_sheet(sensor.camera, camera_faces, pose)
+            (camera.rays(directions_of(_lens(sensor.camera), side), pose.origin_mm, pose.normal)[:, -1]
+             - pose.origin_mm) @ axes.T
+            for side in _image_sides(sensor.camera)
         ),
         lines=np.stack([reach.line_mm, np.repeat(shown[:, None], 2, axis=1)], axis=2),
         region=np.concatenate([low, high[::-1]]),
@@ -248,31 +257,81 @@ def _reach(sensor: Sensor, p: Parameters, pose: LaserPose, outer: float) -> _Rea
     )
 
 
-# --- windows and housings ---------------------------------------------------------------------------------------------
+# --- camera and laser -------------------------------------------------------------------------------------------------
 
 
-def _module_of(
-    window: Window,
-    faces: list[Face],
-    origin: np.ndarray,
-    axis: np.ndarray,
-    axes: np.ndarray,
-    about: np.ndarray | float = 0.0,
-) -> Module:
-    """A module as seen along a direction; ``axes`` (2, 3) span the picture, whose origin is at ``about``."""
-    forward = axes @ axis / np.linalg.norm(axes @ axis)
-    sideways = np.array([forward[1], -forward[0]])
-    place = axes @ (origin - about)
-    front, half, corners = 12.0, 15.0, None
-    if faces:
-        normal = axes @ faces[0][1]
-        along = np.array([normal[1], -normal[0]]) / np.linalg.norm(normal)
-        half, front = window.aperture_diameter_mm / 2, window.distance_mm
-        inner, outer = (axes @ (face[0] - about) for face in faces)
-        corners = np.array([inner - half * along, inner + half * along, outer + half * along, outer - half * along])
-    side, back = (half + _WALL_MM) * sideways, _HOUSING_MM * forward
-    head = place + front * forward
-    return Module(place, corners, np.array([place - back - side, place - back + side, head + side, head - side]))
+@dataclass(frozen=True, eq=False)
+class _Mounted:
+    """A module: its origin and axis in the camera frame, and its window with the opening's diameter, None without."""
+
+    origin: np.ndarray
+    axis: np.ndarray
+    window: FlatWindow | None
+    aperture_mm: float
+    distance_mm: float
+
+    def rays(self, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Rays (N, K, 3) from the origin through the window on to a plane; NaN for a ray that does not get there."""
+        points = np.broadcast_to(self.origin, directions.shape)[:, None]
+        if self.window is not None:
+            points, directions = traced(self.window, self.origin, directions)
+        last = points[:, -1]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            length = (place - last) @ normal / (directions @ normal)
+            end = last + np.where(length > 0, length, np.nan)[:, None] * directions
+        return np.concatenate([points, end[:, None]], axis=1)
+
+    def seen_along(self, axes: np.ndarray, about: np.ndarray | float) -> Module:
+        """The module in a picture spanned by ``axes`` (2, 3), with its origin at ``about``."""
+        forward = axes @ self.axis / np.linalg.norm(axes @ self.axis)
+        sideways = np.array([forward[1], -forward[0]])
+        place = axes @ (self.origin - about)
+        front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, None
+        if self.window is not None:
+            normal = np.array(self.window.normal)
+            seen = axes @ normal
+            along = np.array([seen[1], -seen[0]]) / np.linalg.norm(seen)
+            half, front = self.aperture_mm / 2, self.distance_mm
+            inner = self.origin + self.distance_mm * self.axis
+            inner, outer = (axes @ (face - about) for face in (inner, inner + self.window.thickness_mm * normal))
+            corners = np.array([inner - half * along, inner + half * along, outer + half * along, outer - half * along])
+        side, back = (half + _WALL_MM) * sideways, _HOUSING_MM * forward
+        head = place + front * forward
+        return Module(place, corners, np.array([place - back - side, place - back + side, head + side, head - side]))
+
+
+def _mounted(sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
+    flat, wavelength = None, sensor.laser.wavelength_nm
+    if window.mounted:
+        normal = rotation @ window.normal()
+        flat = FlatWindow(
+            (normal[0], normal[1], normal[2]), window.distance_mm * float(rotation[:, 2] @ normal),
+            window.thickness_mm, window.index(wavelength), medium.refractive_index(wavelength),
+        )  # fmt: skip
+    return _Mounted(origin, rotation[:, 2], flat, window.aperture_diameter_mm, window.distance_mm)
+
+
+def _lens(camera: Camera) -> Lens:
+    d = camera.distortion
+    return Lens(camera.focal_length_px(), *camera.principal_point(), d.k1, d.k2, d.k3, d.p1, d.p2)
+
+
+def _image_sides(camera: Camera) -> list[np.ndarray]:
+    """Pixels (N, 2) along the image's four sides."""
+    width, height = camera.width_px - 0.5, camera.height_px - 0.5
+    corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
+    share = np.linspace(0, 1, _BORDER)[:, None]
+    return [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+
+
+def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
+    """Pixels (2, 2) where lines from the principal point along +-``across`` (2,) leave the image."""
+    centre = np.array(camera.principal_point())
+    least, most = np.array([-0.5, -0.5]), np.array([camera.width_px - 0.5, camera.height_px - 0.5])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = [np.where(d > 0, most - centre, least - centre) / d for d in (across, -across)]
+    lengths = [float(np.min(end[np.abs(across) > 1e-12])) for end in ends]
+    return np.stack([centre + lengths[0] * across, centre - lengths[1] * across])
 
 
 def _corners(module: Module) -> list[np.ndarray]:
@@ -284,44 +343,51 @@ def _finite(parts: list[np.ndarray]) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-_INK, _SOFT, _RED, _BLUE, _GLASS = "#2b3440", "#5c6875", "#c22f2f", "#3573b1", "#12a3a8"
+# --- the drawing ------------------------------------------------------------------------------------------------------
+
+_RED, _BLUE, _GLASS, _BEHIND, _THIN = "#c22f2f", "#3573b1", "#12a3a8", "#98a3af", "#b9c2cc"
 _WIDTH, _HEIGHT = 1080.0, 700.0
-"""Most room in px for both drawings together, without the dimensions around them."""
-_LETTER = 6.7
-_LEFT, _TOP, _RIGHT, _BOTTOM = 108.0, 64.0, 62.0, 40.0
-_FRONT_LEFT, _FRONT_RIGHT = 20.0, 150.0
+"""Most room in px for both views together, without the dimensions around them."""
+_PX_PER_INCH = 96.0
+_SIDE_MARGINS, _FRONT_MARGINS = (108.0, 72.0), (30.0, 150.0)
+"""Room in px left and right of the views."""
+_TOP, _BOTTOM = 64.0, 44.0
 _FITS = 1.7
 """A design behind the chosen one is drawn if the picture need not grow more than this for it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drawing:
-    """Two SVG elements, and whether the other design is drawn behind."""
+    """Side and front view in one figure, and whether the other design is drawn behind."""
 
-    side: Markup
-    front: Markup
+    figure: Figure
     with_other: bool
 
 
 def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> Drawing:
-    """Draw a design's views, another design dashed behind them where it fits."""
-    with_other = other is not None and _fits(side, other[0]) and _fits(front, other[1])
-    sides = [side, other[0]] if with_other else [side]
-    fronts = [front, other[1]] if with_other else [front]
-    low, size = _box(np.concatenate([view.points() for view in sides]))
-    front_low, front_size = _box(np.concatenate([view.points() for view in fronts]))
-    room = _WIDTH - _LEFT - _RIGHT - _FRONT_LEFT - _FRONT_RIGHT
-    scale = min(room / (size[0] + front_size[0]), _HEIGHT / max(size[1], front_size[1]))
-    height = _TOP + scale * max(size[1], front_size[1]) + _BOTTOM
-    sheets = [
-        _Sheet(low, scale, (_LEFT, _TOP), _LEFT + scale * size[0] + _RIGHT, height),
-        _Sheet(front_low, scale, (_FRONT_LEFT, _TOP), _FRONT_LEFT + scale * front_size[0] + _FRONT_RIGHT, height),
-    ]
-    return Drawing(
-        side=_drawn_side(sheets[0], side, other[0] if with_other else None),
-        front=_drawn_front(sheets[1], front, other[1] if with_other else None),
-        with_other=with_other,
-    )
+    """Draw a design's views at one scale, another design dashed behind them where it fits."""
+    behind = other if other is not None and _fits(side, other[0]) and _fits(front, other[1]) else None
+    sides, fronts = ([side], [front]) if behind is None else ([side, behind[0]], [front, behind[1]])
+    boxes = [_box(np.concatenate([view.points() for view in views])) for views in (sides, fronts)]
+    (_, size), (_, front_size) = boxes
+    margins = sum(_SIDE_MARGINS) + sum(_FRONT_MARGINS)
+    tall = max(size[1], front_size[1])
+    scale = min((_WIDTH - margins) / (size[0] + front_size[0]), _HEIGHT / tall)
+    width, height = margins + scale * (size[0] + front_size[0]), _TOP + scale * tall + _BOTTOM
+    figure, views = new_figure(width / _PX_PER_INCH, height / _PX_PER_INCH, columns=2)
+    figure.set_layout_engine("none")
+    start = 0.0
+    for axes, (low, extent), (left, right) in zip(views, boxes, (_SIDE_MARGINS, _FRONT_MARGINS), strict=True):
+        room = left + scale * extent[0] + right
+        axes.set_position((start / width, 0.0, room / width, 1.0))
+        axes.set_xlim(low[0] - left / scale, low[0] + (room - left) / scale)
+        axes.set_ylim(low[1] + (height - _TOP) / scale, low[1] - _TOP / scale)
+        axes.axis("off")
+        start += room
+    px = 1 / scale
+    _draw_side(views[0], side, None if behind is None else behind[0], low=boxes[0][0], high=sum(boxes[0]), px=px)
+    _draw_front(views[1], front, None if behind is None else behind[1], right=float(sum(boxes[1])[0]), px=px)
+    return Drawing(figure, behind is not None)
 
 
 def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -334,223 +400,138 @@ def _fits(view: SideView | FrontView, other: SideView | FrontView) -> bool:
     return bool((both <= _FITS * own.max()).all())
 
 
-@dataclass(frozen=True, eq=False)
-class _Sheet:
-    """Paper of a view: what is left and on top in mm, px per mm, where that is in px, and the paper's size in px."""
-
-    low: np.ndarray
-    scale: float
-    start: tuple[float, float]
-    width: float
-    height: float
-
-    def at(self, points: np.ndarray) -> np.ndarray:
-        """Points in mm as px."""
-        return self.start + self.scale * (np.asarray(points) - self.low)
-
-    def line(self, points: np.ndarray, colour: str, width: float, *, dash: str = "", fill: str = "none") -> str:
-        """A polyline in as many pieces as NaN leave, closed where it is filled."""
-        places = self.at(points)
-        known = np.isfinite(places).all(axis=1)
-        pieces = np.split(places, np.flatnonzero(np.diff(known.astype(int))) + 1)
-        path = " ".join(
-            "M" + " L".join(f"{x:.1f} {y:.1f}" for x, y in piece) + ("" if fill == "none" else " Z")
-            for piece in pieces
-            if len(piece) and np.isfinite(piece).all()
-        )
-        dashed = f' stroke-dasharray="{dash}"' if dash else ""
-        return f'<path d="{path}" fill="{fill}" stroke="{colour}" stroke-width="{width}"{dashed}/>' if path else ""
-
-    def page(self, parts: Sequence[str], title: str) -> Markup:
-        """The SVG element."""
-        size = f"{self.width:.0f} {self.height:.0f}"
-        head = f'viewBox="0 0 {size}" width="{self.width:.0f}" height="{self.height:.0f}" role="img" font-size="12.5"'
-        body = "\n".join(part for part in parts if part)
-        return Markup(f'<svg {head} fill="{_INK}"><title>{escape(title)}</title>\n{body}</svg>')
-
-
-# --- the side view ----------------------------------------------------------------------------------------------------
-
-
-def _drawn_side(sheet: _Sheet, view: SideView, other: SideView | None) -> Markup:
-    left, right = _LEFT - 4, sheet.width - _RIGHT + 4
-    near, far = (sheet.at((0, depth))[1] for depth in (view.near_mm, view.far_mm))
-    cone = np.concatenate([view.edges[0], view.edges[1][::-1]])
-    parts = [_box_of(left, near, right, far, "#f1ecd9")]
+def _draw_side(
+    axes: Axes, view: SideView, other: SideView | None, *, low: np.ndarray, high: np.ndarray, px: float
+) -> None:
+    """Draw the side view into the box from ``low`` to ``high``; ``px`` is the size of a pixel in mm."""
+    band = [low[0] - 4 * px, high[0] + 4 * px]
+    axes.fill_between(band, view.near_mm, view.far_mm, color="#f1ecd9", linewidth=0)
     if other is not None:
-        parts += _other_side(sheet, other)
-    parts += [sheet.line(cone, "none", 0, fill="#3573b118")] if np.isfinite(cone).all() else []
-    parts += [_straight((left, y), (right, y), "#bda96b", 1) for y in (near, far)]
-    parts += [_text(word, right + 4, y + 4, anchor="start") for word, y in (("near", near), ("far", far))]
-    parts += [
-        *_module(sheet, view.camera, "camera"), *_module(sheet, view.laser, "laser"),
-        sheet.line(np.array([(0.0, 0.0), (0.0, 1.06 * view.far_mm)]), _SOFT, 1, dash="10 3 2 3"),
-        *(sheet.line(edge, _BLUE, 1.2) for edge in view.edges),
-        sheet.line(view.sheet, _RED, 1.3),
-        sheet.line(view.volume, _RED, 2.2, dash="3 3"),
-        sheet.line(view.in_view, _RED, 4.5) if view.in_view is not None else "",
-        sheet.line(np.array([(-0.5, 0.0), (0.5, 0.0)]) * view.pupil_mm, _INK, 3.5),
-        *_dots(sheet, [view.laser.origin, view.crossing]),
-    ]  # fmt: skip
-    parts += _angle(sheet, view)
-    parts += _depths(sheet, view)
-    parts += _baseline(sheet, view)
-    parts += _scale_bar(sheet)
-    return sheet.page(parts, f"Side view, baseline {number_text(view.baseline_mm)} mm")
-
-
-def _other_side(sheet: _Sheet, view: SideView) -> list[str]:
-    outlines = [np.vstack([m.housing, m.housing[:1]]) for m in (view.camera, view.laser)]
-    lines = [*view.edges, view.sheet, *outlines]
-    return [sheet.line(line, "#98a3af", 1, dash="5 4") for line in lines] + [
-        sheet.line(view.volume, "#98a3af", 2.4, dash="5 4")
-    ]
-
-
-def _module(sheet: _Sheet, module: Module, name: str) -> list[str]:
-    """Housing, window and name, which stands at the housing's back."""
-    parts = [sheet.line(module.housing, "#aab4c0", 1, fill="#e6eaef88")]
-    if module.window is not None:
-        parts.append(sheet.line(module.window, _GLASS, 1, fill="#12a3a855"))
-    back = sheet.at(module.housing[:2].mean(axis=0))
-    ahead = sheet.at(module.housing[2:].mean(axis=0)) - back
-    place = back + 15 * ahead / max(np.hypot(*ahead), 1e-9)
-    turned = math.degrees(math.atan2(ahead[1], ahead[0])) - 90
-    return [*parts, _text(name, *place, turned=turned)]
-
-
-def _angle(sheet: _Sheet, view: SideView) -> list[str]:
-    """An arc between the camera's axis and the sheet, above their crossing."""
-    at, angle = sheet.at(view.crossing), view.angle_rad
-    radius = min(74.0, 0.6 * float(at[1] - sheet.at((0, view.outer_mm))[1]))
-    towards = math.copysign(1.0, float(view.sheet[0, 0] - view.sheet[-1, 0]))
-    end = at + radius * np.array([towards * math.sin(angle), -math.cos(angle)])
-    start = at - (0, radius)
-    place, anchor = at + (radius - 16) * np.array([towards * math.sin(angle / 2), -math.cos(angle / 2)]), "middle"
-    if 2 * math.sin(angle / 2) * (radius - 16) < 40:
-        place, anchor = end + (towards * 8, 0.0), "start" if towards > 0 else "end"
-    sweep = 1 if towards > 0 else 0
-    arc = f"M{start[0]:.1f} {start[1]:.1f} A{radius:.1f} {radius:.1f} 0 0 {sweep} {end[0]:.1f} {end[1]:.1f}"
-    return [
-        f'<path d="{arc}" fill="none" stroke="{_INK}" stroke-width="1"/>',
-        _text(f"{number_text(math.degrees(angle), 3)}°", place[0], place[1] + 4, anchor=anchor, halo=True),
-    ]
-
-
-def _depths(sheet: _Sheet, view: SideView) -> list[str]:
-    """Dimensions on the left: the volume's near end and depth in a chain, and the stand-off."""
-    levels = {
-        name: float(sheet.at((0, depth))[1])
-        for name, depth in (("outer", view.outer_mm), ("near", view.near_mm), ("far", view.far_mm),
-                            ("crossing", view.crossing[1]))
-    }  # fmt: skip
-    standoff = view.crossing[1] - view.outer_mm
-    inner, outer = _LEFT - 22, _LEFT - 66
-    edge = sheet.at((0, 0))[0]
-    parts = [
-        _straight((outer - 4, levels["outer"]), (edge, levels["outer"]), "#b9c2cc", 0.8),
-        _straight((outer - 4, levels["crossing"]), (edge, levels["crossing"]), "#b9c2cc", 0.8),
-    ]
-    parts += _vertical(inner, levels["outer"], levels["near"], f"near {number_text(view.near_mm - view.outer_mm)}")
-    parts += _vertical(inner, levels["near"], levels["far"], f"volume {number_text(view.far_mm - view.near_mm)}")
-    parts += _vertical(outer, levels["outer"], levels["crossing"], f"stand-off {number_text(standoff)}")
-    return parts
-
-
-def _vertical(x: float, top: float, bottom: float, words: str) -> list[str]:
-    """A vertical dimension; its words stand along it, beside its end where it is too short."""
-    parts = [_straight((x, top), (x, bottom), _INK, 1), *_ticks(x, top), *_ticks(x, bottom)]
-    middle, length = (top + bottom) / 2, abs(bottom - top)
-    if length > _LETTER * len(words) + 6:
-        return [*parts, _text(words, x - 6, middle, turned=-90, halo=True)]
-    return [*parts, _text(words, x + 6, middle + 4, anchor="start", halo=True)]
-
-
-def _baseline(sheet: _Sheet, view: SideView) -> list[str]:
-    """The baseline, and what is seen of it where it does not run square to the sheet."""
-    y, shown = 22.0, float(view.laser.origin[0])
-    ends = [sheet.at((0.0, 0.0)), sheet.at(view.laser.origin)]
-    parts = [_straight((end[0], y - 4), (end[0], end[1]), "#b9c2cc", 0.8) for end in ends]
-    parts += [_straight((ends[0][0], y), (ends[1][0], y), _INK, 1)]
-    parts += [mark for end in ends for mark in _ticks(end[0], y)]
+        _draw_behind(axes, [*other.edges, other.sheet, _closed(other.camera), _closed(other.laser), other.volume])
+    cone = np.concatenate([view.edges[0], view.edges[1][::-1]])
+    if np.isfinite(cone).all():
+        axes.fill(*cone.T, color=_BLUE, alpha=0.1, linewidth=0)
+    for depth, name in ((view.near_mm, "near"), (view.far_mm, "far")):
+        axes.plot(band, [depth, depth], color="#bda96b", linewidth=0.8)
+        axes.text(high[0] + 8 * px, depth, name, va="center")
+    _draw_module(axes, view.camera, "camera", px)
+    _draw_module(axes, view.laser, "laser", px)
+    axes.plot([0, 0], [0, _BEYOND * view.far_mm], color=SOFT, linewidth=0.8, linestyle="-.")
+    for edge in view.edges:
+        axes.plot(*edge.T, color=_BLUE, linewidth=0.9)
+    axes.plot(*view.sheet.T, color=_RED, linewidth=1.0)
+    axes.plot(*view.volume.T, color=_RED, linewidth=1.8, linestyle=":")
+    if view.in_view is not None:
+        axes.plot(*view.in_view.T, color=_RED, linewidth=3.4)
+    axes.plot([-view.pupil_mm / 2, view.pupil_mm / 2], [0, 0], color=INK, linewidth=2.6)
+    axes.plot(*np.stack([view.laser.origin, view.crossing]).T, "o", color=INK, markersize=4.5)
+    _draw_angle(axes, view, px)
+    outer = view.outer_mm
+    chain, whole = low[0] - 26 * px, low[0] - 70 * px
+    for depth in (outer, view.crossing[1]):
+        axes.plot([whole, 0], [depth, depth], color=_THIN, linewidth=0.6)
+    _dimension(axes, (chain, outer), (chain, view.near_mm), f"near {number_text(view.near_mm - outer)}", px)
+    depth = number_text(view.far_mm - view.near_mm)
+    _dimension(axes, (chain, view.near_mm), (chain, view.far_mm), f"volume {depth}", px)
+    standoff = number_text(view.crossing[1] - outer)
+    _dimension(axes, (whole, outer), (whole, view.crossing[1]), f"stand-off {standoff}", px)
+    shown, top = float(view.laser.origin[0]), low[1] - 40 * px
+    for x, y in ((0.0, 0.0), view.laser.origin):
+        axes.plot([x, x], [top, y], color=_THIN, linewidth=0.6)
     words = f"baseline {number_text(view.baseline_mm)} mm"
     if abs(view.baseline_mm - shown) > 1e-3 * view.baseline_mm:
+        # The baseline does not run square to the sheet.
         words = f"{number_text(shown)} mm of the {words}"
-    if abs(ends[1][0] - ends[0][0]) > _LETTER * len(words):
-        return [*parts, _text(words, (ends[0][0] + ends[1][0]) / 2, y - 6)]
-    return [*parts, _text(words, max(ends[0][0], ends[1][0]) + 8, y + 4, anchor="start")]
-
-
-def _scale_bar(sheet: _Sheet) -> list[str]:
-    """A bar of a round length of about a fifth of the picture."""
-    wanted = 0.2 * (sheet.width - _LEFT) / sheet.scale
+    _dimension(axes, (0.0, top), (shown, top), words, px)
+    # A bar of a round length of about a fifth of the picture.
+    wanted = 0.2 * (high[0] - low[0])
     decade = 10.0 ** math.floor(math.log10(wanted))
     length = max(step * decade for step in (1, 2, 5) if step * decade <= wanted)
-    x, y = _LEFT, sheet.height - 16
-    end = x + sheet.scale * length
-    marks = [*_ticks(x, y), *_ticks(end, y)]
-    words = _text(f"{number_text(length)} mm", end + 8, y + 4, anchor="start")
-    return [_straight((x, y), (end, y), _INK, 1.6), *marks, words]
+    bottom = axes.get_ylim()[0] - 16 * px
+    _dimension(axes, (low[0], bottom), (low[0] + length, bottom), "", px)
+    axes.text(low[0] + length + 8 * px, bottom, f"{number_text(length)} mm", va="center")
 
 
-# --- the front view ---------------------------------------------------------------------------------------------------
-
-
-def _drawn_front(sheet: _Sheet, view: FrontView, other: FrontView | None) -> Markup:
-    room = f'width="{sheet.width - _FRONT_RIGHT + 8:.0f}" height="{sheet.height:.0f}"'
-    clip = f'<clipPath id="front-view"><rect {room}/></clipPath>'
-    end = max(edge[-1, 1] for edge in view.fan)
-    borders = [np.where(border[:, 1:] <= end, border, np.nan) for border in view.borders]
-    fan = np.concatenate([view.fan[0], view.fan[1][::-1]])
-    parts = [clip]
+def _draw_front(axes: Axes, view: FrontView, other: FrontView | None, *, right: float, px: float) -> None:
     if other is not None:
-        outline = np.vstack([other.laser.housing, other.laser.housing[:1]])
-        lines = [*other.fan, *other.lines, outline]
-        parts += [sheet.line(line, "#98a3af", 1, dash="5 4") for line in lines]
-    parts += [sheet.line(fan, "none", 0, fill="#c22f2f10")] if np.isfinite(fan).all() else []
-    parts += [sheet.line(view.region, "none", 0, fill="#c22f2f2e")] if len(view.region) else []
-    parts += _module(sheet, view.laser, "laser")
-    parts += [sheet.line(edge, _RED, 1.1) for edge in view.fan]
-    parts += ['<g clip-path="url(#front-view)">', *(sheet.line(border, _BLUE, 1.2) for border in borders), "</g>"]
-    parts += _dots(sheet, [view.laser.origin])
-    right = sheet.width - _FRONT_RIGHT
+        _draw_behind(axes, [*other.fan, *other.lines, _closed(other.laser)])
+    fan = np.concatenate([view.fan[0], view.fan[1][::-1]])
+    if np.isfinite(fan).all():
+        axes.fill(*fan.T, color=_RED, alpha=0.06, linewidth=0)
+    if len(view.region):
+        axes.fill(*view.region.T, color=_RED, alpha=0.18, linewidth=0)
+    _draw_module(axes, view.laser, "laser", px)
+    for edge in view.fan:
+        axes.plot(*edge.T, color=_RED, linewidth=0.9)
+    end = max(edge[-1, 1] for edge in view.fan)
+    for border in view.borders:
+        shown = np.where((border[:, 1:] <= end) & (border[:, :1] <= right + 8 * px), border, np.nan)
+        axes.plot(*shown.T, color=_BLUE, linewidth=0.9)
+    axes.plot(*view.laser.origin, "o", color=INK, markersize=4.5)
     for word, line in zip(("near", "middle", "far"), view.lines, strict=True):
         if not np.isfinite(line).all():
             continue
-        parts.append(sheet.line(line, _RED, 3.5))
-        end, length = sheet.at(line).max(axis=0), float(np.ptp(line[:, 0]))
-        parts.append(_straight((end[0] + 4, end[1]), (right + 8, end[1]), "#b9c2cc", 0.8))
-        parts.append(_text(f"{word} {number_text(length)} mm", right + 12, end[1] + 4, anchor="start"))
-    return sheet.page(parts, "Front view, onto the sheet")
+        axes.plot(*line.T, color=_RED, linewidth=2.8)
+        x, y = line.max(axis=0)
+        axes.plot([x, right + 8 * px], [y, y], color=_THIN, linewidth=0.6)
+        axes.text(right + 12 * px, y, f"{word} {number_text(float(np.ptp(line[:, 0])))} mm", va="center")
 
 
-# --- SVG --------------------------------------------------------------------------------------------------------------
+def _draw_behind(axes: Axes, lines: list[np.ndarray]) -> None:
+    for line in lines:
+        axes.plot(*line.T, color=_BEHIND, linewidth=0.8, linestyle="--")
 
 
-def _dots(sheet: _Sheet, points: Sequence[np.ndarray]) -> list[str]:
-    places = [sheet.at(point) for point in points]
-    return [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.4" fill="{_INK}"/>' for x, y in places]
+def _closed(module: Module) -> np.ndarray:
+    return np.vstack([module.housing, module.housing[:1]])
 
 
-def _ticks(x: float, y: float) -> list[str]:
-    """The oblique stroke that ends a dimension."""
-    return [_straight((x - 4, y + 4), (x + 4, y - 4), _INK, 1.3)]
+def _draw_module(axes: Axes, module: Module, name: str, px: float) -> None:
+    """Housing, window and name, which stands at the housing's back."""
+    axes.fill(*module.housing.T, facecolor="#e6eaef", edgecolor="#aab4c0", alpha=0.6, linewidth=0.8)
+    if module.window is not None:
+        axes.fill(*module.window.T, facecolor=_GLASS, edgecolor=_GLASS, alpha=0.4, linewidth=0.8)
+    back = module.housing[:2].mean(axis=0)
+    ahead = module.housing[2:].mean(axis=0) - back
+    x, y = back + 10 * px * ahead / max(np.hypot(*ahead), 1e-9)
+    turned = 90 - math.degrees(math.atan2(ahead[1], ahead[0]))
+    axes.text(x, y, name, rotation=turned, ha="center", va="center", rotation_mode="anchor")
 
 
-def _straight(a: tuple[float, float], b: tuple[float, float], colour: str, width: float) -> str:
-    ends = f'x1="{a[0]:.1f}" y1="{a[1]:.1f}" x2="{b[0]:.1f}" y2="{b[1]:.1f}"'
-    return f'<line {ends} stroke="{colour}" stroke-width="{width}"/>'
+def _draw_angle(axes: Axes, view: SideView, px: float) -> None:
+    """An arc between the camera's axis and the sheet, above their crossing."""
+    radius = min(74.0 * px, 0.6 * float(view.crossing[1] - view.outer_mm))
+    towards = math.copysign(1.0, float(view.sheet[0, 0] - view.sheet[-1, 0]))
+
+    def at(angles: np.ndarray | float, r: float) -> np.ndarray:
+        return view.crossing + r * np.stack([towards * np.sin(angles), -np.cos(angles)], axis=-1)
+
+    axes.plot(*at(np.linspace(0, view.angle_rad, 60), radius).T, color=INK, linewidth=0.8)
+    narrow = 2 * math.sin(view.angle_rad / 2) * (radius - 16 * px) < 40 * px
+    x, y = at(view.angle_rad, radius + 8 * px) if narrow else at(view.angle_rad / 2, radius - 16 * px)
+    side = ("left" if towards > 0 else "right") if narrow else "center"
+    axes.text(x, y, f"{number_text(math.degrees(view.angle_rad), 3)}°", ha=side, va="center", bbox=_HALO)
 
 
-def _box_of(left: float, top: float, right: float, bottom: float, colour: str) -> str:
-    size = f'width="{right - left:.1f}" height="{bottom - top:.1f}"'
-    return f'<rect x="{left:.1f}" y="{top:.1f}" {size} fill="{colour}"/>'
+_HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
 
 
-def _text(
-    words: str, x: float, y: float, *,
-    anchor: str = "middle", turned: float = 0.0, colour: str = _INK, halo: bool = False,
-) -> str:  # fmt: skip
-    turn = f' transform="rotate({turned:.1f} {x:.1f} {y:.1f})"' if turned else ""
-    under = ' stroke="#fff" stroke-width="3" paint-order="stroke"' if halo else ""
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}"{turn}{under}>{escape(words)}</text>'
+def _dimension(axes: Axes, a: tuple[float, float], b: tuple[float, float], words: str, px: float) -> None:
+    """A dimension with its words along it, or beside its end where it is too short for them."""
+    axes.plot(*np.stack([a, b]).T, color=INK, linewidth=0.8)
+    for x, y in (a, b):
+        axes.plot([x - 4 * px, x + 4 * px], [y + 4 * px, y - 4 * px], color=INK, linewidth=1.0)
+    vertical = a[0] == b[0]
+    fits = math.dist(a, b) > (_LETTER_PX * len(words) + 6) * px
+    (x, y), turned = np.mean([a, b], axis=0), 90.0 if vertical and fits else 0.0
+    if fits:
+        x, y = (x - 9 * px, y) if vertical else (x, y - 9 * px)
+    else:
+        x, y = (x + 6 * px, y) if vertical else (max(a[0], b[0]) + 8 * px, y)
+    axes.text(
+        x, y, words, rotation=turned, ha="center" if fits else "left", va="center", bbox=_HALO if vertical else None
+    )
+
+
+_LETTER_PX = 6.7
+"""Mean width of a letter."""

@@ -1,24 +1,19 @@
-"""The page of a study: what was asked, and which design to build; one HTML file that asks nothing of the network."""
+"""Page of a study: what was asked, and which design to build; one HTML file that loads nothing from the network."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.resources import files
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from jinja2 import Environment
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 import uwlts
 from twin.study.description import Study
-from twin.study.designs import Marked
+from twin.study.designs import Columns, Marked
 from twin.study.report.charts import (
-    Drawn,
+    Interactive,
     Point,
+    Static,
     bars,
     contours,
     curves,
@@ -26,22 +21,23 @@ from twin.study.report.charts import (
     pareto_chart,
     verification_chart,
 )
-from twin.study.report.drawing import Drawing, draw, views_of
+from twin.study.report.drawing import draw, views_of
 from twin.study.report.tables import (
     Judged,
-    Tile,
-    agreement,
+    agreement_rows,
+    agreement_text,
     introduction,
     label_of,
     tiles,
     value_text,
-    verification_rows,
     words_of,
 )
+from twin.study.verification import Agreement
 from uwlts.errors import UwltsError
-from uwlts.files import written_aside
+from uwlts.report.page_toolkit import FigureCollector, InteractiveFigure, render_page, svg_of, write_page
 
 _BEST = 20
+"""Designs in the table of the best."""
 _DRAWN = (
     "Lengths in mm, both views at one scale. Left: along the sheet; the camera's view in blue, the sheet in red, thick "
     "where the camera sees it within the measuring volume (tinted). Right: onto the sheet; the laser's fan, the "
@@ -50,13 +46,13 @@ _DRAWN = (
 )
 
 
-def write_page(
+def write_study_page(
     path: Path,
     study: Study,
-    columns: Mapping[str, np.ndarray],
+    columns: Columns,
     *,
     marked: Sequence[Marked],
-    verified: Sequence[Mapping[str, Any]],
+    agreements: Sequence[Agreement],
     notes: Sequence[str] = (),
 ) -> None:
     """Write the page of a study, whole or not at all, replacing an older one.
@@ -68,11 +64,11 @@ def write_page(
     study
         The study.
     columns
-        All judged designs, as `twin.study.results.read_parts` gives them; empty where there are none.
+        All judged designs, as `twin.study.screening.read_parts` gives them; empty where there are none.
     marked
         Designs to point out, the chosen one last.
-    verified
-        Rows of what was rendered, as `twin.study.agreement.verified` gives them.
+    agreements
+        What was rendered.
     notes
         Sentences for the page's head.
 
@@ -83,89 +79,58 @@ def write_page(
     OutputError
         The file cannot be written.
     """
-    text = page_text(study, columns, marked=marked, verified=verified, notes=notes)
-    with written_aside(path, overwrite=True) as aside:
-        aside.write_text(text, encoding="utf-8", errors="replace")
+    write_page(path, page_text(study, columns, marked=marked, agreements=agreements, notes=notes), overwrite=True)
 
 
 def page_text(
     study: Study,
-    columns: Mapping[str, np.ndarray],
+    columns: Columns,
     *,
     marked: Sequence[Marked],
-    verified: Sequence[Mapping[str, Any]],
+    agreements: Sequence[Agreement],
     notes: Sequence[str] = (),
 ) -> str:
-    """The page as text; arguments and errors as `write_page`."""
-    judged, collected = Judged(study, columns), _Figures()
-    points = [Point(one.label, one.row, number, one is marked[-1]) for number, one in enumerate(marked)]
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string(
-        files("twin.study.report").joinpath("template.html.j2").read_text(encoding="utf-8")
-    )
-    return template.render(
+    """The page as text; arguments and errors as `write_study_page`."""
+    judged, collected = Judged(study, columns), FigureCollector()
+    points = [Point(one.label, one.design.table(), number, one is marked[-1]) for number, one in enumerate(marked)]
+    chosen = None
+    if marked:
+        compared = None if len(marked) == 1 else (marked[0].label, marked[0].design.table())
+        chosen = tiles(study, marked[-1].sensor, marked[-1].design.table(), compared=compared)
+    return render_page(
+        "twin.study.report",
+        "template.html.j2",
+        interactive=collected,
         title=study.title,
         introduction=introduction(judged),
         notes=list(notes),
-        chosen=_chosen(study, marked),
+        label=marked[-1].label if marked else "",
+        chosen=chosen,
         drawing=_drawing(study, marked),
-        over_free=collected.add(_over_what_is_free(judged, points)),
+        over_free=_shown(_over_what_is_free(judged, points)),
         over_free_title=_over_free_title(study),
-        pareto=collected.add(pareto_chart(judged, points)),
-        parallel=collected.add(parallel_chart(judged)),
+        pareto=_interactive(collected, pareto_chart(judged, points)),
+        parallel=_interactive(collected, parallel_chart(judged)),
         nothing=_nothing(judged),
-        verified=verification_rows(verified),
-        verdicts=[(row, agreement(study, row), collected.add(verification_chart(row))) for row in verified],
+        rendered=agreement_rows(agreements),
+        verdicts=[(found, agreement_text(study, found), _shown(verification_chart(found))) for found in agreements],
         best=_best(judged),
-        failures=judged.failure_counts(),
-        misses=judged.miss_counts() if len(judged) else [],
+        failures=[(name, f"{count:,}") for name, count in judged.failure_counts()],
+        misses=[(name, f"{count:,}") for name, count in judged.miss_counts()] if len(judged) else [],
         working=int(judged.works.sum()),
         version=uwlts.__version__,
-        figures=collected.scripts,
-        plotly=Markup(get_plotlyjs().replace("</script", "<\\/script")),
     )
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """A figure's place in the page."""
-
-    number: int
-    caption: str
-    height: int
+def _interactive(collected: FigureCollector, drawn: Interactive | None) -> InteractiveFigure | None:
+    return None if drawn is None else collected.add(drawn.figure, drawn.caption)
 
 
-class _Figures:
-    """Hands out numbers to figures and keeps their JSON for the end of the page."""
-
-    def __init__(self) -> None:
-        self.scripts: list[Markup] = []
-
-    def add(self, drawn: Drawn | None) -> _Shown | None:
-        if drawn is None:
-            return None
-        # Within a script element nothing is escaped, and nothing may look like its end.
-        self.scripts.append(Markup(drawn.figure.to_json(validate=False).replace("<", "\\u003c")))
-        return _Shown(len(self.scripts) - 1, drawn.caption, int(drawn.figure.layout.height))
+def _shown(drawn: Static | None) -> tuple[Markup, str] | None:
+    return None if drawn is None else (svg_of(drawn.figure), drawn.caption)
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """The chosen design's head: what it is called, and its tiles."""
-
-    label: str
-    tiles: list[Tile]
-
-
-def _chosen(study: Study, marked: Sequence[Marked]) -> _Chosen | None:
-    if not marked:
-        return None
-    chosen, base = marked[-1], marked[0]
-    compared = None if base is chosen else (base.label, base.row)
-    return _Chosen(chosen.label, tiles(study, chosen.sensor, chosen.row, compared=compared))
-
-
-def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Drawing | None, str]:
+def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str]:
     """The chosen design's drawing and what it shows, or why there is none."""
     if not marked:
         return None, "There is no design to draw."
@@ -182,10 +147,10 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Drawing | None, st
             other = None
     drawing = draw(*views, other)
     behind = f" Dashed grey behind: {base.label}." if drawing.with_other else ""
-    return drawing, _DRAWN + behind
+    return svg_of(drawing.figure), _DRAWN + behind
 
 
-def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> Drawn | None:
+def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> Static | None:
     """The chart that suits what is free; None where no design works."""
     if not judged.works.any():
         return None

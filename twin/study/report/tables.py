@@ -8,14 +8,15 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from twin.study.choice import pareto
-from twin.study.description import Objective, Study, Variable
+from twin.study.description import Objective, Study, Value, Variable
 from twin.study.figures import CLASS_NAMES
+from twin.study.verification import Agreement
 from uwlts.errors import EvaluationError
+from uwlts.report.page_toolkit import Tile
 from uwlts.sensor import Sensor
 
 MISSING = "\N{EN DASH}"
@@ -91,7 +92,7 @@ def label_of(name: str) -> str:
     return f"{words} ({unit})" if unit else words
 
 
-def number_text(value: Any, digits: int = 4) -> str:
+def number_text(value: float | None, digits: int = 4) -> str:
     """A number with some significant digits and a proper minus sign; a dash for what is missing or not finite."""
     if value is None or not math.isfinite(value):
         return MISSING
@@ -105,7 +106,7 @@ def number_text(value: Any, digits: int = 4) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def value_text(name: str, value: Any, *, unit: bool = True) -> str:
+def value_text(name: str, value: Value | np.generic | None, *, unit: bool = True) -> str:
     """A value of a figure or of something free, with its unit."""
     if isinstance(value, np.generic):
         value = value.item()
@@ -238,12 +239,12 @@ def bound_text(name: str, sign: int, bound: float) -> str:
     return f"{words_of(name)} {'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
 
 
-def misses(study: Study, row: Mapping[str, Any]) -> list[str]:
+def misses(study: Study, row: Mapping[str, Value]) -> list[str]:
     """Which constraints a design misses, in words."""
     found = []
     for name, sign, bound in bounds_of(study):
-        value = row.get(name)
-        if value is not None and sign * (value - bound) > 0:
+        value = _number(row, name)
+        if sign * (value - bound) > 0:
             limit = f"{'at most' if sign > 0 else 'at least'} {value_text(name, bound)} is asked"
             found.append(f"{words_of(name)} is {value_text(name, value)}, {limit}")
     return found
@@ -256,16 +257,6 @@ _CHOSEN = {
 _FOLLOW = {
     "focus": "the lens is focused on it", "waist": "the laser is focused on it", "volume": "the volume lies about it",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A number of the chosen design, and what is to be said of it."""
-
-    name: str
-    value: str
-    note: str
-    accent: bool
 
 
 def introduction(judged: Judged) -> list[tuple[str, str]]:
@@ -294,7 +285,7 @@ def _range_text(name: str, variable: Variable) -> str:
 
 
 def tiles(
-    study: Study, sensor: Sensor, row: Mapping[str, Any], *, compared: tuple[str, Mapping[str, Any]] | None
+    study: Study, sensor: Sensor, row: Mapping[str, Value], *, compared: tuple[str, Mapping[str, Value]] | None
 ) -> list[Tile]:  # fmt: skip
     """What is free, what is wanted, and what else decides, of a design; beside that of another one (label, row)."""
     missed = {text.split(" is ")[0]: text for text in misses(study, row)}
@@ -318,7 +309,7 @@ def tiles(
         *study.constraints,
     ]  # fmt: skip
     found += [tile(name) for name in dict.fromkeys(others) if name not in objectives]
-    required, used = row.get("required_ms", math.nan), row.get("exposure_ms", math.nan)
+    required, used = (_number(row, name) for name in ("required_ms", "exposure_ms"))
     darker = f"the wanted brightness takes {value_text('required_ms', required)}" if required > 1.001 * used else ""
     shown = {*objectives, *others}
     found += [tile("exposure_ms", note=darker)] if "exposure_ms" not in shown else []
@@ -326,27 +317,33 @@ def tiles(
     return found + ([_window_tile(study, sensor, row)] if "window_mm" not in objectives else [])
 
 
-def _window_tile(study: Study, sensor: Sensor, row: Mapping[str, Any]) -> Tile:
+def _number(row: Mapping[str, Value], name: str) -> float:
+    """A number of a row, NaN where it is missing."""
+    value = row.get(name)
+    return math.nan if value is None or isinstance(value, str) else value
+
+
+def _window_tile(study: Study, sensor: Sensor, row: Mapping[str, Value]) -> Tile:
     """The window's thickness and the one it needs."""
-    window, needed = sensor.camera.window, row.get("window_mm", math.nan)
+    window, needed = sensor.camera.window, _number(row, "window_mm")
     if not window.mounted:
-        return Tile("camera's window", "none", "", False)
+        return Tile("camera's window", "none")
     text = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m"
     thin = " – too thin" if needed > window.thickness_mm else ""
-    return Tile("camera's window", value_text("window_mm", window.thickness_mm), text + thin, False)
+    return Tile("camera's window", value_text("window_mm", window.thickness_mm), text + thin)
 
 
-def agreement(study: Study, row: Mapping[str, Any]) -> str:
+def agreement_text(study: Study, found: Agreement) -> str:
     """Whether formulas and rendering agree on a design, in a sentence."""
-    if row["failure"]:
-        return f"It could not be verified: {row['failure']}."
-    factor = number_text(row["ratio"], 3)
-    if row["agrees"]:
+    if found.failure:
+        return f"It could not be verified: {found.failure}."
+    factor = number_text(found.ratio, 3)
+    if found.agrees:
         return (
             f"Formulas and rendering agree: their scatters differ by a factor {factor}, up to "
             f"{number_text(study.verify_tolerance, 3)} is allowed."
         )
-    worst = _worst(row)
+    worst = _worst(found)
     if factor == MISSING or worst is None:
         return "Formulas and rendering could not be compared: rendering found no scatter at any depth."
     z, predicted, rendered = worst
@@ -357,11 +354,11 @@ def agreement(study: Study, row: Mapping[str, Any]) -> str:
     )
 
 
-def _worst(row: Mapping[str, Any]) -> tuple[float, float, float] | None:
+def _worst(found: Agreement) -> tuple[float, float, float] | None:
     """Z, predicted and rendered scatter where they differ most; None where nothing can be compared."""
     triples = [
         (z, predicted, rendered)
-        for z, predicted, rendered in zip(row["z_mm"], row["predicted_mm"], row["rendered_mm"], strict=True)
+        for z, predicted, rendered in zip(found.z_mm, found.predicted_mm, found.rendered_mm, strict=True)
         if _positive(predicted) and _positive(rendered)
     ]
     return max(triples, key=lambda one: abs(math.log(one[2] / one[1])), default=None)
@@ -371,23 +368,22 @@ def _positive(value: float | None) -> bool:
     return value is not None and math.isfinite(value) and value > 0
 
 
-def verification_rows(verified: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+def agreement_rows(agreements: Sequence[Agreement]) -> list[list[str]]:
     """Rows of the table of what was rendered."""
     rows = []
-    for row in verified:
-        errors = [abs(value) for value in row["error_mm"] if value is not None and math.isfinite(value)]
-        lines = [value for value in row["line_mm"] if value is not None and math.isfinite(value)]
-        number = row["design"]
+    for found in agreements:
+        errors = [abs(value) for value in found.error_mm if value is not None and math.isfinite(value)]
+        lines = [value for value in found.line_mm if value is not None and math.isfinite(value)]
         rows.append(
             [
-                row["label"], str(number) if number >= 0 else MISSING,
-                "failed" if row["failure"] else "agree" if row["agrees"] else "DISAGREE",
-                number_text(row["ratio"], 3),
+                found.label, str(found.design) if found.design >= 0 else MISSING,
+                "failed" if found.failure else "agree" if found.agrees else "DISAGREE",
+                number_text(found.ratio, 3),
                 number_text(1e3 * max(errors)) if errors else MISSING,
                 f"{number_text(min(lines))} to {number_text(max(lines))}" if lines else MISSING,
-                value_text("exposure_ms", row["predicted_exposure_ms"], unit=False),
-                value_text("exposure_ms", row["exposure_ms"], unit=False),
-                number_text(row["seconds"], 3),
+                value_text("exposure_ms", found.predicted_exposure_ms, unit=False),
+                value_text("exposure_ms", found.exposure_ms, unit=False),
+                number_text(found.seconds, 3),
             ]
         )  # fmt: skip
     return rows
