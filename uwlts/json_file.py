@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from uwlts.errors import CaptureError
 from uwlts.sensor import Description
@@ -44,3 +44,9 @@ def described(
         problems = error.errors()[:_MOST_PROBLEMS]
         details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
         raise CaptureError(f"{path} is not a valid {called}: {details}") from error
+
+
+def json_text(content: BaseModel | dict[str, Any] | list[Any], *, indent: int | None = None, ascii: bool = True) -> str:
+    """Text of a JSON file, of a model with the fields that were set; ValueError for numbers that are not finite."""
+    plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
+    return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from uwlts.errors import OutputError
-from uwlts.thesis.joint_comparison import summary_lines
-from uwlts.thesis.joint_page import write_joint_comparison
+from uwlts.thesis.joint_comparison import summary_lines, write_joint_comparison
 
 FIGURES = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
 

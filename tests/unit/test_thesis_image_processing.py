@@ -7,7 +7,7 @@ from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.library import load_sensor
 from uwlts.sensor import Medium
 from uwlts.stripe import FoundStripes
-from uwlts.thesis.image_processing import low_passed, thesis_stripes
+from uwlts.thesis.measurements import low_passed, thesis_stripes
 
 LINES, LENGTH = 40, 64
 

@@ -22,10 +22,9 @@ from uwlts.cloud import PointCloud, read_cloud
 from uwlts.errors import EvaluationError
 from uwlts.evaluate import judge
 from uwlts.metrology.artefact_descriptions import parse_artefact
-from uwlts.thesis.folder import ScanFile
-from uwlts.thesis.measurements import _figures, _line_length, _range_within, measure_scan
-from uwlts.thesis.methods import METHODS
-from uwlts.thesis.sphere_scan import sphere_scan
+from uwlts.thesis.campaign import ScanFile
+from uwlts.thesis.measurements import METHODS, _figures, _line_length, _range_within, measure_scan
+from uwlts.thesis.sphere_spacing import sphere_scan
 
 EXACT = nominal_calibration(SENSOR)
 

@@ -16,13 +16,11 @@ from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.library import load_sensor
 from uwlts.sensor import Medium
-from uwlts.thesis.comparison import markdown, write_comparison
-from uwlts.thesis.differences import differences, far_off
+from uwlts.thesis.campaign import CampaignFolder, campaign_folders
 from uwlts.thesis.evaluation import FORMAT, VERSION, read_results
 from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
-from uwlts.thesis.folder import CampaignFolder, campaign_folders
-from uwlts.thesis.published import load_published
-from uwlts.thesis.tables import TableRow, all_rows, headline_rows
+from uwlts.thesis.report import differences, far_off, markdown, write_comparison
+from uwlts.thesis.tables import TableRow, all_rows, headline_rows, load_published
 
 PUBLISHED = load_published()
 FILES = ("summary.json", "tables.csv", "summary.md", "report.html")

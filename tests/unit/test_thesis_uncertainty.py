@@ -29,10 +29,8 @@ from uwlts.placement import camera_from_object
 from uwlts.sensor import Medium
 from uwlts.targets import CircleTarget, circle_centre_bias
 from uwlts.thesis import monte_carlo
-from uwlts.thesis.budget import mm_per_px, spacing_budget
 from uwlts.thesis.monte_carlo import Propagated, propagate
-from uwlts.thesis.sphere_scan import SphereScan
-from uwlts.thesis.window_study import spacing_error
+from uwlts.thesis.sphere_spacing import SphereScan, mm_per_px, spacing_budget, spacing_error
 
 SENSOR = built_sensor()
 LENS = lens_of(SENSOR)

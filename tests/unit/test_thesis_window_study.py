@@ -7,9 +7,8 @@ from tests.unit.calibration_views import STEP_MM, WATER
 from tests.unit.drawn_stripes import SENSOR, SPACING_MM, STAGE_MM, sphere_profiles, step_image, write
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.errors import CaptureError
-from uwlts.thesis.folder import CampaignFolder
-from uwlts.thesis.sphere_scan import SphereScan
-from uwlts.thesis.window_study import WindowChoice, mean_spacing_error, spacing_error, window_choices
+from uwlts.thesis.campaign import CampaignFolder
+from uwlts.thesis.sphere_spacing import SphereScan, WindowChoice, mean_spacing_error, spacing_error, window_choices
 
 EXACT = nominal_calibration(SENSOR)
 DISTANCE_MM = SENSOR.camera.window.distance_mm

@@ -44,10 +44,10 @@ def thesis(
     overwrite
         Replace an existing report.
     """
-    from uwlts.thesis.comparison import markdown, write_comparison
+    from uwlts.thesis.campaign import campaign_folders
     from uwlts.thesis.evaluation import evaluate_campaign
-    from uwlts.thesis.folder import campaign_folders
-    from uwlts.thesis.published import load_published
+    from uwlts.thesis.report import markdown, write_comparison
+    from uwlts.thesis.tables import load_published
 
     if trials != 0 and trials < 20:
         raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
@@ -74,9 +74,8 @@ def thesis(
 
 def _compare_jointly(folder: Path, *, workers: int | None, again: bool, overwrite: bool) -> None:
     """Compare the joint calibration with the thesis's ways on all campaigns of a folder."""
-    from uwlts.thesis.folder import campaign_folders
-    from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines
-    from uwlts.thesis.joint_page import write_joint_comparison
+    from uwlts.thesis.campaign import campaign_folders
+    from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_comparison
 
     for name in ("report.html", "summary.json"):
         refuse_unsuitable(folder / name, overwrite=overwrite)

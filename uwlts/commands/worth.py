@@ -52,16 +52,12 @@ def models(
     """
     from contextlib import ExitStack
 
-    from uwlts.calibration.model_choice import (
-        compare_models,
-        content_of,
-        lines_of,
-        refuse_unsuitable_outputs,
-        write_models,
-    )
+    from uwlts.calibration.model_comparison.comparison import compare_models
     from uwlts.calibration.procedure import CalibrationOptions
     from uwlts.capture import Capture
     from uwlts.refraction import require_index
+    from uwlts.report.model_comparison import content_of, lines_of, write_models
+    from uwlts.report.page_toolkit import refuse_unsuitable_page
     from uwlts.stripe import StripeOptions
 
     if index is not None:
@@ -71,7 +67,7 @@ def models(
     if not (air or water):
         raise DescriptionError("nothing to compare models by: give --air or --water with captures of a target")
     if out is not None:
-        refuse_unsuitable_outputs(out, overwrite=overwrite)
+        refuse_unsuitable_page(out, example="models.html", overwrite=overwrite)
     options = CalibrationOptions(
         poses=poses, medium_index=index, stripe=StripeOptions(method=method) if method else StripeOptions()
     )

@@ -20,14 +20,10 @@ from uwlts.capture import Capture
 from uwlts.errors import CaptureError
 from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
 from uwlts.scan import reconstruct_capture
-from uwlts.thesis.budget import spacing_budget
-from uwlts.thesis.folder import MEDIA, CampaignFolder, ScanFile
-from uwlts.thesis.kept_results import keep, kept, up_to_date
-from uwlts.thesis.measurements import THESIS, Measurement, measure_scan
-from uwlts.thesis.methods import POLYNOMIALS, PROPOSED, TWO, calibrations
+from uwlts.thesis.campaign import MEDIA, CampaignFolder, ScanFile, keep, kept, up_to_date
+from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED, THESIS, TWO, Measurement, calibrations, measure_scan
 from uwlts.thesis.monte_carlo import propagate
-from uwlts.thesis.sphere_scan import SphereScan, sphere_scan
-from uwlts.thesis.window_study import window_choices
+from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan, window_choices
 from uwlts.workers import work_through
 
 RESULTS = "results.json"

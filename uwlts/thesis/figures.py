@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.report.canvas import ticks
 from uwlts.report.svg_plot import COLOURS, FAINT, INK, Curve, Panel, svg
-from uwlts.thesis.methods import POLYNOMIALS, PROPOSED
+from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED
 from uwlts.thesis.tables import MEAN, TableRow
 
 _BAR, _GAP, _LABEL, _ROOM = 15, 12, 300, 560

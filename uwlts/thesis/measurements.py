@@ -1,12 +1,24 @@
-"""Measures every scan of a campaign by every method, with the thesis's image processing and with ours."""
+"""Calibrations of a campaign by every method, and measurements of its scans with them.
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+The thesis's image processing (section 4.5) is a 5x5 low-pass, then a quadratic through the peak. The thesis works in
+LabVIEW. There "low pass" is IMAQ LowPass, which replaces a pixel by the mean of its neighbours only where it differs
+from them by more than a tolerance, 40 % unless set; it is no plain mean. "Every few columns" of the quadratic fit is
+read as five pixels, the size of the filter. Which lines show a stripe is decided as for all methods.
+"""
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from uwlts.calibration.any_calibration import AnyCalibration
+from uwlts.calibration.any_calibration import AnyCalibration, read_any_calibration
+from uwlts.calibration.model import Calibration, write_calibration
+from uwlts.calibration.polynomial import calibrate_polynomials
+from uwlts.calibration.polynomial_model import PolynomialCalibration, write_polynomials
+from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
@@ -14,11 +26,109 @@ from uwlts.evaluate import Judgement, judge
 from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
 from uwlts.scan import reconstruct_stripes
-from uwlts.stripe import find_stripes
-from uwlts.thesis.folder import ScanFile
-from uwlts.thesis.image_processing import thesis_stripes
-from uwlts.thesis.methods import METHODS, PROPOSED
+from uwlts.stripe import FoundStripes, find_stripes
+from uwlts.thesis.campaign import CampaignFolder, ScanFile
 from uwlts.truth import read_truth, truth_path
+
+PROPOSED, TWO, POLYNOMIALS, SINGLE = "proposed", "two refractions", "polynomials", "single viewpoint"
+FORGOTTEN = "window forgotten"
+METHODS = {"air": (PROPOSED, POLYNOMIALS, FORGOTTEN), "water": (PROPOSED, TWO, POLYNOMIALS, SINGLE)}
+
+
+def calibrations(
+    folder: CampaignFolder, *, progress: Callable[[int, int], None] = lambda done, total: None
+) -> dict[tuple[str, str], AnyCalibration]:
+    """Calibrations by method and medium; those made since the recordings are read from the folder ``calibrations``.
+
+    Raises
+    ------
+    CaptureError
+        A recording is missing or damaged.
+    CalibrationError
+        The recordings do not determine a calibration.
+    """
+    made = {
+        (PROPOSED, "water"): lambda: _rays(folder.target("air"), folder.steps(), refractions=1),
+        (TWO, "water"): lambda: _rays(folder.target("bare"), folder.steps(), refractions=2),
+        (SINGLE, "water"): lambda: _rays(folder.target("water"), [], refractions=1),
+        (POLYNOMIALS, "air"): lambda: _polynomials(folder.target("air")),
+        (POLYNOMIALS, "water"): lambda: _polynomials(folder.target("water")),
+    }
+    place = folder.path / "calibrations"
+    place.mkdir(exist_ok=True)
+    found: dict[tuple[str, str], AnyCalibration] = {}
+    evidence = [*folder.steps(), *(folder.target(kind) for kind in ("air", "bare", "water"))]
+    newest = max(path.stat().st_mtime_ns for path in evidence)
+    for number, ((method, medium), make) in enumerate(made.items()):
+        progress(number, len(made))
+        path = place / f"{method.replace(' ', '-')}-{medium}.json"
+        write = write_polynomials if method == POLYNOMIALS else write_calibration
+        if not path.is_file() or path.stat().st_mtime_ns < newest:
+            write(path, make(), overwrite=True)
+        found[method, medium] = read_any_calibration(path)
+    progress(len(made), len(made))
+    # In air nothing but camera and sheet is used of a calibration.
+    for method, source in ((PROPOSED, PROPOSED), (FORGOTTEN, TWO)):
+        found[method, "air"] = found[source, "water"].model_copy(update={"window": None})
+    return found
+
+
+def _rays(target: Path, steps: list[Path], *, refractions: int) -> Calibration:
+    with ExitStack() as stack:
+        air = [stack.enter_context(Capture(target))]
+        opened = [stack.enter_context(Capture(path)) for path in steps]
+        return calibrate_sequentially(air, opened, options=CalibrationOptions(refractions=refractions)).calibration
+
+
+def _polynomials(target: Path) -> PolynomialCalibration:
+    with Capture(target) as capture:
+        return calibrate_polynomials([capture]).calibration
+
+
+_SIZE_PX = 5
+_SEARCHED_PX = 8
+"""How far from the stripe's place the peak is looked for."""
+
+
+def thesis_stripes(
+    capture: Capture, found: FoundStripes, *, tolerance: float = 0.4, fitted_px: int = 5
+) -> FoundStripes:
+    """The same lines of the same images with the centres that the thesis's processing gives.
+
+    ``tolerance`` is the low-pass filter's; 0 makes it a mean of the neighbours. ``fitted_px`` is an odd number.
+    """
+    along_width = capture.header.sensor.camera.stripe_along == "width"
+    centre = np.empty(len(found.line))
+    for number in np.unique(found.frame):
+        own = found.frame == number
+        image = capture.image(int(number))
+        smooth = low_passed(image if along_width else image.T, tolerance=tolerance)
+        centre[own] = _peaks(smooth, found.line[own], found.centre_px[own], half=fitted_px // 2)
+    return replace(found, centre_px=centre)
+
+
+def low_passed(image: np.ndarray, *, tolerance: float) -> np.ndarray:
+    """An image (H, W) after IMAQ LowPass of 5x5 pixels, float32."""
+    grey = image.astype(np.float32)
+    count = _SIZE_PX**2
+    neighbours = (cv2.blur(grey, (_SIZE_PX, _SIZE_PX)) * count - grey) / (count - 1)
+    return np.where(np.abs(grey - neighbours) > tolerance * neighbours, neighbours, grey)
+
+
+def _peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: int) -> np.ndarray:
+    """Vertices (N,) of parabolas through pixels on either side of the largest one of columns (N,) near rows (N,)."""
+    # Of several largest ones, those of a plateau, the nearest to the stripe's place is taken.
+    around = np.array(sorted(range(-_SEARCHED_PX, _SEARCHED_PX + 1), key=abs))
+    rows = np.clip(np.rint(near_px).astype(int)[:, None] + around, 0, len(smooth) - 1)
+    top = rows[np.arange(len(line)), smooth[rows, line[:, None]].argmax(axis=1)]
+    offset = np.arange(-half, half + 1)
+    rows = np.clip(top[:, None] + offset, 0, len(smooth) - 1)
+    # Below the largest one, so that a plateau is exactly zero. It has no vertex; the place is the best guess.
+    below = smooth[rows, line[:, None]] - smooth[top, line][:, None]
+    second, first, _ = np.linalg.pinv(np.vander(offset, 3)) @ below.T
+    vertex = np.where(second < 0, -first / np.where(second < 0, 2 * second, 1.0), 0.0)
+    return top + np.clip(vertex, -half, half)
+
 
 THESIS, OURS = "thesis", "ours"
 """Image processing: the thesis's, and this program's default."""

@@ -18,8 +18,7 @@ from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, E
 from uwlts.camera import project
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.sensor import Medium
-from uwlts.thesis.sphere_scan import SphereScan
-from uwlts.thesis.window_study import spacing_error
+from uwlts.thesis.sphere_spacing import SphereScan, spacing_error
 from uwlts.workers import work_through
 
 COVERAGE = 0.95

@@ -11,17 +11,14 @@ from tests.unit.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.observations import STRIPE, TARGET
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
 from uwlts.calibration.joint.stored import found_estimate
-from uwlts.calibration.model_choice.candidates import Candidate, recast
-from uwlts.calibration.model_choice.choice import choice_of, choose
-from uwlts.calibration.model_choice.comparison import Comparison
-from uwlts.calibration.model_choice.content import content_of, lines_of
-from uwlts.calibration.model_choice.held_out import INSIDE, OUTSIDE, Split, splits
-from uwlts.calibration.model_choice.page import models_page
-from uwlts.calibration.model_choice.prediction import Misses, Prediction, predict
-from uwlts.calibration.model_choice.scores import tally
-from uwlts.calibration.model_choice.verdicts import adds, verdicts
+from uwlts.calibration.model_comparison.candidates import Candidate, recast
+from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose
+from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE, Misses, Prediction, Split, predict, splits
+from uwlts.calibration.model_comparison.scores import tally
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.errors import CalibrationError
+from uwlts.json_file import json_text
+from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
 
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 AIR, IN_WATER = np.arange(8) * 35.0 - 200.0, np.arange(11) * 18.0 - 120.0
@@ -212,10 +209,13 @@ def test_the_page_and_the_lines_tell_every_model(plain_choice):
         "thesis <as built>", ["target.h5"], plain_choice, None, "no polynomials here", ["a warning"]
     )
     content = content_of(comparison)
-    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    text = json_text(content, indent=2, ascii=False)
+    assert ModelComparisonContent.model_validate_json(text) == content
+    usual = json.loads(text)["models"][0]
+    assert list(usual) == ["model", "parameters", "inside", "outside", "as_good"]
     page, lines = models_page(content), "\n".join(lines_of(content))
     assert "<svg" in page and "thesis &lt;as built&gt;" in page
     for judged in plain_choice.judged:
         assert judged.candidate.words() in page and judged.candidate.words() in lines
-    for verdict in content["verdicts"]:
+    for verdict in content.verdicts:
         assert verdict in lines and verdict[1:].replace("'", "&#39;") in page

@@ -1,0 +1,1 @@
+"""Comparison of models of the sensor, judged by images that the calibration does not use."""

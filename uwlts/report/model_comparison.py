@@ -1,0 +1,259 @@
+"""Results of a model comparison: figures as a file, lines for a terminal, and a page to read."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from markupsafe import Markup
+from pydantic import BaseModel, ConfigDict
+
+import uwlts
+from uwlts.calibration.model_comparison.candidates import DIMENSIONS, Candidate, distortion_words
+from uwlts.calibration.model_comparison.comparison import Choice, Comparison, Judged
+from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE
+from uwlts.calibration.model_comparison.scores import POINTS, STRIPES, PolynomialScore
+from uwlts.json_file import json_text
+from uwlts.report.numbers import fixed, small_length
+from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
+
+_WAYS = (INSIDE, OUTSIDE)
+
+
+class _Content(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class HeldOutScore(_Content):
+    """Root mean square misses of a model in images held out in one way.
+
+    Attributes
+    ----------
+    px, mm : dict
+        Of the target's points and of the stripes, in the image and on the object.
+    all_mm, std_mm : float
+        Of both together, and its standard error.
+    adds_mm, adds_std_mm : float or None
+        What the model misses besides the best, in quadrature, with its standard error; None where it is as good.
+    """
+
+    px: dict[str, float]
+    mm: dict[str, float]
+    all_mm: float
+    std_mm: float
+    adds_mm: float | None
+    adds_std_mm: float | None
+
+
+class ModelRow(_Content):
+    """A model's scores, or the reason why it cannot be calibrated."""
+
+    model: str
+    parameters: int | None
+    reason: str | None = None
+    inside: HeldOutScore | None = None
+    outside: HeldOutScore | None = None
+    as_good: bool | None = None
+
+    def score(self, where: str) -> HeldOutScore | None:
+        """Score for one way of holding out."""
+        return self.inside if where == INSIDE else self.outside
+
+
+class ModelComparisonContent(_Content):
+    """All figures of a comparison as its file holds them, lengths in mm."""
+
+    format: Literal["uwlts-models"]
+    version: Literal[1]
+    sensor: str
+    captures: list[str]
+    software: str
+    date: str
+    held_out: dict[str, int]
+    models: list[ModelRow]
+    best: str
+    simplest: str
+    polynomials: PolynomialScore | None
+    verdicts: list[str]
+    warnings: list[str]
+
+
+def content_of(comparison: Comparison) -> ModelComparisonContent:
+    """All figures of a comparison."""
+    choice = comparison.choice
+    return ModelComparisonContent(
+        format="uwlts-models",
+        version=1,
+        sensor=comparison.sensor,
+        captures=comparison.captures,
+        software=f"uwlts {uwlts.__version__}",
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        held_out={where: len(split.held) for where, split in choice.ways.items()},
+        models=[_row(comparison, judged) for judged in choice.judged],
+        best=choice.best().words(),
+        simplest=choice.simplest().words(),
+        polynomials=comparison.polynomials,
+        verdicts=[*verdicts(choice), _of_polynomials(comparison)],
+        warnings=comparison.warnings,
+    )
+
+
+def _row(comparison: Comparison, judged: Judged) -> ModelRow:
+    choice, model = comparison.choice, judged.candidate.words()
+    if judged.reason:
+        return ModelRow(model=model, parameters=judged.parameters, reason=judged.reason)
+    scores = {}
+    for where, score in judged.scores.items():
+        cost = adds(choice, judged.candidate, choice.best(), where)
+        scores[where] = HeldOutScore(
+            px=score.px, mm=score.mm, all_mm=score.all_mm, std_mm=score.std_mm,
+            adds_mm=None if cost is None else cost[0], adds_std_mm=None if cost is None else cost[1],
+        )  # fmt: skip
+    return ModelRow(
+        model=model, parameters=judged.parameters, inside=scores[INSIDE], outside=scores[OUTSIDE],
+        as_good=judged.candidate in choice.as_good(),
+    )  # fmt: skip
+
+
+def _of_polynomials(comparison: Comparison) -> str:
+    score = comparison.polynomials
+    if score is None:
+        return comparison.why_none
+    return (
+        f"polynomials, fitted to the target in {score.medium} alone, miss stripes in {score.images} images inside the "
+        f"calibrated volume by {small_length(score.all_mm)} ± {small_length(score.std_mm)}, the simplest model by "
+        f"{small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not measure"
+    )
+
+
+def lines_of(content: ModelComparisonContent) -> list[str]:
+    """The table and the verdicts, as text."""
+    width = max(len(row.model) for row in content.models)
+    heads = [f"{where} the volume, {content.held_out[where]} images held out" for where in _WAYS]
+    columns = f"{'points':>8}{'stripes':>9}{'all':>15}{'adds':>14}"
+    units = f"{'px':>8}{'px':>9}{'µm':>15}{'µm':>14}"
+    lines = [
+        f"{'':{width}} {'':>4}" + "".join(f"{head:>{len(columns)}}" for head in heads),
+        f"{'model':{width}} {'free':>4}{columns}{columns}",
+        f"{'':{width}} {'':>4}{units}{units}",
+    ]
+    for row in content.models:
+        if row.inside is None or row.outside is None:
+            lines.append(f"{row.model:{width}} no calibration: {row.reason}")
+        else:
+            lines.append(f"{row.model:{width}} {row.parameters:>4}{_cells(row.inside)}{_cells(row.outside)}")
+    return [*lines, "", *content.verdicts]
+
+
+def _cells(score: HeldOutScore) -> str:
+    everything = f"{fixed(1e3 * score.all_mm, 1)} ± {fixed(1e3 * score.std_mm, 1)}"
+    cost = "as good"
+    if score.adds_mm is not None and score.adds_std_mm is not None:
+        cost = f"{fixed(1e3 * score.adds_mm, 1)} ± {fixed(1e3 * score.adds_std_mm, 1)}"
+    points, stripes = (fixed(score.px[kind], 4) if kind in score.px else MISSING for kind in (POINTS, STRIPES))
+    return f"{points:>8}{stripes:>9}{everything:>15}{cost:>14}"
+
+
+def write_models(page: Path, content: ModelComparisonContent, *, overwrite: bool = False) -> None:
+    """Write the page, and the JSON beside it, each whole or not at all; OutputError where that fails."""
+    write_page(page, models_page(content), beside=json_text(content, indent=2, ascii=False), overwrite=overwrite)
+
+
+def models_page(content: ModelComparisonContent) -> str:
+    """The page as text."""
+    return render_page("uwlts.report", "models.html.j2", c=content, ways=_WAYS, picture=_picture(content))
+
+
+def _picture(content: ModelComparisonContent) -> Markup | None:
+    """What each model adds, by its number in the table; None where no model adds anything."""
+    shown = {}
+    for where in _WAYS:
+        scores = [(number, row.score(where)) for number, row in enumerate(content.models, start=1)]
+        adding = [(number, 1e3 * s.adds_mm, 1e3 * (s.adds_std_mm or 0)) for number, s in scores if s and s.adds_mm]
+        if adding:
+            shown[where] = adding
+    if not shown:
+        return None
+    figure, panels = new_figure(5.6 * len(shown), 3.4, columns=len(shown))
+    for axes, (where, adding) in zip(panels, shown.items(), strict=True):
+        number, adds_um, error_um = zip(*adding, strict=True)
+        axes.errorbar(
+            number, adds_um, error_um, fmt="o", capsize=2.5, label="adds to the misses of the best, with standard error"
+        )
+        # Both pictures number all models, including those that add nothing.
+        axes.set(
+            title=f"{where} the calibrated volume", xlabel="model", ylabel="adds / µm", yscale="log",
+            xlim=(0.5, len(content.models) + 0.5), xticks=range(1, len(content.models) + 1),
+        )  # fmt: skip
+    legend_below(figure)
+    return svg_of(figure)
+
+
+_PARTS = {
+    "refractions": ("the glass plate", "with a single refraction"),
+    "window_tilt": ("the tilt of the window", "without it"),
+    "bow": ("the bow of the sheet", "without it"),
+    "window_turn": ("the turn of the laser's window", "without it"),
+}
+
+
+def adds(choice: Choice, candidate: Candidate, other: Candidate, where: str) -> tuple[float, float] | None:
+    """What a model misses besides another, in quadrature, in mm with its standard error; None where it is as good."""
+    tally = choice.tallies[where]
+    if choice.no_worse(candidate, other, where):
+        return None
+    difference, std = tally.beyond(choice.number(candidate), choice.number(other))
+    root = float(difference**0.5)
+    return root, std / (2 * root)
+
+
+def verdicts(choice: Choice) -> list[str]:
+    """For everything that was modelled in several ways what is needed, and which model to take."""
+    usual, said = Candidate(), []
+    known = {each.candidate: each for each in choice.judged}
+    for name, (part, lacking) in _PARTS.items():
+        without = known.get(replace(usual, **{name: DIMENSIONS[name][0]}))
+        if without is None:
+            continue
+        if without.reason:
+            said.append(f"{part} is needed: {lacking} there is no calibration, {without.reason}")
+        elif costs := _costs(choice, without, usual):
+            said.append(f"{part} is needed: {lacking} {costs}")
+        else:
+            said.append(f"{part} is not needed: {lacking} images held out are predicted as well")
+    return [*said, _of_distortion(choice, list(known)), *_chosen(choice)]
+
+
+def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
+    usual = Candidate()
+    levels = [c.distortion for c in candidates if replace(c, distortion=usual.distortion) == usual]
+    enough = choice.level("distortion", levels)
+    said = f"{distortion_words(enough)} is enough"
+    least = replace(usual, distortion=enough)
+    fewer = max((level for level in levels if len(level) < len(enough)), key=len, default=None)
+    if fewer is not None:
+        judged = next(each for each in choice.judged if each.candidate == replace(usual, distortion=fewer))
+        said += f": with {distortion_words(fewer)} {judged.reason or _costs(choice, judged, least)}"
+    return said
+
+
+def _costs(choice: Choice, without: Judged, usual: Candidate) -> str:
+    """Where and by how much a model is worse; nothing where it is as good."""
+    found = {where: adds(choice, without.candidate, usual, where) for where in without.scores}
+    parts = [
+        f"{small_length(cost[0])} ± {small_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"
+        for where, cost in found.items() if cost is not None
+    ]  # fmt: skip
+    return f"points are missed by a further {' and '.join(parts)} the calibrated volume" if parts else ""
+
+
+def _chosen(choice: Choice) -> list[str]:
+    best, simplest, good = choice.best(), choice.simplest(), choice.as_good()
+    others = [candidate.words() for candidate in good if candidate not in (best, simplest)]
+    said = f"best predicts: {best.words()}"
+    if simplest != best:
+        said += f"; the simplest that is as good within the standard errors: {simplest.words()}"
+    elif others:
+        said += ", which is also the simplest of those as good"
+    return [said + (f"; as good are also: {'; '.join(others)}" if others else "")]

@@ -1,0 +1,232 @@
+"""Sphere spacing errors of scans by any calibration, with the step images used (Table 4) and their budget (Table 9)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.any_calibration import AnyCalibration
+from uwlts.calibration.evidence import step_evidence
+from uwlts.calibration.model import Calibration
+from uwlts.calibration.procedure import nominal_window, step_image
+from uwlts.calibration.window import StepImage, solve_window, step_profile
+from uwlts.capture import Capture
+from uwlts.errors import CalibrationError
+from uwlts.metrology.artefact_descriptions import SphereStandard
+from uwlts.metrology.sphere_evaluation import evaluate_spheres
+from uwlts.metrology.sphere_fit import fit_sphere
+from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
+from uwlts.reconstruction import reconstruct_pixels
+from uwlts.scan import reconstruct_stripes
+from uwlts.sensor import Medium
+from uwlts.stripe import find_stripes
+from uwlts.thesis.campaign import STEP_PLACES, CampaignFolder
+
+
+@dataclass(frozen=True, eq=False)
+class SphereScan:
+    """The stripe on two spheres in one scan.
+
+    Attributes
+    ----------
+    placement : str
+    pixels : (N, 2)
+    stage_mm : (N,)
+    sphere : (N,) int
+        Sphere 0 or 1 on which each point lies.
+    stage_direction : (3,)
+    medium_index : float
+    spacing_mm : float
+        Calibrated distance of the centres.
+    """
+
+    placement: str
+    pixels: np.ndarray
+    stage_mm: np.ndarray
+    sphere: np.ndarray
+    stage_direction: np.ndarray
+    medium_index: float
+    spacing_mm: float
+
+    def spacing_error(self, points: np.ndarray) -> float:
+        """Sphere spacing error of points (N, 3) of these stripes, mm."""
+        first, second = (fit_sphere(points[self.sphere == number]).centre_mm for number in (0, 1))
+        return float(np.linalg.norm(second - first)) - self.spacing_mm
+
+
+def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str) -> SphereScan:
+    """Find the stripes of a scan of two spheres and tell by a calibration on which sphere each point lies.
+
+    Raises
+    ------
+    EvaluationError
+        The scan does not show the spheres.
+    """
+    standard = SphereStandard.model_validate(capture.header.artefact)
+    stripes = find_stripes(capture)
+    scan = reconstruct_stripes(capture, stripes, calibration)
+    evaluation = evaluate_spheres(scan.cloud.points_mm, standard)
+    centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
+    radii = np.array(standard.diameters_mm) / 2
+    used = np.isfinite(evaluation.deviation_mm)
+    away = np.abs(np.linalg.norm(scan.cloud.points_mm[used, None] - centres, axis=2) - radii)
+    kept = scan.stripe[used]
+    line, centre = stripes.line[kept], stripes.centre_px[kept]
+    along_width = capture.header.sensor.camera.stripe_along == "width"
+    return SphereScan(
+        placement=placement,
+        pixels=np.stack((line, centre) if along_width else (centre, line), axis=1).astype(float),
+        stage_mm=capture.stage_mm[stripes.frame[kept]],
+        sphere=np.argmin(away, axis=1),
+        stage_direction=np.array(capture.header.stage_direction),
+        medium_index=capture.header.medium.refractive_index(capture.header.sensor.laser.wavelength_nm),
+        spacing_mm=standard.spacings_mm[0],
+    )
+
+
+_TRIED_SHARES = (0.25, 0.5, 1.0, 1.5)
+"""Window distances of Figure 45, as shares of the calibrated one."""
+
+
+@dataclass(frozen=True)
+class WindowChoice:
+    """Window distance found from some step images, and the mean absolute sphere spacing error that it leads to.
+
+    None where the images determine no distance within its bounds.
+    """
+
+    images: str
+    distance_mm: float | None
+    mean_sse_mm: float | None
+
+
+def mean_spacing_error(calibration: Calibration, scans: Sequence[SphereScan]) -> float:
+    """Mean absolute sphere spacing error of scans in mm."""
+    return float(np.mean([abs(spacing_error(calibration, scan)) for scan in scans]))
+
+
+def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: float | None = None) -> float:
+    """Sphere spacing error of a scan in mm, in a medium of another index if one is given."""
+    points = reconstruct_pixels(
+        calibration, scan.pixels, medium_index=medium_index or scan.medium_index,
+        stage_mm=scan.stage_mm, stage_direction=scan.stage_direction,
+    )  # fmt: skip
+    return scan.spacing_error(points.points_mm)
+
+
+def window_choices(
+    folder: CampaignFolder, calibration: Calibration, scans: Sequence[SphereScan]
+) -> tuple[list[WindowChoice], list[dict[str, object]]]:
+    """Every step image alone, the three of each place, and all nine; and profiles of a step at several distances.
+
+    Returns
+    -------
+    choices : list of WindowChoice
+        ``images`` is the place and the image's number (from 1), the place alone, or "all".
+    profiles : list of dict
+        For Figure 45: ``distance_mm`` and points (N, 2), Y and Z in mm, of one step image seen through a window at
+        that distance.
+    """
+    images = _step_images(folder, calibration)
+    subsets = {f"{place} {number}": [image] for place in images for number, image in enumerate(images[place], start=1)}
+    subsets |= images | {"all": [image for place in images for image in images[place]]}
+    choices = []
+    for name, chosen in subsets.items():
+        try:
+            window = solve_window(calibration, calibration.window, chosen).model
+        except CalibrationError:
+            choices.append(WindowChoice(name, None, None))
+            continue
+        moved = calibration.model_copy(update={"window": window})
+        choices.append(WindowChoice(name, window.distance_mm, mean_spacing_error(moved, scans)))
+    shown = images[STEP_PLACES[1]][0]
+    profiles = []
+    for share in _TRIED_SHARES:
+        window = calibration.window.model_copy(update={"distance_mm": share * calibration.window.distance_mm})
+        profile = step_profile(calibration, window, shown.pixels, medium_index=shown.medium_index)
+        seen = profile[np.isfinite(profile).all(axis=1)][::4]
+        profiles.append({"distance_mm": window.distance_mm, "points_mm": np.round(seen, 4).tolist()})
+    return choices, profiles
+
+
+def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, list[StepImage]]:
+    """Step images by place, with their treads told apart."""
+    found = {}
+    for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
+        with Capture(path) as capture:
+            evidence, _ = step_evidence([capture])
+            described = nominal_window(
+                capture.header.sensor.camera.window, capture.header.sensor, refractions=calibration.window.refractions
+            )
+        found[place] = [step_image(calibration, described, step) for step in evidence]
+    return found
+
+
+TEMPERATURE_HALF_WIDTH_C = 5.0
+_EXPANSION_PER_K = 22.2e-6
+"""Of the standard: the thesis's 0.011 mm for 5 K over 99.18 mm, as aluminium expands."""
+_STANDARD_EXPANDED_MM = 0.004
+_SUBPIXEL = 0.1
+"""The thesis takes a tenth of a pixel as the effective resolution."""
+
+
+def spacing_budget(
+    calibration: Calibration, scans: Sequence[SphereScan], medium: Medium, *, deviation_mm: float
+) -> dict[str, float]:
+    """Budget of the sphere spacing by the thesis's sources, as standard uncertainties and what follows from them, mm.
+
+    Index: the change of the spacing when the index changes by what 5 degC do, the calibration left as it is; mean over
+    the scans. Resolution: a tenth of what a pixel is worth along Z at the stand-off. SSE: the standard deviation of the
+    scans' spacing errors, with their mean as the correction. ``deviation_mm`` enters as the thesis's PE.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    scans : sequence of SphereScan
+        At least two.
+    medium : Medium
+    deviation_mm : float
+        Largest standard deviation of the points about the spheres.
+    """
+    errors = np.array([spacing_error(calibration, scan) for scan in scans])
+    correction = float(np.mean(np.abs(errors)))
+    ends = [
+        medium.warmer_by(sign * TEMPERATURE_HALF_WIDTH_C).refractive_index(calibration.wavelength_nm)
+        for sign in (1, -1)
+    ]
+    changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in ends]
+    by_index = float(np.mean(np.abs(np.subtract(*changes)))) / 2
+    expansion = thermal_expansion_mm(
+        length_mm=scans[0].spacing_mm, alpha_per_k=_EXPANSION_PER_K, temperature_change_k=TEMPERATURE_HALF_WIDTH_C
+    )
+    resolution = _SUBPIXEL * mm_per_px(calibration, scans[0].medium_index)
+    budget = combine(
+        [
+            Source(name="index", half_width=by_index, distribution="uniform"),
+            Source(name="expansion", half_width=expansion, distribution="uniform"),
+            Source(name="resolution", half_width=resolution / 2, distribution="uniform"),
+            Source(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),
+            Source(
+                name="SSE", half_width=float(np.std(errors, ddof=1)), degrees_of_freedom=len(errors) - 1,
+                correction=correction,
+            ),
+            Source(name="PE", half_width=deviation_mm),
+        ]
+    )  # fmt: skip
+    return {source.name: source.standard_uncertainty for source in budget.sources} | {
+        "degrees_of_freedom": budget.degrees_of_freedom,
+        "expanded": budget.expanded_uncertainty,
+        "correction": budget.correction,
+        "largest_error": budget.largest_error,
+    }
+
+
+def mm_per_px(calibration: Calibration, medium_index: float) -> float:
+    """Change of Z per pixel across the stripe where the camera's axis meets the sheet, mm."""
+    camera = calibration.camera
+    across = np.array([0.0, 0.5] if calibration.stripe_along == "width" else [0.5, 0.0])
+    pixels = np.array([camera.cx_px, camera.cy_px]) + np.array([-across, across])
+    points = reconstruct_pixels(
+        calibration, pixels, medium_index=medium_index, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
+    ).points_mm
+    return float(abs(points[1, 2] - points[0, 2]))
