@@ -101,10 +101,10 @@ def _scan(
     bright, wide = np.full(len(stripes.line), 100.0), np.full(len(stripes.line), 4.0)
     found = FoundStripes(stripes.frame, stripes.line, stripes.centre_px, bright, wide, {})
     with tempfile.TemporaryDirectory() as folder, _empty_capture(Path(folder), sensor, medium, positions) as capture:
-        cloud = reconstruct_stripes(capture, found, calibration, with_uncertainty=True).cloud
+        cloud = reconstruct_stripes(capture, found, calibration, with_uncertainty=True)
     evaluation = evaluate_cloud(cloud, SPHERES)
     start = time.perf_counter()
-    stated = figure_uncertainties(cloud, SPHERES, evaluation)
+    stated = figure_uncertainties(cloud, evaluation)
     seconds = time.perf_counter() - start
     return [
         Measured(

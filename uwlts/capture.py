@@ -12,6 +12,7 @@ an interrupted recording keeps all its complete frames; closing it gives it its 
 import os
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -415,3 +416,8 @@ def open_capture(path: str | Path) -> Capture:
     ...     images = [frame.image for frame in capture if frame.laser_on]
     """
     return Capture(path)
+
+
+def opened_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:
+    """A context with an opened capture: one that is open already stays so, a file is opened and closed."""
+    return nullcontext(capture) if isinstance(capture, Capture) else Capture(capture)

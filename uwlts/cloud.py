@@ -3,19 +3,26 @@
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from uwlts.cloud_hdf5 import FORMAT, read_arrays, write_arrays
 from uwlts.errors import CaptureError
-from uwlts.file_label import format_of
+from uwlts.file_label import format_of, read_label, write_label
 from uwlts.files import written_aside
-from uwlts.uncertainty.points import PAIRS, PointUncertainty
+from uwlts.sensor import Description
+
+FORMAT = "uwlts-cloud"
+VERSION = 1
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
 NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
@@ -26,6 +33,43 @@ _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
+
+
+@dataclass(frozen=True, eq=False)
+class PointUncertainty:
+    """Standard uncertainty of points in the OCS, mm.
+
+    Attributes
+    ----------
+    random_mm2 : (N, 6) float32
+        Covariance of each point by the stripe's noise, independent from point to point; see `PAIRS`.
+    position_mm : (N, 3) float32
+        How each point moves for one standard deviation of its image's stage position, independent from image to image.
+    patterns_mm : (M, N, 3) float32
+        How each point moves for one standard deviation of what is independent in calibration and stage, largest first.
+    """
+
+    random_mm2: np.ndarray
+    position_mm: np.ndarray
+    patterns_mm: np.ndarray
+
+    def systematic_mm2(self) -> np.ndarray:
+        """Covariance (N, 6) of each point by calibration and stage."""
+        return np.stack([np.sum(self.patterns_mm[:, :, i] * self.patterns_mm[:, :, j], axis=0) for i, j in PAIRS], 1)
+
+    def covariance_mm2(self) -> np.ndarray:
+        """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
+        pairs = self.random_mm2 + self.systematic_mm2()
+        covariance = np.einsum("ni,nj->nij", self.position_mm, self.position_mm)
+        for column, (i, j) in enumerate(PAIRS):
+            covariance[:, i, j] += pairs[:, column]
+            if i != j:
+                covariance[:, j, i] += pairs[:, column]
+        return covariance
+
+    def std_mm(self) -> np.ndarray:
+        """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
+        return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +132,11 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    @property
+    def covariance_mm2(self) -> np.ndarray | None:
+        """Covariance (N, 3, 3) of the coordinates of each point, mm2, of all kinds together; None where not known."""
+        return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
+
 
 def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
     """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
@@ -104,7 +153,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         The file exists and `overwrite` is not set, the folder is missing, the disk is full.
     """
     if _in_hdf5(path):
-        write_arrays(path, _arrays(cloud), cloud.metadata, overwrite=overwrite)
+        _write_arrays(path, _arrays(cloud), cloud.metadata, overwrite=overwrite)
         return
     vertices = np.empty(
         len(cloud),
@@ -188,7 +237,7 @@ def _arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
 
 
 def _from_hdf5(path: Path) -> PointCloud:
-    arrays, metadata = read_arrays(path)
+    arrays, metadata = _read_arrays(path)
     names = [part.name for part in fields(PointUncertainty)]
     wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
     missing = [name for name in wanted if name not in arrays]
@@ -304,3 +353,48 @@ def _indices(path: Path, name: str, values: np.ndarray) -> np.ndarray:
     if not whole.all():
         raise CaptureError(f"{path}: {np.count_nonzero(~whole)} values of {name} are no whole numbers")
     return values.astype(np.int32)
+
+
+class _CloudHeader(Description):
+    """What holds for a whole cloud: its metadata."""
+
+    metadata: dict[str, Any]
+
+
+def _write_arrays(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: dict[str, Any], *, overwrite: bool
+) -> None:
+    """Write named arrays with their metadata, whole or not at all; OutputError where that fails."""
+    # In memory first: HDF5 does not survive a full disk.
+    content = BytesIO()
+    with h5py.File(content, "w", libver="latest") as file:
+        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=metadata))
+        for name, values in arrays.items():
+            file.create_dataset(
+                name, data=values, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+            )
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.getbuffer())
+
+
+def _read_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Named arrays of numbers and the metadata.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, no cloud, newer or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path} does not exist" if not path.exists() else f"{path} is no file")
+    try:
+        with h5py.File(path, "r") as file:
+            header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
+            arrays = {name: np.asarray(dataset[...]) for name, dataset in file.items()}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
+    unusable = [name for name, values in arrays.items() if values.dtype.kind not in "iuf"]
+    if unusable:
+        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers")
+    return arrays, header.metadata

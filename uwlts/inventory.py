@@ -14,8 +14,8 @@ from uwlts.calibration.polynomial_model import PolynomialCalibration, read_polyn
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.errors import CaptureError, DescriptionError
-from uwlts.evaluate import FORMAT as EVALUATION_FORMAT
-from uwlts.evaluate import read_evaluation
+from uwlts.evaluation_file import FORMAT as EVALUATION_FORMAT
+from uwlts.evaluation_file import EvaluationRecord, read_evaluation
 from uwlts.library import load_sensor
 from uwlts.placement import check_design, view_of_sheet
 from uwlts.sensor import Camera, Sensor
@@ -172,22 +172,23 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
     return lines
 
 
-def evaluation_lines(content: dict[str, Any]) -> list[str]:
+def evaluation_lines(record: EvaluationRecord) -> list[str]:
     """What an evaluation says."""
-    lines = [f"evaluation of {content['cloud']}"]
-    if evaluation := content["evaluation"]:
-        known = content.get("uncertainty", {})
-        for name, value in evaluation["figures_mm"].items():
-            expanded = f" ± {known[name]['expanded_mm']:.4f} mm (k = 2)" if name in known else " mm"
+    lines = [f"evaluation of {record.cloud}"]
+    if evaluation := record.evaluation:
+        for name, value in evaluation.figures_mm.items():
+            known = record.uncertainty.get(name)
+            expanded = " mm" if known is None else f" ± {known.expanded_mm:.4f} mm (k = 2)"
             lines.append(f"  {name}: {value:+.4f}{expanded}")
-        lines.append(f"  points: {evaluation['points_used']} used, {evaluation['points_rejected']} rejected")
-    if truth := content["truth"]:
-        for name, part in (("against truth", truth), ("the same after a best-fit motion", truth["after_best_fit"])):
-            lines.append(
-                f"  {name}: rms {part['rms_mm']:.4f} mm, 99 % within {part['p99_mm']:.4f} mm, "
-                f"{100 * part['share_within_tolerance']:.1f} % within {part['tolerance_mm']:g} mm"
-            )
-        lines.append(f"  {truth['missed']} stripe points missed, {truth['false_points']} false")
+        lines.append(f"  points: {evaluation.points_used} used, {evaluation.points_rejected} rejected")
+    if truth := record.truth:
+        for name, part in (("against truth", truth), ("the same after a best-fit motion", truth.after_best_fit)):
+            if part is not None:
+                lines.append(
+                    f"  {name}: rms {part.rms_mm:.4f} mm, 99 % within {part.p99_mm:.4f} mm, "
+                    f"{100 * part.share_within_tolerance:.1f} % within {part.tolerance_mm:g} mm"
+                )
+        lines.append(f"  {truth.missed} stripe points missed, {truth.false_points} false")
     return lines
 
 

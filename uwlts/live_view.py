@@ -98,7 +98,7 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
         stripes = FoundStripes(
             np.full(len(line), number), line, stripe.centre_px[line], stripe.amplitude[line], stripe.width_px[line], {}
         )
-        points = reconstruct_stripes(capture, stripes, calibration).cloud.points_mm
+        points = reconstruct_stripes(capture, stripes, calibration).points_mm
     brightest = frame.image.max(axis=0 if along == "width" else 1)
     full = capture.header.saturation_dn
     remarks = []

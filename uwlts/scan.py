@@ -1,50 +1,83 @@
-"""From a capture to a point cloud: the stripe of every laser image, turned into points by a calibration of any kind."""
+"""Reconstruction of captures: point clouds from the stripes of all laser images by a calibration of any kind."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from uwlts.brightness import beside_sheet, sharp_lines, slopes_of_brightness
-from uwlts.calibration.any_calibration import AnyCalibration, calibration_digest, check_fits
+from uwlts.calibration.any_calibration import AnyCalibration, calibration_digest, check_fits, loaded_calibration
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.polynomial_model import PolynomialCalibration
-from uwlts.capture import Capture
+from uwlts.capture import Capture, opened_capture
 from uwlts.cloud import PointCloud
 from uwlts.errors import CalibrationError
-from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
-from uwlts.reconstruction import ObjectPoints, reconstruct_profile
+from uwlts.reconstruction import ObjectPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.refraction import RayStatus, require_index
 from uwlts.stripe import FoundStripes, StripeOptions, find_stripes
 from uwlts.uncertainty.propagation import point_uncertainty
 
 
-@dataclass(frozen=True)
-class Scan:
-    """A reconstructed capture: its cloud, and what became of the profile lines of all laser images.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanCloud(PointCloud):
+    """The cloud of a capture, and what became of the profile lines of all its laser images.
 
-    ``stripe`` (N,) tells from which of the capture's `FoundStripes` each point of the cloud comes.
+    Attributes
+    ----------
+    stripe : (N,) int
+        Number, in the capture's `FoundStripes`, of the stripe centre that each point comes from.
+    lines_by_status : dict
+        Number of profile lines by the name of their `StripeStatus`, and ``blurred`` by a joint calibration.
+    rays_by_status : dict
+        Number of stripe centres by the name of their `RayStatus`.
     """
 
-    cloud: PointCloud
     stripe: np.ndarray
     lines_by_status: dict[str, int]
     rays_by_status: dict[str, int]
 
 
-def reconstruct_capture(
-    capture: Capture,
-    calibration: AnyCalibration,
+def reconstruct(
+    capture: Capture | str | Path,
+    calibration: AnyCalibration | str | Path,
     *,
     options: StripeOptions = StripeOptions(),
     index: float | None = None,
-    with_uncertainty: bool = False,
+    with_uncertainty: bool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Scan:
-    """Point cloud of a capture: `find_stripes`, then `reconstruct_stripes`, with the errors of both."""
-    check_fits(capture.header, calibration, source=capture.path.name)
-    stripes = find_stripes(capture, options=options, progress=progress)
-    return reconstruct_stripes(capture, stripes, calibration, index=index, with_uncertainty=with_uncertainty)
+) -> ScanCloud:
+    """Point cloud of a capture: finds the stripes of all laser images and turns them into points.
+
+    Parameters
+    ----------
+    capture : Capture or path
+    calibration : Calibration, PolynomialCalibration or path
+    options : StripeOptions, optional
+        How stripes are found.
+    index : float, optional
+        Refractive index of the medium relative to air, in place of the one that follows from the capture.
+    with_uncertainty : bool, optional
+        Calculate the uncertainty of the points; by default with a joint calibration, which alone holds one.
+    progress : callable, optional
+        Called after each image with the number of images done and the number in all.
+
+    Returns
+    -------
+    ScanCloud
+        ``points_mm`` (N, 3) in the object coordinate system, ``covariance_mm2`` (N, 3, 3) or None.
+
+    Raises
+    ------
+    CaptureError, CalibrationError, RangeError
+        As `find_stripes` and `reconstruct_stripes`; or a file cannot be read.
+    """
+    calibration = loaded_calibration(calibration)
+    with opened_capture(capture) as scan:
+        check_fits(scan.header, calibration, source=scan.path.name)
+        stripes = find_stripes(scan, options=options, progress=progress)
+        known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
+        return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
 
 
 def reconstruct_stripes(
@@ -54,11 +87,11 @@ def reconstruct_stripes(
     *,
     index: float | None = None,
     with_uncertainty: bool = False,
-) -> Scan:
+) -> ScanCloud:
     """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
 
-    ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` tells how well
-    the points are known by a joint calibration; in the OCS, whatever the poses. Without a window in the light's way
+    ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` adds the
+    uncertainty of the points by a joint calibration. Without a window in the light's way
     the calibration's window is left out. Points that a calibration by polynomials does not reach are left out and
     counted in ``rays_by_status``.
 
@@ -93,21 +126,30 @@ def reconstruct_stripes(
     points = _posed(found.points_mm + beside, capture, stripes.frame)
     good = np.flatnonzero(found.status == RayStatus.OK)
     kept = stripes[good]
-    cloud = PointCloud(
-        points_mm=points[good], intensity=kept.amplitude, frame=kept.frame, line=kept.line,
-        metadata={
-            "capture": capture.path.name, "sensor": calibration.sensor_name, "medium": capture.header.medium_name,
-            "medium_index": index, "artefact": capture.header.artefact, "calibration": calibration_digest(calibration),
-        },
-    )  # fmt: skip
+    known = None
     if with_uncertainty:
         known = point_uncertainty(
             capture, calibration, kept.frame, kept.line, kept.centre_px, blur_px=blur[good], beside_mm=beside[good]
         )
-        cloud = replace(cloud, uncertainty=known)
     rays = np.bincount(found.status, minlength=len(RayStatus))
-    by_status = {status.name.lower(): int(rays[status]) for status in RayStatus}
-    return Scan(cloud, sharp[good], lines, by_status)
+    return ScanCloud(
+        points_mm=points[good],
+        intensity=kept.amplitude,
+        frame=kept.frame,
+        line=kept.line,
+        uncertainty=known,
+        metadata={
+            "capture": capture.path.name,
+            "sensor": calibration.sensor_name,
+            "medium": capture.header.medium_name,
+            "medium_index": index,
+            "artefact": capture.header.artefact,
+            "calibration": calibration_digest(calibration),
+        },
+        stripe=sharp[good],
+        lines_by_status=lines,
+        rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
+    )
 
 
 def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes, index: float) -> ObjectPoints:

@@ -18,11 +18,10 @@ from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate_sequentially
 from uwlts.capture import Capture
-from uwlts.evaluate import Judgement, judge
+from uwlts.evaluate import Evaluation, evaluate
 from uwlts.library import load_sensor
-from uwlts.metrology.artefact_descriptions import parse_artefact
-from uwlts.scan import reconstruct_capture
-from uwlts.truth import read_truth, truth_path
+from uwlts.scan import reconstruct
+from uwlts.truth import truth_path
 
 PLACEMENTS = ("near", "standoff", "far")
 PROFILES = {"start_mm": -18.0, "step_mm": 3.0, "count": 13}
@@ -33,11 +32,8 @@ def true_calibration() -> Calibration:
     return nominal_calibration(sensor, sensor.media["water"])
 
 
-def measured(path: Path, calibration: Calibration) -> Judgement:
-    with Capture(path) as capture:
-        scan = reconstruct_capture(capture, calibration)
-        artefact = parse_artefact(capture.header.artefact)
-    return judge(scan.cloud, artefact=artefact, truth=read_truth(truth_path(path))[1], source=path.name)
+def measured(path: Path, calibration: Calibration) -> Evaluation:
+    return evaluate(reconstruct(path, calibration), truth=truth_path(path))
 
 
 def record(
@@ -52,14 +48,15 @@ def record(
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_perfect_images_and_true_parameters_give_micrometres(tmp_path: Path, placement: str):
     path = record("spheres", tmp_path / "spheres.h5", ideal=True, placement=placement, motion=PROFILES)
-    judgement = measured(path, true_calibration())
-    truth, figures = judgement.content["truth"], judgement.content["evaluation"]["figures_mm"]
-    assert truth["matched"] > 5000
-    assert truth["share_within_tolerance"] >= 0.99
-    assert truth["tolerance_mm"] == pytest.approx(0.010)
-    assert abs(figures["SSE"]) <= 0.005
+    evaluation = measured(path, true_calibration())
+    truth = evaluation.truth
+    matched = np.count_nonzero(truth.matched)
+    assert matched > 5000
+    assert truth.share_within_tolerance >= 0.99
+    assert truth.tolerance_mm == pytest.approx(0.010)
+    assert abs(evaluation.sphere_spacing.error_mm) <= 0.005
     # Rows of a stripe that ends in a point are lost or doubtful, never more than a tenth of them.
-    assert truth["missed"] + truth["false_points"] < 0.1 * truth["matched"]
+    assert truth.missed + truth.false_points < 0.1 * matched
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +100,7 @@ def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationRes
         placement=placement,
         motion=PROFILES,
     )
-    figures = measured(path, result.calibration).content["evaluation"]["figures_mm"]
+    figures = measured(path, result.calibration).artefact.figures_mm
     assert abs(figures["SSE"]) <= 0.11
     # Speckle leaves the profile fit 0.022 to 0.025 mm on spheres (docs/stripe-methods.md); half of it and twice of it.
     assert 0.012 < figures["STD"] <= 0.05, "speckle is there, and no more than speckle"
@@ -117,8 +114,8 @@ def test_a_hundredth_of_a_millimetre_is_noticed(tmp_path: Path):
     wrong = true.model_copy(
         update={"window": true.window.model_copy(update={"distance_mm": true.window.distance_mm + 0.3})}
     )
-    truth = measured(path, wrong).content["truth"]
-    assert truth["share_within_tolerance"] < 0.99
+    truth = measured(path, wrong).truth
+    assert truth.share_within_tolerance < 0.99
 
 
 def test_pipe_and_step_in_water(tmp_path: Path, campaign: tuple[Path, CalibrationResult]):
@@ -127,8 +124,8 @@ def test_pipe_and_step_in_water(tmp_path: Path, campaign: tuple[Path, Calibratio
     pipe = record("pipe", tmp_path / "pipe.h5", as_built="thesis-as-built", motion=few)
     step = record("step-scan", tmp_path / "step.h5", as_built="thesis-as-built", motion=few)
     # The pipe's radius follows from 60 deg of arc: an error of depth counts about four times in the diameter.
-    assert abs(measured(pipe, calibration).content["evaluation"]["figures_mm"]["diameter error"]) < 0.4
-    assert abs(measured(step, calibration).content["evaluation"]["figures_mm"]["height error"]) < 0.05
+    assert abs(measured(pipe, calibration).diameters[0].error_mm) < 0.4
+    assert abs(measured(step, calibration).step_height.error_mm) < 0.05
 
 
 def test_shadowed_lines_give_no_points(tmp_path: Path):
@@ -140,7 +137,7 @@ def test_shadowed_lines_give_no_points(tmp_path: Path):
     shaded = type(scene).model_validate(scene.model_dump() | {"objects": objects, "artefact": None})
     record_scene(shaded, load_sensor("thesis"), path, options=Options(effects=NONE))
     with Capture(path) as capture:
-        cloud = reconstruct_capture(capture, true_calibration()).cloud
+        cloud = reconstruct(capture, true_calibration())
     on_block = cloud.points_mm[:, 2] < -30
     assert np.count_nonzero(on_block) > 200
     behind = ~on_block & (np.abs(cloud.points_mm[:, 1]) < 12)

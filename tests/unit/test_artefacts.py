@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.cloud import PointCloud
 from uwlts.errors import EvaluationError
-from uwlts.metrology.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard, evaluate_cloud
-from uwlts.metrology.treads import Tread, label_treads, step_height_of_profile, step_height_of_scan
-from uwlts.metrology.truth import compare_with_truth
+from uwlts.metrology.artefact_descriptions import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile, step_height_of_scan
+from uwlts.metrology.truth_comparison import compare_with_truth
 
 SIGMA = 0.1
 DUMBBELL = SphereStandard(diameters_mm=(50.12, 50.14), spacings_mm=(99.18,))
@@ -242,10 +243,10 @@ def step_profile(
     """Profile (Y, Z) with three mixed points at each edge and strays, and the true treads (0 for these)."""
     y = np.linspace(-88, 88, 900)
     up = SHAPES[shape](y)
-    z, tread = np.where(up, -height, 0.0), np.where(up, Tread.UPPER, Tread.LOWER)
+    z, tread = np.where(up, -height, 0.0), np.where(up, StepFace.UPPER, StepFace.LOWER)
     for edge in np.flatnonzero(np.diff(up.astype(int))):
         z[edge : edge + 3] = -height * np.array([0.02, 0.5, 0.98])[:: 1 if up[edge + 1] else -1]
-        tread[edge : edge + 3] = Tread.NEITHER
+        tread[edge : edge + 3] = StepFace.NEITHER
     points = np.column_stack([y, z + rng.normal(0, sigma, len(y))])
     angle = np.radians(tilt_deg)
     points = points @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) + [3, 310]
@@ -259,11 +260,11 @@ def test_profiles_are_labelled_and_measured(shape, tilt_deg):
     scaled, kept = [], 0
     for seed in range(6):
         points, tread = step_profile(np.random.default_rng(seed), shape, tilt_deg=tilt_deg)
-        labels = label_treads(points, height_mm=24.0)
-        named = labels != Tread.NEITHER
+        labels = label_step_faces(points, height_mm=24.0)
+        named = labels != StepFace.NEITHER
         # A stray may fall on a tread by chance (0.5 mm of 120); mixed points and the other tread never pass.
         assert np.count_nonzero(labels[named] != tread[named]) <= 1
-        assert not np.any(named[:900] & (tread[:900] == Tread.NEITHER))
+        assert not np.any(named[:900] & (tread[:900] == StepFace.NEITHER))
         kept += np.count_nonzero(named)
         for reference in ("lower", "upper"):
             height = step_height_of_profile(points, labels, reference=reference)
@@ -278,7 +279,7 @@ def test_the_height_of_many_profiles_has_no_bias_and_the_stated_scatter():
     heights, stated = [], []
     for seed in range(49):
         points, _ = step_profile(np.random.default_rng(seed), "base, block, base", tilt_deg=6)
-        height = step_height_of_profile(points, label_treads(points, height_mm=HEIGHT))
+        height = step_height_of_profile(points, label_step_faces(points, height_mm=HEIGHT))
         heights.append(height.height_mm)
         stated.append(height.std_mm)
     assert abs(np.mean(heights) - HEIGHT) < 4 * np.mean(stated) / 7
@@ -293,13 +294,13 @@ def test_rounded_edges_stay_out():
     rounded = np.abs(np.abs(y) - 25) < 0.8
     z = np.where(up, -HEIGHT, 0.0) + np.where(rounded, np.where(up, 0.2, -0.2), 0.0) + rng.normal(0, 0.05, len(y))
     points = np.column_stack([y, z])
-    assert not label_treads(points, height_mm=HEIGHT, edge_mm=1.0)[rounded].any()
-    assert label_treads(points, height_mm=HEIGHT, edge_mm=0.0)[rounded].any()
+    assert not label_step_faces(points, height_mm=HEIGHT, edge_mm=1.0)[rounded].any()
+    assert label_step_faces(points, height_mm=HEIGHT, edge_mm=0.0)[rounded].any()
 
 
 def test_labels_serve_slightly_changed_points():
     points, _ = step_profile(np.random.default_rng(1), "base, block, base")
-    labels = label_treads(points, height_mm=HEIGHT)
+    labels = label_step_faces(points, height_mm=HEIGHT)
     first = step_height_of_profile(points, labels).height_mm
     for scale in (0.97, 1.01, 1.05):
         stretched = step_height_of_profile(points * [1, scale], labels).height_mm
@@ -309,7 +310,7 @@ def test_labels_serve_slightly_changed_points():
 
 def test_a_step_as_low_as_ten_times_the_noise_is_found():
     points, _ = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, strays=0)
-    labels = label_treads(points, height_mm=1.0)
+    labels = label_step_faces(points, height_mm=1.0)
     assert np.count_nonzero(labels) > 600
     height = step_height_of_profile(points, labels)
     assert abs(height.height_mm - 1.0) < 4.5 * height.std_mm < 0.05
@@ -319,7 +320,7 @@ def test_a_step_as_low_as_ten_times_the_noise_is_found():
 def test_another_height_is_not_found(height_mm):
     points, _ = step_profile(np.random.default_rng(0), "base, block, base", tilt_deg=6)
     with pytest.raises(EvaluationError, match="no two"):
-        label_treads(points, height_mm=height_mm)
+        label_step_faces(points, height_mm=height_mm)
 
 
 @pytest.mark.parametrize("curvature", [0.0, 1 / 300])
@@ -327,7 +328,7 @@ def test_flat_and_curved_profiles_have_no_step(curvature):
     y = np.linspace(-80, 80, 800)
     z = 300 + curvature * y**2 + np.random.default_rng(0).normal(0, SIGMA, 800)
     with pytest.raises(EvaluationError, match="no two"):
-        label_treads(np.column_stack([y, z]), height_mm=HEIGHT)
+        label_step_faces(np.column_stack([y, z]), height_mm=HEIGHT)
 
 
 def step_scan(turn_deg: float) -> PointCloud:
@@ -372,8 +373,8 @@ def test_a_turned_step_is_measured_along_its_normal():
     # The treads are drawn HEIGHT / cos 25 / cos 5 apart along Z; along their normal that is less by the length of
     # (slope in X, slope in Y, 1), here from an ordinary regression of Z.
     cloud = step_scan(25)
-    labels = label_treads(cloud.points_mm, height_mm=HEIGHT)
-    base = cloud.points_mm[labels == Tread.LOWER]
+    labels = label_step_faces(cloud.points_mm, height_mm=HEIGHT)
+    base = cloud.points_mm[labels == StepFace.LOWER]
     slopes, *_ = np.linalg.lstsq(np.column_stack([base[:, :2], np.ones(len(base))]), base[:, 2], rcond=None)
     drawn = HEIGHT / np.cos(np.radians(25)) / np.cos(np.radians(5)) / np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
     assert step_height_of_scan(cloud.points_mm, labels).height_mm == pytest.approx(drawn, abs=0.005)
@@ -432,7 +433,7 @@ def test_results_are_plain_json():
 
 
 def test_unknown_artefacts_are_a_bug():
-    with pytest.raises(TypeError, match="no evaluation for str"):
+    with pytest.raises(AssertionError, match="plane"):
         evaluate_cloud(cloud_of(np.zeros((1, 3))), "plane")
 
 

@@ -58,7 +58,7 @@ def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
     with Capture(tmp_path / "scan.h5") as capture:
         off = []
         for calibration in (plain, joint):
-            points = reconstruct_stripes(capture, stripes, calibration).cloud.points_mm
+            points = reconstruct_stripes(capture, stripes, calibration).points_mm
             off.append((points[:, 2] - surface_z(points[:, 0])) / np.hypot(1.0, LEAN))
     assert len(off[0]) == len(off[1]) == len(frame)
     assert np.abs(off[0]).min() > 0.005

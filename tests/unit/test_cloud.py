@@ -16,10 +16,9 @@ from plyfile import PlyData, PlyElement
 from tests.system.in_process import uwlts
 from tests.unit import drawn_stripes
 from uwlts.capture import Capture
-from uwlts.cloud import PointCloud, is_cloud, read_cloud, write_cloud
+from uwlts.cloud import PointCloud, PointUncertainty, is_cloud, read_cloud, write_cloud
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files import written_aside
-from uwlts.uncertainty.points import PointUncertainty
 
 KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
 

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.metrology.fits import fit_cylinder, fit_line, fit_plane, fit_robustly, fit_sphere
+from uwlts.metrology.flat_fits import fit_line, fit_plane
+from uwlts.metrology.robust_fit import fit_robustly
+from uwlts.metrology.round_fits import fit_cylinder, fit_sphere
 
 poses = st.tuples(
     st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(random_state=seed).as_matrix()),

@@ -16,17 +16,15 @@ from uwlts.calibration.parameter_keys import MediumIndex, StageParameter
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.calibration.sources import source_of
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
-from uwlts.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud, write_cloud
 from uwlts.errors import CalibrationError
-from uwlts.metrology.artefacts import PlaneStandard, SphereStandard, evaluate_cloud
-from uwlts.metrology.sphere_fit import fit_sphere
+from uwlts.metrology.artefact_descriptions import PlaneStandard, SphereStandard
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.metrology.round_fits import fit_sphere
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.sensor import Medium
-from uwlts.uncertainty.figures import figure_uncertainties, noise_mm
-from uwlts.uncertainty.moved_spheres import MovedSpheres
-from uwlts.uncertainty.points import PAIRS, PointUncertainty
-from uwlts.uncertainty.propagation import point_uncertainty, stripe_noise_px
-from uwlts.uncertainty.stage import stage_root
+from uwlts.uncertainty.figures import MovedSpheres, figure_uncertainties, noise_mm
+from uwlts.uncertainty.propagation import point_uncertainty, stage_root, stripe_noise_px
 
 BUILT = built_sensor()
 DRAWS = 400
@@ -191,7 +189,7 @@ def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesi
     grid = np.column_stack([rng.uniform(-20, 20, near.sum()), np.linspace(-60, 60, near.sum()), np.zeros(near.sum())])
     cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
     artefact = PlaneStandard(kind="plane")
-    found = figure_uncertainties(cloud, artefact, evaluate_cloud(cloud, artefact))
+    found = figure_uncertainties(cloud, evaluate_cloud(cloud, artefact))
     along, patterns = noise_mm(known), known.patterns_mm.astype(float)
     spread = []
     for _ in range(200):
@@ -229,7 +227,7 @@ def spheres():
 def test_spheres_follow_their_points_as_when_searched_for_again(spheres):
     """To the second order of moves by 0.05 mm and residuals by 0.05 mm over the radius of 25 mm."""
     evaluation = evaluate_cloud(spheres, DUMBBELL)
-    moved = MovedSpheres(spheres.points_mm, DUMBBELL, evaluation)
+    moved = MovedSpheres(spheres.points_mm, evaluation)
     for move in spheres.uncertainty.patterns_mm[:2].astype(float):
         again = evaluate_cloud(replace(spheres, points_mm=spheres.points_mm + move), DUMBBELL).figures_mm
         change = np.array(list(again.values())) - list(evaluation.figures_mm.values())
@@ -241,7 +239,7 @@ def test_spheres_follow_their_points_as_when_searched_for_again(spheres):
 def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
     """Of 200 draws a standard deviation is right to 5 %, of 50 for the noise to 10 %: 4 sigma."""
     evaluation, known = evaluate_cloud(spheres, DUMBBELL), spheres.uncertainty
-    found = figure_uncertainties(spheres, DUMBBELL, evaluation)
+    found = figure_uncertainties(spheres, evaluation)
     rng, along = np.random.default_rng(1), noise_mm(known)
     drawn = []
     for _ in range(200):
@@ -255,7 +253,7 @@ def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
         assert np.hypot(found[name].random_mm, found[name].systematic_mm) == pytest.approx(std, rel=0.45), name
     still = replace(spheres, uncertainty=replace(known, position_mm=np.zeros_like(known.position_mm)))
     name = "diameter error sphere 1"
-    assert figure_uncertainties(still, DUMBBELL, evaluation)[name].random_mm < 0.7 * found[name].random_mm
+    assert figure_uncertainties(still, evaluation)[name].random_mm < 0.7 * found[name].random_mm
 
 
 @pytest.mark.parametrize(("calibrated", "way"), [(True, 1.0), (True, -1.0), (False, 1.0)])

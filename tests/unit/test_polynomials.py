@@ -25,9 +25,9 @@ from uwlts.console import run
 from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.inventory import describe
 from uwlts.placement import camera_from_object
-from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
+from uwlts.reconstruction import reconstruct_by_polynomials
 from uwlts.refraction import RayStatus
-from uwlts.scan import reconstruct_capture
+from uwlts.scan import reconstruct
 from uwlts.sensor import Distortion, Medium
 from uwlts.targets import CircleTarget
 
@@ -507,19 +507,19 @@ def small(files):
 def test_captures_to_cloud(files, small):
     """Centres of drawn circles and lines are good to 0.02 px of 0.17 mm in Y; in Z a pixel is 0.4 mm."""
     with Capture(files["scan"]) as capture:
-        scan = reconstruct_capture(capture, small.calibration)
-        kept = scan.cloud.metadata
+        scan = reconstruct(capture, small.calibration)
+        kept = scan.metadata
     assert scan.rays_by_status["outside_calibration"] > 600, "the plane at 70 mm lies outside"
     assert set(scan.rays_by_status) == {status.name.lower() for status in RayStatus}
-    assert sorted(np.unique(scan.cloud.frame)) == [0, 1]
-    points, frame = scan.cloud.points_mm, scan.cloud.frame
+    assert sorted(np.unique(scan.frame)) == [0, 1]
+    points, frame = scan.points_mm, scan.frame
     sensor = small_sensor()
     for number, depth in ((0, -22.0), (1, 5.0)):
         own = frame == number
         assert np.count_nonzero(own) > 600
         assert np.abs(points[own, 2] - depth).max() < 0.02
         plane = on_plane(sensor, depth)
-        line = scan.cloud.line[own]
+        line = scan.line[own]
         row = np.argmin(np.abs(plane[..., 0]), axis=0)[line]
         # The nearest row's Y is off by half a row's; the plane's Y changes along a column by 3 % of a pixel at most.
         assert np.abs(points[own, 1] - plane[row, line, 1]).max() < 0.02 + 0.5 * 0.17 * 0.3
@@ -549,7 +549,7 @@ def test_captures_that_do_not_fit(files, small):
         Capture(files["water"]) as capture,
         pytest.raises(CalibrationError, match="made in pool .*polynomials in water"),
     ):
-        reconstruct_capture(capture, calibration)
+        reconstruct(capture, calibration)
     with Capture(files["scan"]) as capture:
         for changed, says in (
             ({"stripe_along": "height", "domains_px": calibration.domains_px[:500]}, "the stripe runs along"),
@@ -557,9 +557,9 @@ def test_captures_that_do_not_fit(files, small):
             ({"window_mounted": True}, "without the camera's window, the polynomials with"),
         ):
             with pytest.raises(CalibrationError, match=says):
-                reconstruct_capture(capture, calibration.model_copy(update=changed))
+                reconstruct(capture, calibration.model_copy(update=changed))
         with pytest.raises(CalibrationError, match="refractive index cannot replace"):
-            reconstruct_capture(capture, calibration, index=1.33)
+            reconstruct(capture, calibration, index=1.33)
 
 
 def test_water_of_another_index(files, small):
@@ -567,9 +567,9 @@ def test_water_of_another_index(files, small):
     warm = small.calibration.model_copy(update={"medium": Medium(kind="fresh", temperature_c=30.0)})
     with Capture(files["water"]) as capture:
         with pytest.raises(CalibrationError, match="hold in the medium they were made in only"):
-            reconstruct_capture(capture, warm)
+            reconstruct(capture, warm)
         near = small.calibration.model_copy(update={"medium": Medium(kind="fresh", temperature_c=22.0)})
-        assert len(reconstruct_capture(capture, near).cloud) > 1200
+        assert len(reconstruct(capture, near)) > 1200
 
 
 def test_captures_that_are_refused(files, tmp_path):

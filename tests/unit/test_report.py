@@ -21,12 +21,19 @@ from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.evaluate import judge, write_evaluation
+from uwlts.evaluate import evaluate, write_evaluation
 from uwlts.library import load_sensor
+<<<<<<< HEAD
 from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.report import plot
 from uwlts.report.campaign_page import report_page, write_report
 from uwlts.report.gather import gather_campaign, load_reference
+=======
+from uwlts.report.cloud_picture import cloud_picture
+from uwlts.report.colours import PLAIN, UNKNOWN, colour_limit_mm, coloured
+from uwlts.report.figures import MOST_POINTS, cloud_figure, histogram_figure
+from uwlts.report.gather import gather_campaign
+>>>>>>> 2a39051 (Evaluations, clouds and verifications as typed results with one model for the evaluation file; metrology, uncertainty and cloud in fewer modules)
 from uwlts.report.numbers import as_fine_as, fixed, small_length
 from uwlts.report.page_toolkit import png_of, svg_of
 from uwlts.report.pictures import StripeView, stripe_picture, write_pictures
@@ -100,9 +107,9 @@ def cloud_of(points: np.ndarray, capture: str, artefact: dict, calibration: Cali
 
 def write_measurement(folder, name, points, artefact, calibration, *, truth=None, cloud_name=None):
     cloud = cloud_of(points, f"{name}.h5", artefact, calibration)
-    judgement = judge(cloud, artefact=parse_artefact(artefact), truth=truth, source=f"{name}.ply")
-    write_evaluation(folder / f"{name}.evaluation.json", judgement)
-    write_cloud(folder / f"{cloud_name or name}.ply", judgement.cloud)
+    evaluation = evaluate(cloud, artefact, truth, source=f"{name}.ply")
+    write_evaluation(folder / f"{name}.evaluation.json", evaluation)
+    write_cloud(folder / f"{cloud_name or name}.ply", evaluation.cloud)
     return cloud
 
 

@@ -15,7 +15,7 @@ from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.errors import CalibrationError, CaptureError, RangeError
 from uwlts.library import load_sensor
 from uwlts.reconstruction import reconstruct_profile
-from uwlts.scan import reconstruct_capture, reconstruct_stripes
+from uwlts.scan import reconstruct, reconstruct_stripes
 from uwlts.sensor import Medium
 from uwlts.stripe import StripeOptions, find_stripes
 from uwlts.targets import ChessboardTarget
@@ -97,7 +97,7 @@ def test_captures_without_stripes_are_refused(tmp_path, how, message):
 
 def test_both_halves_make_the_whole(path):
     with Capture(path) as capture:
-        whole = reconstruct_capture(capture, CALIBRATION)
+        whole = reconstruct(capture, CALIBRATION)
         stripes = find_stripes(capture)
         halves = reconstruct_stripes(capture, stripes, CALIBRATION)
     np.testing.assert_array_equal(halves.cloud.points_mm, whole.cloud.points_mm)
@@ -119,10 +119,10 @@ def test_centres_from_elsewhere_are_what_is_reconstructed(path):
             CALIBRATION, moved.line, moved.centre_px, medium_index=index, stage_mm=2.0 * moved.frame,
             stage_direction=np.array([1.0, 0.0, 0.0]),
         )  # fmt: skip
-        np.testing.assert_allclose(scan.cloud.points_mm, expected.points_mm, atol=1e-12)
+        np.testing.assert_allclose(scan.points_mm, expected.points_mm, atol=1e-12)
         other = reconstruct_stripes(capture, moved, CALIBRATION, index=1.36)
-        assert np.abs(other.cloud.points_mm - scan.cloud.points_mm).max() > 0.1
-        assert (scan.cloud.metadata["medium_index"], other.cloud.metadata["medium_index"]) == (index, 1.36)
+        assert np.abs(other.points_mm - scan.points_mm).max() > 0.1
+        assert (scan.metadata["medium_index"], other.metadata["medium_index"]) == (index, 1.36)
         with pytest.raises(RangeError, match="refractive index"):
             reconstruct_stripes(capture, moved, CALIBRATION, index=0.9)
 
@@ -150,12 +150,12 @@ def test_a_calibration_without_a_window_holds_in_its_own_medium(tmp_path, calibr
         if refusal is None:
             check_fits(capture.header, calibration, source=capture.path.name)
             scan = reconstruct_stripes(capture, find_stripes(capture), calibration)
-            assert len(scan.cloud) == scan.rays_by_status["ok"] > 400
+            assert len(scan) == scan.rays_by_status["ok"] > 400
             return
         def fits(c, k):
             check_fits(c.header, k, source=c.path.name)
 
-        for use in (fits, reconstruct_capture, lambda c, k: reconstruct_stripes(c, find_stripes(c), k)):
+        for use in (fits, reconstruct, lambda c, k: reconstruct_stripes(c, find_stripes(c), k)):
             with pytest.raises(CalibrationError, match=refusal):
                 use(capture, calibration)
 
@@ -166,14 +166,14 @@ def test_a_single_viewpoint_measures_along_straight_rays(tmp_path):
         stripes = find_stripes(capture)
         scan = reconstruct_stripes(capture, stripes, single_viewpoint(FRESH))
         other = reconstruct_stripes(capture, stripes, single_viewpoint(FRESH), index=1.4)
-    np.testing.assert_array_equal(scan.cloud.points_mm, other.cloud.points_mm)
+    np.testing.assert_array_equal(scan.points_mm, other.points_mm)
 
 
 def test_the_window_taken_off_is_left_out(tmp_path):
     with Capture(write(tmp_path / "bare.h5", medium=AIR, sensor=small_sensor(mounted=False))) as capture:
         stripes = find_stripes(capture)
-        bare = reconstruct_stripes(capture, stripes, CALIBRATION).cloud.points_mm
-        straight = reconstruct_stripes(capture, stripes, single_viewpoint(AIR)).cloud.points_mm
+        bare = reconstruct_stripes(capture, stripes, CALIBRATION).points_mm
+        straight = reconstruct_stripes(capture, stripes, single_viewpoint(AIR)).points_mm
     np.testing.assert_array_equal(bare, straight)
 
 

@@ -20,8 +20,7 @@ from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, read_cloud
 from uwlts.errors import EvaluationError
-from uwlts.evaluate import judge
-from uwlts.metrology.artefact_descriptions import parse_artefact
+from uwlts.evaluate import evaluate
 from uwlts.thesis.campaign import ScanFile
 from uwlts.thesis.measurements import METHODS, _figures, _line_length, _range_within, measure_scan
 from uwlts.thesis.sphere_spacing import sphere_scan
@@ -144,7 +143,7 @@ def test_figures_of_a_plane_stand_beside_those_of_all_points():
         points_mm=points, intensity=np.ones(4000), frame=np.repeat(np.arange(40), 100), line=np.arange(4000),
         metadata={},
     )  # fmt: skip
-    figures = _figures(judge(cloud, artefact=parse_artefact({"kind": "plane"}), truth=None, source="plane"))
+    figures = _figures(evaluate(cloud, {"kind": "plane"}))
     # Of 4000 normal numbers the largest lie about 3.5 standard deviations out, of all but 0.3 % of them 2.97.
     assert figures["STD"] == pytest.approx(0.05, rel=0.05)
     assert figures["RE"] == pytest.approx(2 * 2.97 * 0.05, rel=0.05)

@@ -12,7 +12,7 @@ from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.window import label_step, solve_window
 from uwlts.calibration.window import step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
-from uwlts.metrology.treads import Tread
+from uwlts.metrology.step_faces import StepFace
 
 SENSOR = built_sensor()
 AIR = nominal_calibration(SENSOR).model_copy(update={"window": None})
@@ -52,11 +52,11 @@ def test_exact_steps_give_the_exact_distance(window):
 
 def test_labels_keep_to_their_treads():
     for step, profile in zip(clean_steps(PLATE), nine_steps(), strict=True):
-        assert min(np.count_nonzero(step.labels == tread) for tread in (Tread.LOWER, Tread.UPPER)) > 100
+        assert min(np.count_nonzero(step.labels == tread) for tread in (StepFace.LOWER, StepFace.UPPER)) > 100
         points = reconstructed(
             AIR, PLATE.model_copy(update={"distance_mm": DISTANCE}), step.pixels, medium_index=step.medium_index
         )
-        block = points[step.labels == Tread.UPPER]
+        block = points[step.labels == StepFace.UPPER]
         distances = np.linalg.norm(block[:, None] - profile[None, ::4, 1:], axis=2).min(axis=1)
         # Neighbouring points of the profile are 0.12 mm apart; every fourth is compared.
         assert distances.max() < 0.3

@@ -36,6 +36,11 @@ def read_any_calibration(path: str | Path) -> AnyCalibration:
     return read_polynomials(path) if kind == FORMAT else read_calibration(path)
 
 
+def loaded_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:
+    """The calibration itself, or the one in a file; CaptureError as from `read_any_calibration`."""
+    return read_any_calibration(calibration) if isinstance(calibration, str | Path) else calibration
+
+
 def calibration_digest(calibration: AnyCalibration) -> str:
     """Short digest that identifies a calibration, as the clouds made with it name it."""
     return hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]

@@ -9,7 +9,7 @@ from scipy.optimize import brentq, least_squares
 
 from uwlts.calibration.model import Calibration, WindowModel
 from uwlts.errors import CalibrationError
-from uwlts.metrology.treads import Tread, label_treads, step_height_of_profile
+from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile
 from uwlts.reconstruction import points_on_sheet
 
 _CURVE_POINTS = 31
@@ -33,7 +33,7 @@ class StepImage:
     medium_index : float
         Refractive index of the medium relative to air.
     labels : (N,)
-        `Tread` of every pixel, from `label_step`.
+        `StepFace` of every pixel, from `label_step`.
     reference : {"lower", "upper"}
         The tread to which the line is fitted.
     """
@@ -110,8 +110,8 @@ def label_step(
     """
     points = step_profile(calibration, window, pixels, medium_index=medium_index)
     found = np.isfinite(points).all(axis=1)
-    labels = np.full(len(points), int(Tread.NEITHER), dtype=np.int8)
-    labels[found] = label_treads(points[found], height_mm=height_mm, edge_mm=edge_mm)
+    labels = np.full(len(points), int(StepFace.NEITHER), dtype=np.int8)
+    labels[found] = label_step_faces(points[found], height_mm=height_mm, edge_mm=edge_mm)
     return StepImage(pixels, height_mm, medium_index, labels, reference)
 
 
@@ -211,7 +211,7 @@ def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[Step
     heights = np.full((len(steps), 2), np.nan)
     for index in {step.medium_index for step in steps}:
         here = [number for number, step in enumerate(steps) if step.medium_index == index]
-        treads = [steps[number].labels != Tread.NEITHER for number in here]
+        treads = [steps[number].labels != StepFace.NEITHER for number in here]
         pixels = np.vstack([steps[number].pixels[on_it] for number, on_it in zip(here, treads, strict=True)])
         points = step_profile(calibration, at_distance, pixels, medium_index=index)
         ends = np.cumsum([np.count_nonzero(on_it) for on_it in treads])

@@ -1,12 +1,11 @@
-"""Commands from captures to judged point clouds."""
+"""Commands from captures to evaluated point clouds."""
 
-import tomllib
 from pathlib import Path
 from typing import Literal
 
 from uwlts.commands.options import Flag, Method, app
 from uwlts.console import progress_bar
-from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.errors import OutputError
 from uwlts.files import refuse_unsuitable
 
 
@@ -46,26 +45,25 @@ def reconstruct(
     from uwlts.calibration.any_calibration import read_any_calibration
     from uwlts.capture import Capture
     from uwlts.cloud import write_cloud
-    from uwlts.scan import reconstruct_capture
-    from uwlts.stripe import StripeOptions
+    from uwlts.scan import reconstruct as reconstructed
+    from uwlts.stripe import PeakRule, StripeMethod, StripeOptions
 
     refuse_unsuitable(out, overwrite=overwrite)
-    options = StripeOptions(peak=peak) if method is None else StripeOptions(method=method, peak=peak)
+    options = StripeOptions(method=StripeMethod(method or StripeOptions.method), peak=PeakRule(peak))
     known = read_any_calibration(calibration)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
-        scan = reconstruct_capture(
-            opened, known, options=options, index=index, with_uncertainty=known.joint is not None, progress=progress
-        )
+        cloud = reconstructed(opened, known, options=options, index=index, progress=progress)
         lit = int(opened.laser_on.sum())
-    write_cloud(out, scan.cloud, overwrite=overwrite)
-    lines = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in scan.lines_by_status.items() if count)
-    print(f"laser images with a point: {len(set(scan.cloud.frame.tolist()))} of {lit}")
-    print(f"profile lines: {lines}")
-    lost = {name: count for name, count in scan.rays_by_status.items() if count and name != "ok"}
-    if lost:
-        reasons = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in lost.items())
-        print(f"stripe centres without a point: {reasons}")
-    print(f"wrote {out} with {len(scan.cloud)} points")
+    write_cloud(out, cloud, overwrite=overwrite)
+    print(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
+    print(f"profile lines: {_counts(cloud.lines_by_status)}")
+    if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
+        print(f"stripe centres without a point: {lost}")
+    print(f"wrote {out} with {len(cloud)} points")
+
+
+def _counts(by_status: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in by_status.items() if count)
 
 
 @app.command
@@ -78,7 +76,7 @@ def evaluate(
     coloured: Path | None = None,
     overwrite: Flag = False,
 ) -> None:
-    """Judge a cloud by its artefact's calibrated values, and point by point by a truth file.
+    """Compare a cloud with its artefact's calibrated values, and point by point with a truth file.
 
     Example: uwlts evaluate spheres.ply --truth spheres.truth.h5 --out spheres.evaluation.json
 
@@ -97,27 +95,19 @@ def evaluate(
     overwrite
         Replace existing files.
     """
-    from uwlts.cloud import read_cloud, write_cloud
-    from uwlts.evaluate import judge, write_evaluation
+    from uwlts.cloud import write_cloud
+    from uwlts.evaluate import evaluate as evaluated
+    from uwlts.evaluate import write_evaluation
     from uwlts.inventory import evaluation_lines
-    from uwlts.metrology.artefact_descriptions import parse_artefact
-    from uwlts.truth import read_truth
 
     for path in (out, coloured):
         if path:
             refuse_unsuitable(path, overwrite=overwrite)
-    points = read_cloud(cloud)
-    table = _read_toml(artefact) if artefact else points.metadata.get("artefact")
-    judgement = judge(
-        points,
-        artefact=parse_artefact(table) if table else None,
-        truth=read_truth(truth)[1] if truth else None,
-        source=cloud.name,
-    )
-    write_evaluation(out, judgement, overwrite=overwrite)
+    evaluation = evaluated(cloud, artefact, truth)
+    write_evaluation(out, evaluation, overwrite=overwrite)
     if coloured:
-        write_cloud(coloured, judgement.cloud, overwrite=overwrite)
-    print("\n".join(evaluation_lines(judgement.content)))
+        write_cloud(coloured, evaluation.cloud, overwrite=overwrite)
+    print("\n".join(evaluation_lines(evaluation.record())))
     print(f"wrote {out}")
 
 
@@ -169,12 +159,3 @@ def report(
         write_pictures(pictures, campaign, overwrite=overwrite)
     print_table(summary_table(campaign, published))
     print(f"wrote {page} and {page.with_name('summary.json')}")
-
-
-def _read_toml(path: Path) -> dict[str, object]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise DescriptionError(f"{path} is not valid TOML: {error}") from error

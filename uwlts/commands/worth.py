@@ -6,7 +6,7 @@ from typing import Literal
 
 from uwlts.commands.options import Files, Flag, Method, app, warn
 from uwlts.console import progress_bar
-from uwlts.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError
 
 
 @app.command
@@ -162,21 +162,15 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
     capture
         Scan of an artefact with calibrated sizes.
     calibration
-        Calibration of the sensor; a joint one tells how well it measures.
+        Calibration of the sensor; a joint one holds its uncertainty.
     limit
         Largest permissible error in mm.
     """
-    from uwlts.calibration.any_calibration import read_any_calibration
-    from uwlts.capture import Capture
-    from uwlts.verify import verify as measured
+    from uwlts.verify import verify as verified
 
-    if limit is not None and not limit > 0:
-        raise RangeError(f"--limit is {limit:g} mm; a permissible error is positive")
-    known = read_any_calibration(calibration)
-    with Capture(capture) as opened:
-        verdicts = measured(opened, known, limit_mm=limit)
-    print("\n".join(verdict.words() for verdict in verdicts))
-    if not all(verdict.passed for verdict in verdicts):
+    verification = verified(capture, calibration, limit)
+    print(verification.text)
+    if not verification.passed:
         print("FAIL")
         sys.exit(1)
     print("pass")

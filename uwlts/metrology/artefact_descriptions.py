@@ -1,10 +1,12 @@
 """Descriptions of artefacts with their calibrated sizes, distinguished by `kind`."""
 
+import tomllib
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.errors import EvaluationError
+from uwlts.errors import CaptureError, DescriptionError, EvaluationError
 from uwlts.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6
@@ -47,7 +49,7 @@ class PlaneStandard(Description):
 
 
 class StepStandard(Description):
-    """Parallel treads at two levels, one step or several of the same height (base - block - base)."""
+    """Parallel faces at two levels, one step or several of the same height (base - block - base)."""
 
     kind: Literal["step"] = "step"
     height_mm: Positive
@@ -74,3 +76,20 @@ def parse_artefact(table: dict[str, Any]) -> Artefact:
     except ValidationError as error:
         details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
         raise EvaluationError(f"the artefact's description is not valid: {details}") from error
+
+
+def read_artefact(path: str | Path) -> Artefact:
+    """An artefact's description from a TOML file.
+
+    Raises
+    ------
+    CaptureError, DescriptionError, EvaluationError
+        The file cannot be read, is no TOML, or does not describe an artefact.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
+    return parse_artefact(table)

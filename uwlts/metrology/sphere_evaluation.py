@@ -8,9 +8,9 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.metrology.artefact_descriptions import SphereStandard
-from uwlts.metrology.evaluation import TOWARDS_SENSOR, Evaluation, spread_mm
+from uwlts.metrology.evaluation import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
 from uwlts.metrology.robust_fit import RobustFit, fit_robustly
-from uwlts.metrology.sphere_fit import SphereFit, fit_sphere
+from uwlts.metrology.round_fits import SphereFit, fit_sphere
 from uwlts.metrology.sphere_search import LEAST_POINTS, FoundSphere, find_sphere
 
 # Orders of the spheres whose misfit to the calibrated sizes differs by less than this share of the smallest diameter
@@ -56,11 +56,12 @@ class SpacingResult:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SphereEvaluation(Evaluation):
+class SphereEvaluation(ArtefactEvaluation):
     """Spheres in the order of the artefact's description, and the spacings between consecutive ones."""
 
     kind: ClassVar[str] = "spheres"
 
+    artefact: SphereStandard
     spheres: tuple[SphereResult, ...]
     spacings: tuple[SpacingResult, ...]
 
@@ -79,18 +80,19 @@ class SphereEvaluation(Evaluation):
         """Sphere spacing error of the largest size, with its sign; None for a single sphere."""
         return max((spacing.sse_mm for spacing in self.spacings), key=abs, default=None)
 
-    @property
-    def figures_mm(self) -> dict[str, float]:
-        figures = {"PE": self.pe_mm, "STD": self.std_mm}
+    def values_mm(self) -> dict[FigureId, float | None]:
+        values: dict[FigureId, float | None] = {
+            (Quantity.PROBING_ERROR, ()): self.pe_mm,
+            (Quantity.STD, ()): self.std_mm,
+        }
         for number, sphere in enumerate(self.spheres, start=1):
-            figures[f"PE sphere {number}"] = sphere.pe_mm
-            figures[f"STD sphere {number}"] = sphere.std_mm
-            figures[f"diameter error sphere {number}"] = sphere.diameter_error_mm
+            values[Quantity.PROBING_ERROR, (number,)] = sphere.pe_mm
+            values[Quantity.STD, (number,)] = sphere.std_mm
+            values[Quantity.DIAMETER_ERROR, (number,)] = sphere.diameter_error_mm
         for number, spacing in enumerate(self.spacings, start=1):
-            pair = "" if len(self.spacings) == 1 else f" {number}-{number + 1}"
-            figures[f"SSE{pair}"] = spacing.sse_mm
-            figures[f"SSE{pair} known radius"] = spacing.sse_known_radius_mm
-        return figures
+            values[Quantity.SPACING_ERROR, (number, number + 1)] = spacing.sse_mm
+            values[Quantity.SPACING_ERROR_KNOWN_RADIUS, (number, number + 1)] = spacing.sse_known_radius_mm
+        return values
 
 
 def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int = 0) -> SphereEvaluation:
@@ -130,6 +132,7 @@ def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int 
         )
     pairs = zip(pairwise(fits), artefact.spacings_mm, strict=True)
     return SphereEvaluation(
+        artefact=artefact,
         points_used=sum(sphere.points_used for sphere in spheres),
         points_rejected=sum(sphere.points_rejected for sphere in spheres),
         deviation_mm=deviation,

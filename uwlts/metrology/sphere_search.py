@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from uwlts.errors import EvaluationError
 from uwlts.metrology.robust_fit import DEFAULT_K, MAD_TO_STD, RobustFit, fit_robustly
-from uwlts.metrology.sphere_fit import SphereFit, fit_sphere
+from uwlts.metrology.round_fits import SphereFit, fit_sphere
 
 LEAST_POINTS = 50
 """A sphere is judged by at least so many points."""

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 
 import uwlts
 from uwlts.calibration.model import Calibration
+from uwlts.evaluation_file import ArtefactFigures, TruthComparisons, TruthFigures
 from uwlts.report import plot
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference
-from uwlts.report.judged import ArtefactFigures, TruthComparisons, TruthFigures
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.report.page_toolkit import (
     Comparison,

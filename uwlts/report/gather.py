@@ -15,8 +15,8 @@ from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.capture import Capture, CaptureHeader
 from uwlts.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.errors import CaptureError, DescriptionError
+from uwlts.evaluation_file import EvaluationRecord, read_evaluation
 from uwlts.library import find, read_table
-from uwlts.report.judged import Judged, read_judged
 from uwlts.sensor import Sensor
 from uwlts.truth import read_truth
 
@@ -56,7 +56,7 @@ class Measurement:
 
     name: str
     cloud: PointCloud | None
-    judged: Judged | None
+    judged: EvaluationRecord | None
     capture: GatheredCapture | None
     calibration: GatheredCalibration | None
 
@@ -132,7 +132,7 @@ def gather_campaign(folder: str | Path) -> Campaign:
     calibrations = [_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)]
     calibrations.sort(key=lambda found: (len(found.name), found.name))
     clouds = {path.stem: read_cloud(path) for path in [*filter(is_cloud, in_hdf5), *_files(folder, "*.ply")]}
-    judged = {path.name.removesuffix(_EVALUATION): read_judged(path) for path in _files(folder, f"*{_EVALUATION}")}
+    judged = {path.name.removesuffix(_EVALUATION): read_evaluation(path) for path in _files(folder, f"*{_EVALUATION}")}
     if not (clouds or judged or calibrations):
         raise CaptureError(
             f"{folder} holds {len(captures)} captures, but no cloud (.ply or .h5), evaluation ({_EVALUATION}) or "
@@ -170,7 +170,7 @@ def _calibration(path: Path) -> GatheredCalibration:
     return GatheredCalibration(path.stem, calibration, calibration_digest(calibration))
 
 
-def _paired(clouds: dict[str, PointCloud], judged: dict[str, Judged]) -> dict[str, str | None]:
+def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, str | None]:
     """Name of the cloud of every measurement: an evaluation and its cloud, or a cloud without any evaluation.
 
     The cloud has the evaluation's name, or the one it gives. Where it holds no deviations, a copy of it that does, as
@@ -196,7 +196,7 @@ def _paired(clouds: dict[str, PointCloud], judged: dict[str, Judged]) -> dict[st
 def _measurement(
     name: str,
     cloud: PointCloud | None,
-    judged: Judged | None,
+    judged: EvaluationRecord | None,
     captures: dict[str, GatheredCapture],
     calibrations: dict[str, GatheredCalibration],
 ) -> Measurement:

@@ -1,27 +1,27 @@
 """The campaign's key figures as plain JSON."""
 
 import json
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from uwlts.evaluation_file import TruthFigures
 from uwlts.files import written_aside
+from uwlts.metrology.evaluation import Quantity
 from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
-from uwlts.report.judged import TruthFigures
 from uwlts.report.tables import true_window_distance
 
 KEY_FIGURES = {
-    "sphere_spacing_error_mm": ("spheres", "SSE"),
-    "probing_error_mm": ("spheres", "PE"),
-    "std_mm": (None, "STD"),
-    "step_height_error_mm": ("step", "height error"),
-    "pipe_diameter_error_mm": ("pipe", "diameter error"),
-    "plane_range_error_mm": ("plane", "RE"),
+    "sphere_spacing_error_mm": ("spheres", Quantity.SPACING_ERROR),
+    "probing_error_mm": ("spheres", Quantity.PROBING_ERROR),
+    "std_mm": (None, Quantity.STD),
+    "step_height_error_mm": ("step", Quantity.HEIGHT_ERROR),
+    "pipe_diameter_error_mm": ("pipe", Quantity.DIAMETER_ERROR),
+    "plane_range_error_mm": ("plane", Quantity.RANGE_ERROR),
 }
-"""Key figures by name: kind of the artefact (None: any), and the evaluation's figure, one for every pair of spheres."""
+"""Key figures by name: kind of the artefact (None: any) and quantity; details are left out."""
 
 
 def summary(campaign: Campaign, reference: Reference | None = None) -> dict[str, Any]:
@@ -70,16 +70,21 @@ def write_summary(
 
 def _key_figures(measurements: Iterable[Measurement]) -> dict[str, Any]:
     figures = {}
-    for key, (kind, figure) in KEY_FIGURES.items():
-        wanted, values = re.compile(rf"{figure}( \d+-\d+)?"), {}
+    for name, (kind, quantity) in KEY_FIGURES.items():
+        values = {}
         for measurement in measurements:
             evaluation = None if measurement.judged is None else measurement.judged.evaluation
             if evaluation is None or kind not in (None, evaluation.kind):
                 continue
-            found = [value for name, value in evaluation.figures_mm.items() if wanted.fullmatch(name)]
+            keys = measurement.judged.figure_keys()
+            found = [
+                value
+                for figure, value in evaluation.figures_mm.items()
+                if figure in keys and keys[figure].quantity is quantity and not keys[figure].is_detail
+            ]
             if found:
                 values[measurement.name] = max(found, key=abs)
-        figures[key] = {"mean_abs": _mean_abs(values.values()), "by_measurement": values}
+        figures[name] = {"mean_abs": _mean_abs(values.values()), "by_measurement": values}
     return figures
 
 

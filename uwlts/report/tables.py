@@ -1,7 +1,6 @@
 """Tables of a campaign: results of its measurements, and parameters and residuals of its calibrations."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,8 +13,7 @@ from rich.text import Text
 
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
-from uwlts.metrology.artefact_descriptions import Artefact
-from uwlts.metrology.calibrated import calibrated_quantity
+from uwlts.metrology.evaluation import FigureKey
 from uwlts.report.gather import CALIBRATION, Campaign, GatheredCalibration, Measurement, Reference
 from uwlts.report.numbers import fixed, is_number, plain, unit_of, words_of
 from uwlts.report.page_toolkit import MISSING, Comparison
@@ -27,7 +25,6 @@ _QUANTITIES = {
     "STD": "deviations STD",
     "range": "deviations range",
 }
-_DETAILS = re.compile(r"(PE|STD) sphere \d+|SSE.* known radius|profile height error")
 _ORDER = ("sphere spacing", "step height", "pipe diameter", "diameter", "probing", "range", "deviations", "ovality")
 _WIDTH = 110
 
@@ -96,10 +93,12 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
         return []
     rows = []
     if judged.evaluation is not None:
+        keys = judged.figure_keys()
         for figure, value in judged.evaluation.figures_mm.items():
-            if not _DETAILS.fullmatch(figure):
+            key = keys.get(figure)
+            if key is None or not key.is_detail:
                 published = () if reference is None else reference.values(measurement.known_as, figure)
-                rows.append(_figure_row(measurement.name, figure, value, judged.artefact, published))
+                rows.append(_figure_row(measurement.name, figure, value, key, published))
     rows.sort(key=_place)
     if judged.truth is not None:
         truth, fitted = judged.truth, judged.truth.after_best_fit
@@ -116,8 +115,8 @@ def _place(row: Row) -> int:
     return next((place for place, start in enumerate(_ORDER) if row.quantity.startswith(start)), len(_ORDER))
 
 
-def _figure_row(name: str, figure: str, value: float, artefact: Artefact | None, published: tuple[float, ...]) -> Row:
-    known = calibrated_quantity(figure, artefact)
+def _figure_row(name: str, figure: str, value: float, key: FigureKey | None, published: tuple[float, ...]) -> Row:
+    known = None if key is None else key.calibrated
     if known is None:
         return Row(name, _QUANTITIES.get(figure, figure), measured=value, published=published)
     true = known.value_mm

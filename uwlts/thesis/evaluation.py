@@ -18,8 +18,8 @@ from uwlts.calibration.polynomial_model import PolynomialCalibration
 from uwlts.calibration.procedure import CalibrationOptions, gather
 from uwlts.capture import Capture
 from uwlts.errors import CaptureError
-from uwlts.polynomial_reconstruction import reconstruct_by_polynomials
-from uwlts.scan import reconstruct_capture
+from uwlts.reconstruction import reconstruct_by_polynomials
+from uwlts.scan import reconstruct
 from uwlts.thesis.campaign import MEDIA, CampaignFolder, ScanFile, keep, kept, up_to_date
 from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED, THESIS, TWO, Measurement, calibrations, measure_scan
 from uwlts.thesis.monte_carlo import propagate
@@ -190,6 +190,6 @@ def _line_profile(folder: CampaignFolder, side: str) -> dict[str, Any] | None:
         return None
     with Capture(path) as capture:
         header = capture.header
-        scan = reconstruct_capture(capture, nominal_calibration(header.sensor, header.medium))
-    points = scan.cloud.points_mm[:, 1:]
+        scan = reconstruct(capture, nominal_calibration(header.sensor, header.medium))
+    points = scan.points_mm[:, 1:]
     return {"length_mm": float(np.ptp(points[:, 0])), "points_mm": np.round(points[::4], 3).tolist()}

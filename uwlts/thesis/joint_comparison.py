@@ -131,11 +131,11 @@ def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]
         artefact, stripes = parse_artefact(capture.header.artefact), find_stripes(capture)
         found: dict[str, Any] = {"placement": scan.placement, "medium": scan.medium}
         for way, calibration in known.items():
-            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=way == JOINT).cloud
+            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=way == JOINT)
             evaluation = evaluate_cloud(cloud, artefact)
             found[way] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
             if way == JOINT:
-                std = figure_uncertainties(cloud, artefact, evaluation)
+                std = figure_uncertainties(cloud, evaluation)
                 found["std"] = {name: std[name].expanded_mm / 2 for name in found[way]}
     return found
 
@@ -144,7 +144,7 @@ def _of_plane(scan: ScanFile, joint: Calibration) -> dict[str, Any]:
     """Scatter of a plane about its fit, over the speckle limit along the laser's axis at its distance."""
     with Capture(scan.path) as capture:
         header = capture.header
-        cloud = reconstruct_stripes(capture, find_stripes(capture), joint).cloud
+        cloud = reconstruct_stripes(capture, find_stripes(capture), joint)
         std_mm = evaluate_cloud(cloud, parse_artefact(header.artefact)).figures_mm["STD"]
         setup, leaning = nominal_setup(header.sensor, header.medium)
         frame = joint.object_transform()

@@ -22,7 +22,7 @@ from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequential
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
-from uwlts.evaluate import Judgement, judge
+from uwlts.evaluate import Evaluation, evaluate
 from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
 from uwlts.scan import reconstruct_stripes
@@ -172,34 +172,33 @@ def measure_scan(
             for method in methods:
                 about = scan.thing, scan.placement, scan.medium, method, processing
                 try:
-                    cloud = reconstruct_stripes(capture, stripes, calibrations[method, scan.medium]).cloud
-                    judgement = judge(cloud, artefact=artefact, truth=truth, source=scan.path.name)
+                    cloud = reconstruct_stripes(capture, stripes, calibrations[method, scan.medium])
+                    evaluation = evaluate(cloud, artefact, truth)
                 except (CalibrationError, CaptureError, EvaluationError) as error:
                     found.append(Measurement(*about, figures_mm={}, failure=str(error)))
                     continue
-                figures = _figures(judgement) | {"line length": _line_length(cloud)}
+                figures = _figures(evaluation) | {"line length": _line_length(cloud)}
                 found.append(Measurement(*about, figures_mm=figures, points=len(cloud)))
                 if scan.thing in _SHOWN and processing == OURS:
                     name = f"{scan.path.stem}-{method.replace(' ', '-')}.ply"
-                    write_cloud(clouds / name, judgement.cloud, overwrite=True)
+                    write_cloud(clouds / name, evaluation.cloud, overwrite=True)
     return found
 
 
-def _figures(judgement: Judgement) -> dict[str, float]:
+def _figures(evaluation: Evaluation) -> dict[str, float]:
     """The artefact's figures; of a free form the spread about the true surface after a best fit is the STD.
 
     PE and RE leave out the 0.3 % of the points that lie farthest off, as VDI/VDE 2634 allows: the published ranges of
     4 to 6 standard deviations of more than ten thousand points cannot be had without. The full ranges stand beside.
     """
-    content = judgement.content
-    figures = dict(content["evaluation"]["figures_mm"]) if content["evaluation"] else {}
+    figures = {figure.key.name: figure.value_mm for figure in evaluation.figures}
     for name in ("PE", "RE"):
         if name in figures:
             figures[f"{name} of all points"] = figures[name]
-            figures[name] = _range_within(judgement.cloud.deviation_mm)
-    if content["truth"]:
-        spread = content["truth"]["after_best_fit"]["std_mm"]
-        figures |= {"std to the true surface": spread} | ({} if content["evaluation"] else {"STD": spread})
+            figures[name] = _range_within(evaluation.cloud.deviation_mm)
+    if (fitted := evaluation.truth_after_best_fit) is not None:
+        spread = fitted.std_mm
+        figures |= {"std to the true surface": spread} | ({} if evaluation.artefact else {"STD": spread})
     return figures
 
 

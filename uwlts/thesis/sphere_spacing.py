@@ -14,7 +14,7 @@ from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.metrology.artefact_descriptions import SphereStandard
 from uwlts.metrology.sphere_evaluation import evaluate_spheres
-from uwlts.metrology.sphere_fit import fit_sphere
+from uwlts.metrology.round_fits import fit_sphere
 from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.scan import reconstruct_stripes
@@ -65,11 +65,11 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
     standard = SphereStandard.model_validate(capture.header.artefact)
     stripes = find_stripes(capture)
     scan = reconstruct_stripes(capture, stripes, calibration)
-    evaluation = evaluate_spheres(scan.cloud.points_mm, standard)
+    evaluation = evaluate_spheres(scan.points_mm, standard)
     centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
     radii = np.array(standard.diameters_mm) / 2
     used = np.isfinite(evaluation.deviation_mm)
-    away = np.abs(np.linalg.norm(scan.cloud.points_mm[used, None] - centres, axis=2) - radii)
+    away = np.abs(np.linalg.norm(scan.points_mm[used, None] - centres, axis=2) - radii)
     kept = scan.stripe[used]
     line, centre = stripes.line[kept], stripes.centre_px[kept]
     along_width = capture.header.sensor.camera.stripe_along == "width"

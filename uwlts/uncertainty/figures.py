@@ -1,34 +1,23 @@
-"""How well an artefact's figures are known, correlations between the points included."""
+"""Uncertainty of an artefact's figures, including the correlations between the points."""
 
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from uwlts.cloud import PointCloud
-from uwlts.metrology.artefacts import Artefact, Evaluation, SphereEvaluation, evaluate_cloud
-from uwlts.uncertainty.moved_spheres import MovedSpheres
-from uwlts.uncertainty.points import PAIRS, PointUncertainty
+from uwlts.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.metrology.artefact_descriptions import Artefact
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.metrology.evaluation import ArtefactEvaluation, FigureUncertainty, spread_mm
+from uwlts.metrology.round_fits import fit_sphere
+from uwlts.metrology.sphere_evaluation import SphereEvaluation
 
 # The standard deviation of as many is right to 27 % and to 10 %.
 _DRAWS, _QUICK_DRAWS = 8, 50
 _SEED = 635
 
 
-@dataclass(frozen=True)
-class FigureUncertainty:
-    """Standard uncertainties in mm of one figure: by noise of stripe and positions, and by calibration and stage."""
-
-    random_mm: float
-    systematic_mm: float
-
-    @property
-    def expanded_mm(self) -> float:
-        """Expanded uncertainty in mm with the coverage factor 2."""
-        return 2.0 * float(np.hypot(self.random_mm, self.systematic_mm))
-
-
-def figure_uncertainties(cloud: PointCloud, artefact: Artefact, evaluation: Evaluation) -> dict[str, FigureUncertainty]:
+def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> dict[str, FigureUncertainty]:
     """Uncertainty of the figures of an evaluation of a cloud; nothing where the cloud's points have none.
 
     Figures are calculated again with each pattern of the calibration added to the points; the squares of their changes
@@ -45,9 +34,9 @@ def figure_uncertainties(cloud: PointCloud, artefact: Artefact, evaluation: Eval
 
     plain, draws = evaluation.figures_mm, _DRAWS
     if isinstance(evaluation, SphereEvaluation):
-        figures_mm, draws = MovedSpheres(cloud.points_mm, artefact, evaluation).figures_mm, _QUICK_DRAWS
+        figures_mm, draws = MovedSpheres(cloud.points_mm, evaluation).figures_mm, _QUICK_DRAWS
     else:
-        figures_mm = partial(_evaluated, cloud, artefact)
+        figures_mm = partial(_evaluated, cloud, evaluation.artefact)
 
     def changed(by: np.ndarray) -> np.ndarray:
         figures = figures_mm(by)
@@ -82,3 +71,75 @@ def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
     largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
     rows = np.arange(len(covariance))
     return covariance[rows, largest] / np.sqrt(covariance[rows, largest, largest])[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class _MovedFit:
+    """A sphere's fit: its points (K,) in the cloud, centre, outward unit vectors (K, 3), residuals (K,), and a step.
+
+    ``solve`` (4 or 3, K) times changes of the residuals is how centre and, where it is free, radius follow them. Moves
+    are so small against the radius that the outward vectors stay.
+    """
+
+    used: np.ndarray
+    centre_mm: np.ndarray
+    outward: np.ndarray
+    residuals_mm: np.ndarray
+    solve: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, used: np.ndarray, radius_mm: float | None) -> "_MovedFit":
+        fit = fit_sphere(points[used], radius_mm)
+        outward = points[used] - fit.centre_mm
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        by_parameters = outward if radius_mm is not None else np.column_stack([outward, np.ones(len(used))])
+        solve = np.linalg.solve(by_parameters.T @ by_parameters, by_parameters.T)
+        return cls(used, fit.centre_mm, outward, fit.residuals_mm, solve)
+
+    def moved(self, moves: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+        """Centre (3,), change of the radius (0 where it is known) and residuals (K,) after moves (N, 3)."""
+        change = np.einsum("ni,ni->n", self.outward, moves[self.used])
+        step = self.solve @ change
+        by_radius = float(step[3]) if len(step) > 3 else 0.0
+        residuals = self.residuals_mm + change - self.outward @ step[:3] - by_radius
+        return self.centre_mm + step[:3], by_radius, residuals
+
+
+class MovedSpheres:
+    """The spheres of an evaluation of points (N, 3), in mm: the same points belong to each wherever they move."""
+
+    def __init__(self, points: np.ndarray, evaluation: SphereEvaluation):
+        self._evaluation = evaluation
+        diameters = evaluation.artefact.diameters_mm
+        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
+        centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
+        radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
+        off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
+        members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
+        self._free = [_MovedFit.of(points, own, None) for own in members]
+        self._known = [_MovedFit.of(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+
+    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
+        """The evaluation's figures after moves (N, 3) of all points."""
+        free = [fit.moved(moves) for fit in self._free]
+        known = [fit.moved(moves)[0] for fit in self._known]
+        spheres = [
+            replace(
+                sphere,
+                diameter_mm=sphere.diameter_mm + 2 * by_radius,
+                diameter_error_mm=sphere.diameter_error_mm + 2 * by_radius,
+                pe_mm=spread_mm(residuals),
+                std_mm=float(np.sqrt(residuals @ residuals / (len(residuals) - 4))),
+            )
+            for sphere, (_, by_radius, residuals) in zip(self._evaluation.spheres, free, strict=True)
+        ]
+        spacings = []
+        for number, spacing in enumerate(self._evaluation.spacings):
+            calibrated = spacing.spacing_mm - spacing.sse_mm
+            apart = float(np.linalg.norm(free[number + 1][0] - free[number][0]))
+            apart_known = float(np.linalg.norm(known[number + 1] - known[number]))
+            spacings.append(
+                replace(spacing, spacing_mm=apart, sse_mm=apart - calibrated,
+                        sse_known_radius_mm=apart_known - calibrated)
+            )  # fmt: skip
+        return replace(self._evaluation, spheres=tuple(spheres), spacings=tuple(spacings)).figures_mm

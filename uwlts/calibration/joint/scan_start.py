@@ -13,8 +13,8 @@ from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.metrology.artefact_descriptions import Pipe, PlaneStandard, SphereStandard, parse_artefact
+from uwlts.metrology.artefacts import PipeEvaluation, PlaneEvaluation, evaluate_pipe, evaluate_plane
 from uwlts.metrology.sphere_evaluation import SphereEvaluation, evaluate_spheres
-from uwlts.metrology.surface_evaluation import PipeEvaluation, PlaneEvaluation, evaluate_pipe, evaluate_plane
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.sensor import Sensor
 from uwlts.stripe import StripeOptions, find_stripes

@@ -9,7 +9,7 @@ from uwlts.calibration.model import Calibration, WindowModel
 from uwlts.calibration.parameter_keys import StepHeight
 from uwlts.calibration.procedure import step_image
 from uwlts.errors import CalibrationError, EvaluationError
-from uwlts.metrology.treads import Tread
+from uwlts.metrology.step_faces import StepFace
 
 
 def step_profiles(
@@ -25,10 +25,10 @@ def step_profiles(
         except EvaluationError as error:
             warnings.append(f"{step.source}: left out, {error}")
             continue
-        on_tread = image.labels != Tread.NEITHER
+        on_tread = image.labels != StepFace.NEITHER
         height, stated = step.standard.height_mm, step.standard.height_uncertainty_mm
         evidence = StepProfileEvidence(
-            view=view, pixels=image.pixels[on_tread], upper=image.labels[on_tread] == Tread.UPPER,
+            view=view, pixels=image.pixels[on_tread], upper=image.labels[on_tread] == StepFace.UPPER,
             upward=-transform[:3, 2], along=transform[:3, 1],
             across=1 if gathered.sensor.camera.stripe_along == "width" else 0,
             height=StepHeight(height), image=number,

@@ -1,4 +1,4 @@
-"""Treads of a step standard: which points lie on them, and how far they are apart.
+"""Faces of a step standard: the points on each and the distance between them.
 
 Points are (N, 2) of one profile (Y, Z) or (N, 3) of a scan (X, Y, Z); the last coordinate points away from the sensor.
 """
@@ -23,12 +23,12 @@ _LARGEST_STD = 0.125
 
 _PROPOSALS = 500
 _THINNED = 800
-_SMALLEST_TREAD = 0.02
+_SMALLEST_FACE = 0.02
 _ROUNDS = 5
 
 
-class Tread(IntEnum):
-    """Label of a point: on the tread farther from the sensor, on the nearer one, or on neither."""
+class StepFace(IntEnum):
+    """Label of a point: on the face farther from the sensor, on the nearer one, or on neither."""
 
     NEITHER = 0
     LOWER = 1
@@ -43,13 +43,13 @@ class StepHeight:
     std_mm: float
 
 
-def label_treads(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
-    """Tread of every point (N,) int8, as `Tread`.
+def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Face of every point (N,) int8, as `StepFace`.
 
     Two parallel lines (planes) about one height apart, within a quarter, are searched among the directions of random
-    pairs (triples) of points; the treads may be in several pieces (base - block - base) and lie at any angle. A point
-    belongs to a tread when it is nearer to it than five robust standard deviations (within 1 to 30 % of the height)
-    and, along the tread, farther than `edge_mm` from all points that are not on it: so the rounded, mixed points at
+    pairs (triples) of points; the faces may be in several pieces (base - block - base) and lie at any angle. A point
+    belongs to a face when it is nearer to it than five robust standard deviations (within 1 to 30 % of the height)
+    and, along the face, farther than `edge_mm` from all points that are not on it: so the rounded, mixed points at
     edges and the riser stay out.
 
     Parameters
@@ -65,15 +65,15 @@ def label_treads(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, 
     Raises
     ------
     EvaluationError
-        Too few points, or no two such treads; the message says what was found.
+        Too few points, or no two such faces; the message says what was found.
     """
     points = accepted_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
     proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
     if proposal is None:
         raise EvaluationError(
-            f"no two parallel treads about {height_mm:g} mm apart among {len(points)} points; "
-            f"show both treads, or correct the height"
+            f"no two parallel step faces about {height_mm:g} mm apart among {len(points)} points; "
+            f"show both faces, or correct the height"
         )
     normal, anchor, offset = proposal
     for _ in range(_ROUNDS):
@@ -83,16 +83,16 @@ def label_treads(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, 
     lower, upper = (on_anchor, on_other) if offset > 0 else (on_other, on_anchor)
     labels = np.zeros(len(points), dtype=np.int8)
     along = points @ np.linalg.svd(normal[None])[2][1:].T
-    for tread, on_it in ((Tread.LOWER, lower), (Tread.UPPER, upper)):
-        labels[_away_from_edges(along, on_it, edge_mm)] = tread
-    _require_treads(heights=points @ normal, labels=labels, height=height_mm, least=least)
+    for face, on_it in ((StepFace.LOWER, lower), (StepFace.UPPER, upper)):
+        labels[_away_from_edges(along, on_it, edge_mm)] = face
+    _require_faces(heights=points @ normal, labels=labels, height=height_mm, least=least)
     return labels
 
 
 def step_height_of_profile(
     points_yz: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
 ) -> StepHeight:
-    """Mean distance of one tread's points to the line through the other's, in one profile (thesis, section 3.2.2).
+    """Mean distance of one face's points to the line through the other's, in one profile (thesis, section 3.2.2).
 
     Where the sheet does not cut the step along its normal this is the height over the cosine of the angle between.
 
@@ -100,14 +100,14 @@ def step_height_of_profile(
     ----------
     points_yz : (N, 2), mm
     labels : (N,)
-        From `label_treads`. While points move a little, as in a calibration, the labels can stay.
+        From `label_step_faces`. While points move a little, as in a calibration, the labels can stay.
     reference : str
-        The tread to which the line is fitted.
+        The face to which the line is fitted.
 
     Raises
     ------
     EvaluationError
-        Too few points on a tread.
+        Too few points on a face.
     """
     return _step_height(points_yz, labels, reference, fit_line)
 
@@ -115,15 +115,15 @@ def step_height_of_profile(
 def step_height_of_scan(
     points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
 ) -> StepHeight:
-    """The same in a whole scan (N, 3), mm: mean distance to the plane through the other tread's points."""
+    """The same in a whole scan (N, 3), mm: mean distance to the plane through the other face's points."""
     return _step_height(points, labels, reference, fit_plane)
 
 
 def _step_height(points: np.ndarray, labels: np.ndarray, reference: str, fit) -> StepHeight:
-    base, other = (Tread.LOWER, Tread.UPPER) if reference == "lower" else (Tread.UPPER, Tread.LOWER)
+    base, other = (StepFace.LOWER, StepFace.UPPER) if reference == "lower" else (StepFace.UPPER, StepFace.LOWER)
     points = np.asarray(points, dtype=np.float64)
     surface: LineFit | PlaneFit = fit(points[labels == base])
-    across = accepted_points(points[labels == other], least=2, what="a tread", dimensions=(2, 3))
+    across = accepted_points(points[labels == other], least=2, what="a step face", dimensions=(2, 3))
     distances = surface.distances_mm(across)
     axes = surface.axes if isinstance(surface, PlaneFit) else surface.direction[None]
     lever = np.array([1.0, *(axes @ (across.mean(axis=0) - surface.point_mm))])
@@ -131,30 +131,32 @@ def _step_height(points: np.ndarray, labels: np.ndarray, reference: str, fit) ->
     return StepHeight(abs(float(distances.mean())), float(np.sqrt(variance)))
 
 
-def _require_treads(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
+def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
     """Two levels at the right distance, each with enough points and narrow: a slope or curve fills its whole band."""
-    lower, upper = heights[labels == Tread.LOWER], heights[labels == Tread.UPPER]
+    lower, upper = heights[labels == StepFace.LOWER], heights[labels == StepFace.UPPER]
     if min(len(lower), len(upper)) < least:
         raise EvaluationError(
-            f"no two treads about {height:g} mm apart: {len(lower)} points on the lower level, {len(upper)} on the "
-            f"upper one, at least {least} needed on each; show both treads, or correct the height"
+            f"no two step faces about {height:g} mm apart: {len(lower)} points on the lower level, {len(upper)} on the "
+            f"upper one, at least {least} needed on each; show both faces, or correct the height"
         )
     widest = max(float(lower.std()), float(upper.std()))
     if widest > _LARGEST_STD * height:
         raise EvaluationError(
-            f"no two treads about {height:g} mm apart: what lies at these levels scatters by {widest:.2g} mm "
-            f"(standard deviation) and is sloping or curved; show both treads, or correct the height"
+            f"no two step faces about {height:g} mm apart: what lies at these levels scatters by {widest:.2g} mm "
+            f"(standard deviation) and is sloping or curved; show both faces, or correct the height"
         )
     distance = float(upper.mean() - lower.mean())
     if abs(distance - height) > _HEIGHT_TOLERANCE * height:
-        raise EvaluationError(f"the treads found are {distance:.2f} mm apart; the step is described with {height:g} mm")
+        raise EvaluationError(
+            f"the step faces found are {distance:.2f} mm apart; the step is described with {height:g} mm"
+        )
 
 
 def _best_proposal(
     points: np.ndarray, height: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, float, float] | None:
-    """Normal towards the sensor, level of one tread and signed offset of the other, with most points on both."""
-    limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_TREAD * len(points))
+    """Normal towards the sensor, level of one face and signed offset of the other, with most points on both."""
+    limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_FACE * len(points))
     most, best = 0.0, None
     for normal in _proposed_normals(points, rng):
         heights = np.sort(points @ normal)
@@ -189,7 +191,7 @@ def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
 
 
 def _levels(heights: np.ndarray, anchor: float, offset: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N,) bool on the tread at the anchor's level, and on the one where points crowd most about an offset."""
+    """Points (N,) bool on the face at the anchor's level, and on the one where points crowd most about an offset."""
     height = abs(offset)
     about = np.sort(heights[np.abs(heights - anchor - offset) <= _HEIGHT_TOLERANCE * height])
     window = _SEARCH_LIMIT * height
@@ -212,15 +214,15 @@ def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
 
 def _common_normal(lower: np.ndarray, upper: np.ndarray, towards: np.ndarray) -> np.ndarray:
     """Normal (D,) of two parallel lines or planes, each through the middle of its points."""
-    treads = [tread - tread.mean(axis=0) for tread in (lower, upper) if len(tread)]
-    _, axes = principal_axes(np.vstack(treads))
+    faces = [face - face.mean(axis=0) for face in (lower, upper) if len(face)]
+    _, axes = principal_axes(np.vstack(faces))
     return axes[-1] if axes[-1] @ towards > 0 else -axes[-1]
 
 
 def _away_from_edges(along: np.ndarray, on_it: np.ndarray, edge: float) -> np.ndarray:
-    """Indices of the points of a tread that no other point comes near along the tread."""
-    tread, others = np.flatnonzero(on_it), along[~on_it]
-    if not len(others) or not len(tread) or edge == 0:
-        return tread
-    distance, _ = cKDTree(others).query(along[tread], distance_upper_bound=edge)
-    return tread[distance > edge]
+    """Indices of the points of a face that no other point comes near along the face."""
+    face, others = np.flatnonzero(on_it), along[~on_it]
+    if not len(others) or not len(face) or edge == 0:
+        return face
+    distance, _ = cKDTree(others).query(along[face], distance_upper_bound=edge)
+    return face[distance > edge]

@@ -1,4 +1,4 @@
-"""Cylinder by orthogonal distances, with free or known radius, from a patch of its surface."""
+"""Spheres and cylinders by orthogonal distances, with free or known radius."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,13 +16,97 @@ from uwlts.metrology.least_squares import (
     principal_axes,
     require_convergence,
 )
-from uwlts.metrology.round_starts import algebraic_centres, centre_of_known_radius
 
 _THINNED = 600
 _NEIGHBOURS = 12
 _DIRECTIONS = 80
 _TRIED = 5
 _LARGEST_SLOPE_STD = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class SphereFit:
+    """A sphere through points.
+
+    Attributes
+    ----------
+    centre_mm : (3,)
+    radius_mm : float
+        Fitted, or the known one.
+    residuals_mm : (N,)
+        |p - centre| - radius, positive outside.
+    std_mm : float
+        Standard deviation of the residuals, with N less the number of parameters as degrees of freedom.
+    covariance : (4, 4) or (3, 3), mm2
+        Of the centre and, where it was free, the radius, for equal independent noise on all points.
+    """
+
+    centre_mm: np.ndarray
+    radius_mm: float
+    residuals_mm: np.ndarray
+    std_mm: float
+    covariance: np.ndarray
+
+    def distances_mm(self, points: np.ndarray) -> np.ndarray:
+        """Signed distances (M,) of any points (M, 3), as in `residuals_mm`."""
+        return np.linalg.norm(np.asarray(points, dtype=np.float64) - self.centre_mm, axis=1) - self.radius_mm
+
+
+def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
+    """Least-squares sphere through points (N, 3), mm; a cap is enough.
+
+    Parameters
+    ----------
+    radius_mm : float, optional
+        Known radius; without it the radius is fitted.
+
+    Raises
+    ------
+    EvaluationError
+        Too few points (5, or 4 with known radius), points that are not finite or lie in one plane, or a cap so small
+        or noisy that the centre is uncertain by more than a fifth of the radius.
+    """
+    what = "a sphere fit"
+    points, unit, known = prepared_round(points, radius_mm, least=5, what=what)
+    parameters, cost = minimised(
+        lambda x: _sphere_residuals(x, unit.points, known),
+        lambda x: _sphere_jacobian(x, unit.points),
+        _sphere_start(unit.points, known),
+    )
+    require_convergence(cost, what=what)
+    covariance, std = covariance_of(_sphere_jacobian(parameters, unit.points), cost, what="a sphere")
+    radius = known if known is not None else float(parameters[3])
+    uncertainty = float(np.sqrt(np.trace(covariance[:3, :3])))
+    if uncertainty > LARGEST_RELATIVE_STD * radius:
+        raise EvaluationError(
+            f"the {len(points)} points do not determine a sphere: its centre would be uncertain by "
+            f"{uncertainty * unit.scale_mm:.3g} mm, its radius {radius * unit.scale_mm:.3g} mm; they may lie on a plane"
+        )
+    centre = unit.centroid_mm + unit.scale_mm * parameters[:3]
+    radius = radius_mm if radius_mm is not None else radius * unit.scale_mm
+    residuals = np.linalg.norm(points - centre, axis=1) - radius
+    return SphereFit(centre, float(radius), residuals, std * unit.scale_mm, covariance * unit.scale_mm**2)
+
+
+def _sphere_residuals(parameters: np.ndarray, points: np.ndarray, known: float | None) -> np.ndarray:
+    radius = parameters[3] if known is None else known
+    return np.linalg.norm(points - parameters[:3], axis=1) - radius
+
+
+def _sphere_jacobian(parameters: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """d|p - c| / dc is minus the unit vector from the centre; d/dr is -1."""
+    away = points - parameters[:3]
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), np.finfo(float).tiny)
+    jacobian = np.full((len(points), len(parameters)), -1.0)
+    np.negative(away, out=jacobian[:, :3])
+    return jacobian
+
+
+def _sphere_start(points: np.ndarray, known: float | None) -> np.ndarray:
+    if known is not None:
+        return centre_of_known_radius(points, known)
+    centre, radius = algebraic_centres(points)
+    return np.array([*centre, radius])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +167,14 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
     what = "a cylinder fit"
     points, unit, known = prepared_round(points, radius_mm, least=6, what=what)
     thinned = evenly_thinned(unit.points, _THINNED)
-    trials = [_refined(thinned, frame, start, known) for frame, start in _starts(thinned, known, axis_start)]
+    trials = [
+        _refined_cylinder(thinned, frame, start, known) for frame, start in _cylinder_starts(thinned, known, axis_start)
+    ]
     frame, start, _ = min(trials, key=lambda trial: trial[2])
-    frame, parameters, cost = _refined(unit.points, frame, start, known)
+    frame, parameters, cost = _refined_cylinder(unit.points, frame, start, known)
     require_convergence(cost, what=what)
 
-    covariance, std = covariance_of(_jacobian(parameters, unit.points, frame), cost, what="a cylinder")
+    covariance, std = covariance_of(_cylinder_jacobian(parameters, unit.points, frame), cost, what="a cylinder")
     radius = known if known is not None else float(parameters[4])
     sigma = np.sqrt(np.diag(covariance))
     if np.hypot(*sigma[:2]) > LARGEST_RELATIVE_STD * radius or np.hypot(*sigma[2:4]) > _LARGEST_SLOPE_STD:
@@ -112,7 +198,7 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
     )
 
 
-def _geometry(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray):
+def _cylinder_geometry(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray):
     """Radial vectors (N, 3), positions along the axis (N,), stretch of the direction a + s u + t v."""
     direction = frame[2] + parameters[2:4] @ frame[:2]
     stretch = float(np.linalg.norm(direction))
@@ -122,14 +208,16 @@ def _geometry(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray):
     return away - along[:, None] * direction, along, stretch
 
 
-def _residuals(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray, known: float | None) -> np.ndarray:
-    radial, _, _ = _geometry(parameters, points, frame)
+def _cylinder_residuals(
+    parameters: np.ndarray, points: np.ndarray, frame: np.ndarray, known: float | None
+) -> np.ndarray:
+    radial, _, _ = _cylinder_geometry(parameters, points, frame)
     return np.linalg.norm(radial, axis=1) - (parameters[4] if known is None else known)
 
 
-def _jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
+def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """With the radial unit vector e, normal to the axis: -e.u, -e.v; -along e.u / stretch, same with v; -1."""
-    radial, along, stretch = _geometry(parameters, points, frame)
+    radial, along, stretch = _cylinder_geometry(parameters, points, frame)
     radial /= np.maximum(np.linalg.norm(radial, axis=1, keepdims=True), np.finfo(float).tiny)
     across = radial @ frame[:2].T
     jacobian = np.full((len(points), len(parameters)), -1.0)
@@ -138,10 +226,10 @@ def _jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> 
     return jacobian
 
 
-def _refined(points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None):
+def _refined_cylinder(points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None):
     """Solution as (frame, parameters, cost) with the frame turned so that both slopes are zero."""
     parameters, cost = minimised(
-        lambda x: _residuals(x, points, frame, known), lambda x: _jacobian(x, points, frame), start
+        lambda x: _cylinder_residuals(x, points, frame, known), lambda x: _cylinder_jacobian(x, points, frame), start
     )
     turned = _frame(frame[2] + parameters[2:4] @ frame[:2])
     foot = turned[:2] @ (parameters[:2] @ frame[:2])
@@ -158,7 +246,7 @@ def _frame(axis: np.ndarray) -> np.ndarray:
     return np.array([first, np.cross(axis, first), axis])
 
 
-def _starts(points: np.ndarray, known: float | None, axis_start: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     if axis_start is None:
         directions = np.vstack([principal_axes(points)[1], _normal_to_normals(points), _half_sphere(_DIRECTIONS)])
     else:
@@ -197,3 +285,35 @@ def _half_sphere(count: int) -> np.ndarray:
     angle = np.pi * (3.0 - 5.0**0.5) * step
     radius = np.sqrt(1.0 - z**2)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+
+
+def algebraic_centres(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (..., D) and radii (...) of circles (D = 2) or spheres (D = 3) through centred points (..., N, D).
+
+    Taubin's fit, nearly unbiased on short arcs where the simpler one of Kasa shrinks the radius: the eigenvector of
+    the smallest eigenvalue of the moments of (|p|^2 - m) / (2 sqrt m) and p, with m the mean of |p|^2 (N. Chernov,
+    Circular and linear regression, 2010, section 5.10). Points on a line or plane give huge, finite radii.
+    """
+    squares = np.sum(points**2, axis=-1)
+    mean = squares.mean(axis=-1)
+    half = 2.0 * np.sqrt(mean)
+    design = np.concatenate([((squares - mean[..., None]) / half[..., None])[..., None], points], axis=-1)
+    _, vectors = np.linalg.eigh(np.swapaxes(design, -1, -2) @ design)
+    vector = vectors[..., :, 0]
+    curvature = vector[..., 0] / half
+    curvature = np.where(np.abs(curvature) < 1e-9, np.copysign(1e-9, curvature), curvature)
+    centres = -vector[..., 1:] / (2.0 * curvature[..., None])
+    radii = np.sqrt(np.sum(centres**2, axis=-1) + mean)
+    return centres, radii
+
+
+def centre_of_known_radius(points: np.ndarray, radius: float) -> np.ndarray:
+    """Start centre (D,) of a circle or sphere of known radius through centred points (N, D).
+
+    In the direction of the algebraic centre, as deep below the points as their extent across it demands.
+    """
+    centre, _ = algebraic_centres(points)
+    direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
+    across = np.sum(points**2, axis=-1) - (points @ direction) ** 2
+    depth = np.sqrt(max(radius**2 - float(across.mean()), (0.1 * radius) ** 2))
+    return direction * depth
