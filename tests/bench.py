@@ -115,12 +115,12 @@ def pipeline() -> list[Row]:
     from uwlts.calibration.nominal import nominal_calibration
     from uwlts.library import load_sensor
     from uwlts.reconstruction import reconstruct_pixels
-    from uwlts.stripe import StripeMethod, StripeOptions, extract_stripe
+    from uwlts.stripe import StripeOptions, extract_stripe
 
     rows = []
     cv2.setNumThreads(1)
     # Dark lines are searched for a dim stripe, which takes longer than measuring a bright one.
-    default, fastest, limit_ms = StripeOptions().method, StripeMethod.ZERO_CROSSING, 1e3 / 300
+    default, fastest, limit_ms = StripeOptions().method, "zero-crossing", 1e3 / 300
     for along, scene, stripe, method, limit in (
         ("width", load_scene("pipe"), "stripe on every column", default, limit_ms),
         ("width", load_scene("pipe"), "stripe on every column", fastest, 1.0),

@@ -10,7 +10,6 @@ blur moves light from one line to the next and with it the centre that is seen t
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -18,9 +17,9 @@ from scipy.ndimage import uniform_filter
 from uwlts.calibration.model import Calibration
 from uwlts.placement import laser_pose
 from uwlts.reconstruction import reconstruct_profile
-from uwlts.sensor import Laser, Sensor
+from uwlts.sensor import Laser, Sensor, Vector
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
-from uwlts.stripe.result import FWHM_PER_SIGMA
 
 _MOST_BLUR_PX = 0.1
 """Where blur may move a centre by more, which is as much as speckle does, it is not worth using."""
@@ -45,7 +44,7 @@ _MOVED_PX = 0.5
 
 def beside_sheet(
     calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, width_px: np.ndarray,
-    slopes: np.ndarray, *, medium_index: float, stage_direction: Sequence[float],
+    slopes: np.ndarray, *, medium_index: float, stage_direction: Vector,
 ) -> np.ndarray:  # fmt: skip
     """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
 
@@ -64,7 +63,7 @@ def beside_sheet(
     stage_direction : (3,)
         As the capture describes it.
     """
-    direction = np.array(calibration.stage_direction_of(tuple(stage_direction)))
+    direction = np.array(calibration.stage_direction_of(stage_direction))
     frame = calibration.object_transform()
     across = float(np.array(calibration.sheet.normal) @ frame[:3, :3] @ direction)
     if abs(across) < _LEAST_ACROSS or not slopes.any():

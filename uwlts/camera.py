@@ -151,9 +151,14 @@ def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
-@lru_cache(maxsize=16)
 def _largest_square(d: Distortion) -> float:
-    """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it.
+    """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it."""
+    return _one_to_one_square(d.k1, d.k2, d.k3, d.p1, d.p2)
+
+
+@lru_cache(maxsize=16)
+def _one_to_one_square(k1: float, k2: float, k3: float, p1: float, p2: float) -> float:
+    """As `_largest_square`.
 
     The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
     have the same image. With g(r) = 1 + k1 r^2 + k2 r^4 + k3 r^6 the radial terms give it the eigenvalues g and
@@ -161,9 +166,9 @@ def _largest_square(d: Distortion) -> float:
     first reaches 6 r |(p1, p2)|, which is the exact edge for a barrel. Solved for 1 / r, as then the polynomials lead
     with 1; an edge farther than `_WIDEST` is none.
     """
-    tangential = 6.0 * math.hypot(d.p1, d.p2)
-    across = np.roots([1.0, -tangential, d.k1, 0.0, d.k2, 0.0, d.k3])
-    along = np.roots([1.0, -tangential, 3.0 * d.k1, 0.0, 5.0 * d.k2, 0.0, 7.0 * d.k3])
+    tangential = 6.0 * math.hypot(p1, p2)
+    across = np.roots([1.0, -tangential, k1, 0.0, k2, 0.0, k3])
+    along = np.roots([1.0, -tangential, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3])
     roots = np.concatenate([across, along])
     ends = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / _WIDEST)]
     return float(ends.max() ** -2) if len(ends) else math.inf
@@ -204,6 +209,7 @@ def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple
         s = x_seen * x_seen + y_seen * y_seen
         start = 1.0 / (1.0 + s * (d.k1 + s * (d.k2 + s * d.k3)))
         x, y = start * x_seen, start * y_seen
+        found = np.zeros(len(x), dtype=bool)
         for _ in range(_USUAL_STEPS):
             x_step, y_step, missing = _newton_step(d, x_seen, y_seen, x, y)
             found = missing <= allowed
@@ -224,6 +230,7 @@ def _undistorted_with_care(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray
     """
     largest, allowed = _largest_square(d), _allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
+    x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):
         x_step, y_step, missing = _newton_step(d, x_seen, y_seen, x, y)
         length, helps = np.ones_like(x), np.zeros(len(x), dtype=bool)

@@ -219,7 +219,7 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
-    return format_of(path) == FORMAT if _in_hdf5(path) else Path(path).suffix.lower() == ".ply"
+    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else Path(path).suffix.lower() == ".ply"
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:

@@ -115,21 +115,23 @@ def reconstruct_stripes(
     require_index(index)
     lines = stripes.lines_by_status
     sharp, blur = np.arange(len(stripes.line)), np.zeros(len(stripes.line))
-    exact = isinstance(calibration, Calibration) and calibration.joint is not None
-    if exact:
+    exact = calibration if isinstance(calibration, Calibration) and calibration.joint is not None else None
+    if exact is not None:
         sharp, blur = sharp_lines(stripes)
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
     found = _points(capture, calibration, stripes, index)
-    beside = _beside(capture, calibration, stripes, index) if exact else np.zeros((len(sharp), 3))
+    beside = np.zeros((len(sharp), 3)) if exact is None else _beside(capture, exact, stripes, index)
     points = _posed(found.points_mm + beside, capture, stripes.frame)
     good = np.flatnonzero(found.status == RayStatus.OK)
     kept = stripes[good]
     known = None
     if with_uncertainty:
+        if exact is None:
+            raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
         known = point_uncertainty(
-            capture, calibration, kept.frame, kept.line, kept.centre_px, blur_px=blur[good], beside_mm=beside[good]
+            capture, exact, kept.frame, kept.line, kept.centre_px, blur_px=blur[good], beside_mm=beside[good]
         )
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return ScanCloud(

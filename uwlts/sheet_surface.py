@@ -67,6 +67,7 @@ class SheetSurface:
         reach = (self.offset_mm - self.normal @ origins) / along
         if self.is_plane():
             return reach, along
+        slope = along
         for _ in range(_ROUNDS):
             points = origins + reach * directions
             slope = np.einsum("in,in->n", self.gradient(points), directions)
@@ -76,22 +77,21 @@ class SheetSurface:
     def miss_mm(self, points: np.ndarray) -> np.ndarray:
         """How far points (3, N) lie beyond the surface, (N,)."""
         miss = self.normal @ points - self.offset_mm
-        if self.is_plane():
+        if (fan := self.fan) is None or self.is_plane():
             return miss
-        at = fan_distances(points, self.fan, medium_index=self.index)
-        of_bow, of_turn = at.bulges()
-        return miss - (self.fan.bow_rad * of_bow + self.fan.window_turn_rad * of_turn) / self.index
+        of_bow, of_turn = fan_distances(points, fan, medium_index=self.index).bulges()
+        return miss - (fan.bow_rad * of_bow + fan.window_turn_rad * of_turn) / self.index
 
     def gradient(self, points: np.ndarray) -> np.ndarray:
         """Gradient (3, N) of `miss_mm`."""
-        if self.is_plane():
+        if (fan := self.fan) is None or self.is_plane():
             return np.repeat(self.normal[:, None], points.shape[1], axis=1)
-        at, n = fan_distances(points, self.fan, medium_index=self.index), self.index
-        axis = np.array(self.fan.axis)[:, None]
+        at, n = fan_distances(points, fan, medium_index=self.index), self.index
+        axis = np.array(fan.axis)[:, None]
         of_air = (n**2 * at.along * axis - (n**2 - 1.0) * at.away) / at.in_air
         of_bow = at.away / at.all - of_air
         of_turn = at.wet * (axis - of_air) + (1.0 - at.wet) * (1.0 - at.in_air / at.along) * axis
-        return self.normal[:, None] - (self.fan.bow_rad * of_bow + self.fan.window_turn_rad * of_turn) / n
+        return self.normal[:, None] - (fan.bow_rad * of_bow + fan.window_turn_rad * of_turn) / n
 
 
 def fan_distances(points: np.ndarray, fan: FanModel, *, medium_index: float) -> FanDistances:

@@ -24,7 +24,7 @@ from uwlts.library import load_sensor
 from uwlts.placement import camera_from_object, check_design
 from uwlts.report.canvas import ORANGE, blank, dot, line, write
 from uwlts.report.svg_plot import COLOURS, Band, Curve, Panel, draw
-from uwlts.stripe.result import FWHM_PER_SIGMA
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 
 ZOOM, GAP = 8, 12
 FOUND = (200, 90, 20)

@@ -20,7 +20,7 @@ from stripe_tables import table, write_tables
 
 from twin.options import use_variant
 from uwlts.console import progress_bar
-from uwlts.stripe import StripeMethod, StripeOptions, extract_stripe
+from uwlts.stripe import StripeOptions, extract_stripe, method_names
 
 PAGE = Path(__file__).parents[1] / "explanation" / "stripe-methods.md"
 FIT, FIT_FIVE, CROSSING = "profile fit", "profile fit, 5 lines averaged", "zero crossing"
@@ -129,7 +129,7 @@ def lateral_table(frames: int) -> str:
 def time_table() -> str:
     """Time of extraction per frame of 1280 lines, all effects."""
     rows = []
-    for method in StripeMethod:
+    for method in method_names():
         times = []
         for name in ("plane, near", "plane, far"):
             image, options = shot_image(places()[name], 0, 1.0, True), StripeOptions(method=method)

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import erf
 
 from uwlts.commands.options import Method
-from uwlts.stripe import StripeMethod, StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe, method_names
 
 LENGTH = 120
 FIT = "profile-fit"
@@ -36,8 +36,8 @@ def centres(image, method=FIT):
 
 
 def test_it_is_the_default_and_the_command_knows_all_methods():
-    assert StripeOptions().method is StripeMethod.PROFILE_FIT
-    assert get_args(Method) == tuple(StripeMethod)
+    assert StripeOptions().method == "profile-fit"
+    assert get_args(Method) == method_names()
 
 
 @pytest.mark.parametrize(("sigma", "limit"), [(0.64, 0.003), (1.0, 0.001), (1.7, 0.001), (3.0, 0.002), (4.0, 0.008)])
@@ -118,7 +118,7 @@ def test_least_noise_in_speckle(sigma, contrast):
     rng = np.random.default_rng(2)
     centre = LENGTH / 2 + rng.uniform(-0.5, 0.5, 4000)
     image = speckled(centre, sigma=sigma, contrast=contrast, rng=rng)
-    error = {method: centres(image, method) - centre for method in StripeMethod}
+    error = {method: centres(image, method) - centre for method in method_names()}
     # Strong speckle tears a line in a thousand into two stripes, which are ambiguous for every method.
     found = np.isfinite(error[FIT])
     error = {method: values[found] for method, values in error.items()}
@@ -131,7 +131,7 @@ def test_least_noise_in_speckle(sigma, contrast):
     assert abs(error[FIT].mean()) < 5 * error[FIT].std() / math.sqrt(4000)
 
 
-@pytest.mark.parametrize("method", list(StripeMethod))
+@pytest.mark.parametrize("method", method_names())
 def test_one_line_alone(method):
     rng = np.random.default_rng(3)
     for centre in (57.3, 60.0, 62.8):

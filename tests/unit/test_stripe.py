@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.special import erf
 
 from uwlts.errors import ImageError, RangeError
-from uwlts.stripe import PeakRule, StripeMethod, StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import PeakRule, StripeOptions, StripeStatus, extract_stripe, method_names
 
 LENGTH = 120
-METHODS = list(StripeMethod)
+METHODS = method_names()
 
 
 def gaussian(centre, *, sigma, amplitude, length=LENGTH):
@@ -137,7 +137,7 @@ def test_zero_crossing_is_the_least_noisy_in_white_noise():
     image = gaussian(centre, sigma=2, amplitude=60) + 20 + 2 * rng.standard_normal((2000, LENGTH))
     image = image.astype(np.float32)
     spread = {m: np.std(rows(image, options=StripeOptions(method=m)).centre_px - centre) for m in METHODS}
-    assert min(spread, key=spread.get) is StripeMethod.ZERO_CROSSING
+    assert min(spread, key=spread.get) == "zero-crossing"
 
 
 # Left in, 0.2 levels per px would move the zero crossing by b 2^1.5 sigma^2 / A = 0.011 px and the centre of mass by

@@ -13,7 +13,7 @@ from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.metrology.artefact_descriptions import StepStandard
 from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
-from uwlts.stripe.absence import has_stripe
+from uwlts.stripe.recording import has_stripe
 from uwlts.targets import Target, parse_target
 
 Progress = Callable[[str, int, int], None]

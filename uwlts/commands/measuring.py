@@ -46,10 +46,10 @@ def reconstruct(
     from uwlts.capture import Capture
     from uwlts.cloud import write_cloud
     from uwlts.scan import reconstruct as reconstructed
-    from uwlts.stripe import PeakRule, StripeMethod, StripeOptions
+    from uwlts.stripe import PeakRule, StripeOptions
 
     refuse_unsuitable(out, overwrite=overwrite)
-    options = StripeOptions(method=StripeMethod(method or StripeOptions.method), peak=PeakRule(peak))
+    options = StripeOptions(method=method or StripeOptions.method, peak=PeakRule(peak))
     known = read_any_calibration(calibration)
     with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
         cloud = reconstructed(opened, known, options=options, index=index, progress=progress)

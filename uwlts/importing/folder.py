@@ -14,7 +14,7 @@ from uwlts.importing.description import NAME, ImportDescription, capture_header,
 from uwlts.importing.images import bits_of, grey_values, one_channel, read_image, without_background
 from uwlts.importing.matching import Matched, PlannedFrame, match, planned_frames, read_rows, stage_remark
 from uwlts.sensor import Sensor
-from uwlts.stripe.absence import BLACK, WHITE, has_stripe, is_black, runs_across, white_share
+from uwlts.stripe.recording import BLACK, WHITE, has_stripe, is_black, runs_across, white_share
 
 
 def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> None:

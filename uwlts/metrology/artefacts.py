@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, assert_never
+from typing import Any, ClassVar, Literal, assert_never
 
 import numpy as np
 
@@ -141,7 +141,7 @@ def evaluate_pipe(points: np.ndarray, artefact: Pipe) -> PipeEvaluation:
     )
 
 
-def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> RobustFit:
+def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> RobustFit[Any]:
     robust = fit_robustly(fit, points)
     if robust.rejected_share > _MOST_REJECTED:
         raise EvaluationError(
@@ -151,7 +151,7 @@ def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> 
     return robust
 
 
-def _point_counts(robust: RobustFit) -> dict[str, Any]:
+def _point_counts(robust: RobustFit[Any]) -> dict[str, Any]:
     return {
         "points_used": int(np.count_nonzero(robust.inliers)),
         "points_rejected": robust.rejected,
@@ -252,14 +252,16 @@ def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard,
 
 
 def _step_face(points: np.ndarray, labels: np.ndarray, face: StepFace) -> RobustFit[PlaneFit]:
-    """The plane of one face; its stray points lose their label."""
+    """The plane of one face; its outliers lose their label."""
     members = np.flatnonzero(labels == face)
     robust = fit_robustly(partial(fit_plane, towards=TOWARDS_SENSOR), points[members])
     labels[members[~robust.inliers]] = StepFace.NEITHER
     return robust
 
 
-def _heights_by_profile(points: np.ndarray, frame: np.ndarray, labels: np.ndarray, reference: str) -> np.ndarray:
+def _heights_by_profile(
+    points: np.ndarray, frame: np.ndarray, labels: np.ndarray, reference: Literal["lower", "upper"]
+) -> np.ndarray:
     heights = []
     for number in np.unique(frame[frame >= 0]):
         profile = frame == number

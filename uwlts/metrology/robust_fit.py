@@ -1,4 +1,4 @@
-"""Fits that leave out stray points, by a stated rule and with a full account."""
+"""Robust fits: outliers are left out by a stated rule and counted."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,8 @@ _RETURNING_ROUNDS = 20
 class Fit(Protocol):
     """What `fit_robustly` needs of a fitted shape."""
 
-    residuals_mm: np.ndarray
+    @property
+    def residuals_mm(self) -> np.ndarray: ...
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray: ...
 
@@ -33,7 +34,7 @@ FitT = TypeVar("FitT", bound=Fit)
 
 @dataclass(frozen=True, eq=False)
 class RobustFit(Generic[FitT]):
-    """A fit to the inliers and the account of what was left out.
+    """A fit to the inliers, and what was left out.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
     A point is off by the difference of its distance from the median distance of all points; the robust standard
     deviation is 1.4826 times the median size of these differences (the median absolute deviation). A point that was
     left out comes back when a later fit passes within the limit; after 20 rounds points only leave, so that the rounds
-    end. The rule is for a few stray points on one surface, not for telling surfaces apart.
+    end. The rule is for a few outliers on one surface, not for telling surfaces apart.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
         shape = fit(points[inliers])
         rounds += 1
         distances = shape.distances_mm(points)
-        # About the median: strays on one side pull the first shape away from most points.
+        # About the median: outliers on one side pull the first shape away from most points.
         off = np.abs(distances - np.median(distances))
         limit = max(k * MAD_TO_STD * float(np.median(off)), smallest)
         within = off <= limit

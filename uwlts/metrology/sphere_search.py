@@ -1,4 +1,4 @@
-"""Finds a sphere of known radius in a cloud that may hold other surfaces and stray points."""
+"""Finds a sphere of known radius in a cloud that may hold other surfaces and outliers."""
 
 from dataclasses import dataclass
 

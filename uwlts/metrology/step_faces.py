@@ -76,6 +76,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
             f"show both faces, or correct the height"
         )
     normal, anchor, offset = proposal
+    on_anchor = on_other = np.zeros(len(points), dtype=bool)
     for _ in range(_ROUNDS):
         on_anchor, on_other = _levels(points @ normal, anchor, offset)
         normal = _common_normal(points[on_anchor], points[on_other], normal)

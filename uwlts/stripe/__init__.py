@@ -1,24 +1,24 @@
 """The laser stripe's sub-pixel centre, one per profile line.
 
 A profile line is an image row when the stripe runs along the image height, an image column when it runs along the
-width. The steps: `candidates` finds where on each line a stripe may be, `lobe` looks at those places closely,
-`centre` places the centre, `extract` applies the rules about several peaks and hands out the statuses. `absence` says
-why there is none.
+width. The steps: `candidates` finds where on each line a stripe may be, `peak_window` measures what stands there,
+`methods` place the centre, `extract` applies the rules about several peaks and gives the statuses. `recording` does so
+for all laser images and says why there is no stripe.
 """
 
-from uwlts.stripe.absence import why_no_stripe
 from uwlts.stripe.extract import extract_stripe
-from uwlts.stripe.recording import FoundStripes, find_stripes
-from uwlts.stripe.result import PeakRule, Stripe, StripeMethod, StripeOptions, StripeStatus
+from uwlts.stripe.methods import method_names
+from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
+from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeStatus
 
 __all__ = [
     "FoundStripes",
     "PeakRule",
     "Stripe",
-    "StripeMethod",
     "StripeOptions",
     "StripeStatus",
     "extract_stripe",
     "find_stripes",
+    "method_names",
     "why_no_stripe",
 ]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
 
+import cv2
 import numpy as np
 
+from uwlts.errors import ImageError
 from uwlts.stripe.candidates import (
     block_contrast,
     block_extremes,
@@ -14,20 +18,25 @@ from uwlts.stripe.candidates import (
     last_true,
     noise_from_contrast,
 )
-from uwlts.stripe.centre import place_centre
-from uwlts.stripe.ends import half_lit
-from uwlts.stripe.image import (
-    as_profiles,
-    average_lines,
-    check_image,
-    check_length,
-    saturation_of,
-    subtract_background,
+from uwlts.stripe.methods import place_centre
+from uwlts.stripe.peak_window import (
+    FLANK,
+    FWHM_PER_SIGMA,
+    PeakWindow,
+    measure_windows,
+    noise_gain,
+    off_centre,
+    peak_row,
 )
-from uwlts.stripe.lobe import FLANK, Lobe, look, noise_gain, off_centre, peak_row
-from uwlts.stripe.result import FWHM_PER_SIGMA, PeakRule, Stripe, StripeOptions, StripeStatus
+from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeStatus
 
-_DEFAULTS = StripeOptions()
+_LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
+
+_LONGEST_SIDE = 32766
+"""OpenCV's remap addresses pixels with 16 bits."""
+
+_SHORT_GAP = 2
+"""A stripe that is lost for so few lines, as in noise, has not ended."""
 
 _LOOKS = 4
 """Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
@@ -52,7 +61,7 @@ def extract_stripe(
     image: np.ndarray,
     *,
     stripe_along: str,
-    options: StripeOptions = _DEFAULTS,
+    options: StripeOptions = StripeOptions(),
     background: np.ndarray | None = None,
     saturation: float | None = None,
 ) -> Stripe:
@@ -84,14 +93,14 @@ def extract_stripe(
         than two search windows, too short to tell stripe from background.
     """
     half, block = options.half_window_px, options.half_window_px // 2
-    check_image(image, name="image")
-    check_length(image, stripe_along=stripe_along, least=4 * half)
-    clip = saturation_of(image, saturation)
+    _check_image(image, name="image")
+    _check_length(image, stripe_along=stripe_along, least=4 * half)
+    clip = _saturation_of(image, saturation)
 
-    signal = image if background is None else subtract_background(image, background)
+    signal = image if background is None else _subtract_background(image, background)
     if options.smoothing_lines > 1:
-        signal = average_lines(signal, options.smoothing_lines, stripe_along=stripe_along)
-    profiles = as_profiles(signal, stripe_along=stripe_along)
+        signal = _average_lines(signal, options.smoothing_lines, stripe_along=stripe_along)
+    profiles = _as_profiles(signal, stripe_along=stripe_along)
     high, low = block_extremes(profiles, block)
     # Two blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
     board = np.zeros((high.shape[0] + 4, high.shape[1]), high.dtype)
@@ -101,11 +110,11 @@ def extract_stripe(
     none = found.status == _NO_STRIPE
     if none.any():
         if signal is not image:
-            _, low = block_extremes(as_profiles(image, stripe_along=stripe_along), block)
+            _, low = block_extremes(_as_profiles(image, stripe_along=stripe_along), block)
         found.status[none & (low.max(axis=0) >= clip)] = _SATURATED
     if options.end_lines:
         good = found.status == _OK
-        found.discard(half_lit(good, found.centre, lines=options.end_lines, jump_px=half / 2), _END)
+        found.discard(_half_lit(good, found.centre, lines=options.end_lines, jump_px=half / 2), _END)
     return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
 
 
@@ -157,21 +166,21 @@ def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: Stri
             if lines.size == 0:
                 lines, least = passed, passed_least
                 continue
-        lobe = _look_centred(profiles, lines, (chosen - 2) * block, fine, options)
-        verdict = _judge(lobe, profiles.shape[0], fine, options)
+        peak = _centred_windows(profiles, lines, (chosen - 2) * block, fine, options)
+        verdict = _judge(peak, profiles.shape[0], fine, options)
         stripe = verdict != _NO_STRIPE
         status = found.status[lines]
         again = status == _OK
         new = stripe & ~again
         if again.any():
             # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
-            other = np.abs(lobe.start + lobe.middle - found.centre[lines]) > found.width[lines]
-            rival = stripe & again & other & (lobe.height >= options.ambiguous_ratio * found.height[lines])
+            other = np.abs(peak.start + peak.middle - found.centre[lines]) > found.width[lines]
+            rival = stripe & again & other & (peak.height >= options.ambiguous_ratio * found.height[lines])
             found.discard(lines[rival], _AMBIGUOUS)
             status[rival] = _AMBIGUOUS
         status = np.where(new, verdict, status)
         found.status[lines] = status
-        _measure(found, lines, lobe, new & (verdict == _OK), options)
+        _measure(found, lines, peak, new & (verdict == _OK), options)
 
         # The window has been searched for rivals already; of what is no stripe only the block itself is done with.
         place = chosen * board.shape[1] + lines
@@ -231,54 +240,154 @@ def _next_blocks(
     return lines, least, chosen, there.astype(np.float32)
 
 
-def _look_centred(
+def _centred_windows(
     profiles: np.ndarray, lines: np.ndarray, place: np.ndarray, fine: float, options: StripeOptions
-) -> Lobe:
-    """`look`, and a second time where what is seen is not in the middle, as with a wide plateau."""
-    settings = {
-        "half": options.half_window_px,
-        "block": options.half_window_px // 2,
-        "smoothing": options.smoothing_px,
-        "share": options.ambiguous_ratio,
-        "whole": options.peak is PeakRule.STRONGEST,
-    }
-    lobe = look(profiles, lines, place, **settings)
-    offset, needed = off_centre(lobe)
-    needed &= lobe.height >= fine
+) -> PeakWindow:
+    """`measure_windows`, and a second time where what is seen is not in the middle, as with a wide plateau."""
+    measured = partial(
+        measure_windows,
+        profiles,
+        half=options.half_window_px,
+        block=options.half_window_px // 2,
+        smoothing=options.smoothing_px,
+        share=options.ambiguous_ratio,
+        whole=options.peak is PeakRule.STRONGEST,
+    )
+    peak = measured(lines, place)
+    offset, needed = off_centre(peak)
+    needed &= peak.height >= fine
     if needed.any():
         shifted = place[needed] + np.rint(offset[needed]).astype(np.intp)
-        lobe = lobe.replaced(needed, look(profiles, lines[needed], shifted, **settings))
-    return lobe
+        peak = peak.replaced(needed, measured(lines[needed], shifted))
+    return peak
 
 
-def _judge(lobe: Lobe, count: int, fine: float, options: StripeOptions) -> np.ndarray:
+def _judge(peak: PeakWindow, count: int, fine: float, options: StripeOptions) -> np.ndarray:
     """(M,) uint8 `StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
-    size = lobe.window.shape[0]
+    size = peak.window.shape[0]
     narrowest, widest = options.min_fwhm_px / FWHM_PER_SIGMA, options.half_window_px / FWHM_PER_SIGMA
-    stripe = lobe.closed & (lobe.sigma >= narrowest) & (lobe.sigma <= widest)
+    stripe = peak.closed & (peak.sigma >= narrowest) & (peak.sigma <= widest)
     verdict = np.where(stripe, _OK, _NO_STRIPE)
-    if lobe.crowded.any():
-        verdict[stripe & lobe.crowded] = _AMBIGUOUS
-    if lobe.start.min() < 0 or lobe.start.max() + size > count:
-        outside = (lobe.start < 0) | (lobe.start + size > count)
-        middle, extent = lobe.start + lobe.middle, lobe.reach + FLANK - 1
+    if peak.crowded.any():
+        verdict[stripe & peak.crowded] = _AMBIGUOUS
+    if peak.start.min() < 0 or peak.start.max() + size > count:
+        outside = (peak.start < 0) | (peak.start + size > count)
+        middle, extent = peak.start + peak.middle, peak.reach + FLANK - 1
         half = options.half_window_px
-        peak = lobe.start + peak_row(lobe.smooth, half=half, block=half // 2)
+        highest = peak.start + peak_row(peak.smooth, half=half, block=half // 2)
         verdict[stripe & ((middle - extent < 0) | (middle + extent > count - 1))] = _BORDER
         # A peak whose far side is not in the image; one on the last pixel itself may be any rise towards the border.
-        verdict[outside & ~lobe.closed & (peak > 1) & (peak < count - 2)] = _BORDER
-    verdict[lobe.height < fine] = _NO_STRIPE
+        verdict[outside & ~peak.closed & (highest > 1) & (highest < count - 2)] = _BORDER
+    verdict[peak.height < fine] = _NO_STRIPE
     return verdict
 
 
-def _measure(found: _Lines, lines: np.ndarray, lobe: Lobe, which: np.ndarray, options: StripeOptions) -> None:
-    """Enter centre, amplitude and width of the chosen lobes."""
+def _measure(found: _Lines, lines: np.ndarray, peak: PeakWindow, which: np.ndarray, options: StripeOptions) -> None:
+    """Enter centre, amplitude and width of the chosen peaks."""
     if not which.any():
         return
     if not which.all():
-        lines, lobe = lines[which], lobe.keep(which)
-    centre, amplitude = place_centre(options.method, lobe)
-    found.centre[lines] = lobe.start + centre.astype(np.float64)
+        lines, peak = lines[which], peak.keep(which)
+    centre, amplitude = place_centre(options.method, peak)
+    found.centre[lines] = peak.start + centre.astype(np.float64)
     found.amplitude[lines] = amplitude
-    found.width[lines] = lobe.sigma * FWHM_PER_SIGMA
-    found.height[lines] = lobe.height
+    found.width[lines] = peak.sigma * FWHM_PER_SIGMA
+    found.height[lines] = peak.height
+
+
+def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: float) -> np.ndarray:
+    """Numbers (M,) of the lines with a centre that are among the ``lines`` last before a stripe ends or jumps.
+
+    ``good`` (L,) tells which lines have a centre. A stripe ends where more than a few lines in a row have none, and
+    jumps where neighbouring centres lie more than ``jump_px`` apart. The image's own border is no end.
+    """
+    if good.all() and np.abs(centre[1:] - centre[:-1]).max(initial=0.0) <= jump_px:
+        return np.empty(0, np.intp)
+    found = np.flatnonzero(good)
+    if len(found) == 0:
+        return found
+    # breaks[k] stands before found[k], the last one after all of them.
+    breaks = np.empty(len(found) + 1, bool)
+    breaks[1:-1] = (np.diff(found) > _SHORT_GAP + 1) | (np.abs(np.diff(centre[found])) > jump_px)
+    breaks[0], breaks[-1] = found[0] > _SHORT_GAP, len(good) - 1 - found[-1] > _SHORT_GAP
+    near = np.zeros(len(found), bool)
+    for away in range(min(lines, len(found))):
+        near[: len(found) - away] |= breaks[1 + away :]
+        near[away:] |= breaks[: len(found) - away]
+    return found[near]
+
+
+def _check_image(image: np.ndarray, *, name: str) -> None:
+    """Refuse what is not a two-dimensional, finite uint8, uint16 or float32 array.
+
+    Raises
+    ------
+    ImageError
+    """
+    if not isinstance(image, np.ndarray):
+        raise ImageError(f"the {name} is a {type(image).__name__}; expected a NumPy array")
+    if image.dtype not in _LARGEST:
+        raise ImageError(f"the {name} has type {image.dtype}; convert it to uint8, uint16 or float32")
+    if image.ndim != 2:
+        raise ImageError(f"the {name} has shape {image.shape}; expected (height, width): choose one channel")
+    if image.size == 0:
+        raise ImageError(f"the {name} is empty, its shape is {image.shape}")
+    if image.dtype == np.float32 and not np.isfinite(image).all():
+        count = image.size - np.count_nonzero(np.isfinite(image))
+        raise ImageError(f"the {name} has {count} pixels that are not finite; repair or mask them before")
+
+
+def _check_length(image: np.ndarray, *, stripe_along: str, least: int) -> None:
+    """Refuse an unknown orientation, lines shorter than the search needs and images OpenCV cannot address.
+
+    Raises
+    ------
+    ImageError
+    """
+    if stripe_along not in ("height", "width"):
+        raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
+    if max(image.shape) > _LONGEST_SIDE:
+        raise ImageError(f"the image is {image.shape}; each side may have at most {_LONGEST_SIDE} pixels: crop it")
+    length = image.shape[1] if stripe_along == "height" else image.shape[0]
+    if length < least:
+        raise ImageError(
+            f"the image's lines have {length} pixels; the search needs {least}: lower half_window_px or check "
+            "stripe_along"
+        )
+
+
+def _saturation_of(image: np.ndarray, saturation: float | None) -> float:
+    """Grey value at which pixels clip: as given, else the type's largest (none for float32)."""
+    if saturation is None:
+        return _LARGEST[image.dtype]
+    if not math.isfinite(saturation) or saturation <= 0:
+        raise ImageError(f"saturation is {saturation!r}; expected the positive grey value at which pixels clip")
+    return float(saturation)
+
+
+def _subtract_background(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Image minus background with its sign kept: int16 for two uint8 images, otherwise float32.
+
+    Raises
+    ------
+    ImageError
+        If the background is no image or its size or type differs.
+    """
+    _check_image(background, name="background")
+    if background.shape != image.shape or background.dtype != image.dtype:
+        raise ImageError(
+            f"the background is {background.shape} {background.dtype} but the image {image.shape} {image.dtype}; "
+            "take both with the same camera settings"
+        )
+    return cv2.subtract(image, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
+
+
+def _average_lines(image: np.ndarray, count: int, *, stripe_along: str) -> np.ndarray:
+    """float32 image averaged over `count` neighbouring lines, the outermost repeated at the border."""
+    kernel = (1, count) if stripe_along == "height" else (count, 1)
+    return cv2.blur(image.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
+
+
+def _as_profiles(image: np.ndarray, *, stripe_along: str) -> np.ndarray:
+    """(N, L) contiguous array: position along the line first, so that whole-line steps run over adjacent memory."""
+    return cv2.transpose(image) if stripe_along == "height" else np.ascontiguousarray(image)

@@ -1,25 +1,14 @@
-"""What a caller chooses about stripe extraction and what comes back."""
+"""Options and results of stripe extraction."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
 import numpy as np
 
 from uwlts.errors import RangeError
-
-FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-
-
-class StripeMethod(StrEnum):
-    """How the centre is placed once the stripe is found."""
-
-    CENTRE_OF_MASS = "centre-of-mass"
-    PROFILE_FIT = "profile-fit"
-    QUADRATIC = "quadratic"
-    ZERO_CROSSING = "zero-crossing"
+from uwlts.stripe.methods import method_names
 
 
 class PeakRule(StrEnum):
@@ -31,7 +20,7 @@ class PeakRule(StrEnum):
 
 
 class StripeStatus(IntEnum):
-    """Why a line has, or has not, a centre."""
+    """Why a line has a centre or has none."""
 
     OK = 0
     NO_STRIPE = 1
@@ -52,8 +41,8 @@ class StripeOptions:
 
     Attributes
     ----------
-    method : StripeMethod
-        How the centre is placed.
+    method : str
+        How the centre is placed once the stripe is found: one of `uwlts.stripe.method_names`.
     peak : PeakRule
         Which of several stripes on a line counts.
     half_window_px : int
@@ -86,7 +75,7 @@ class StripeOptions:
         If a number lies outside the range stated above.
     """
 
-    method: StripeMethod = StripeMethod.PROFILE_FIT
+    method: str = "profile-fit"
     peak: PeakRule = PeakRule.STRONGEST
     half_window_px: int = 16
     smoothing_px: float = 1.0
@@ -98,11 +87,11 @@ class StripeOptions:
     end_lines: int = 2
 
     def __post_init__(self) -> None:
-        for name, kind in (("method", StripeMethod), ("peak", PeakRule)):
+        for name, known in (("method", method_names()), ("peak", tuple(PeakRule))):
             value = getattr(self, name)
-            if value not in list(kind):
-                raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in kind)}")
-            object.__setattr__(self, name, kind(value))
+            if value not in known:
+                raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in known)}")
+        object.__setattr__(self, "peak", PeakRule(self.peak))
         for name in ("half_window_px", "smoothing_lines", "end_lines"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):

@@ -29,7 +29,7 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
     EvaluationError
         As `evaluate_cloud`.
     """
-    if cloud.uncertainty is None:
+    if (uncertainty := cloud.uncertainty) is None:
         return {}
 
     plain, draws = evaluation.figures_mm, _DRAWS
@@ -42,12 +42,12 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
         figures = figures_mm(by)
         return np.array([figures[name] - value for name, value in plain.items()])
 
-    systematic = [changed(pattern) for pattern in cloud.uncertainty.patterns_mm]
-    rng, along = np.random.default_rng(_SEED), noise_mm(cloud.uncertainty)
+    systematic = [changed(pattern) for pattern in uncertainty.patterns_mm]
+    rng, along = np.random.default_rng(_SEED), noise_mm(uncertainty)
     images, image = np.unique(cloud.frame, return_inverse=True)
 
     def noise() -> np.ndarray:
-        position = rng.standard_normal((len(images), 1))[image] * cloud.uncertainty.position_mm
+        position = rng.standard_normal((len(images), 1))[image] * uncertainty.position_mm
         return rng.standard_normal((len(cloud), 1)) * along + position
 
     drawn = [changed(noise()) for _ in range(draws)]

@@ -34,7 +34,7 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     """Standard deviation (N,) of stripe centres, from how they scatter about their neighbours in the same image.
 
     The centre of a line less the mean of its two neighbours has 3/2 of the variance of one, where the surface is
-    smooth; edges and strays do not count, as half the lines would have to hold some. Images with few lines take the
+    smooth; edges and outliers do not count, as half the lines would have to hold some. Images with few lines take the
     value of all.
     """
     order = np.lexsort((line, frame))

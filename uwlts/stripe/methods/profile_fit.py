@@ -1,7 +1,7 @@
 """The stripe's centre by maximum likelihood: a Gaussian profile fitted under the noise that laser stripes have.
 
 Speckle multiplies the light, so that a pixel errs in proportion to what it shows. Above the floor of noise the faint
-flanks then tell the place of a stripe better than its bright middle, where the profile is level.
+flanks then locate a stripe better than its bright middle, where the profile is level.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ import math
 import cv2
 import numpy as np
 
-from uwlts.stripe.lobe import FLANK, Lobe
-from uwlts.stripe.result import FWHM_PER_SIGMA
+from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
 
 _STEPS, _FIRST_STEPS = 5, 2
 """Steps in all, and those before the contrast is taken from what the fit leaves."""
@@ -37,10 +36,10 @@ _MEDIAN_MEAN_SQUARE = 0.934
 """Median of the mean square of 2 x 5 unit Gaussian numbers (chi-square of 10 degrees)."""
 
 
-def fit_profiles(lobe: Lobe) -> np.ndarray:
+def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Centre (M,) float32 of the best-fitting Gaussian profile, px from the window's first pixel.
 
-    The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the lobe's flanks. A pixel's variance
+    The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. A pixel's variance
     is v = r^2 + (C f)^2: r is the floor of detector and surroundings, C the contrast of speckle, which stands for shot
     noise too. Both are measured on all lines together, r beside the stripes, C on what a first fit leaves.
 
@@ -51,23 +50,23 @@ def fit_profiles(lobe: Lobe) -> np.ndarray:
 
     Saturated pixels get no special care: the contrast gives the top so little weight that it would change little.
     """
-    near = np.rint(lobe.middle)
-    # About each lobe's own pixel the powers of x stay small, and one matrix product sums them for all lobes.
-    most = int(lobe.reach.max())
+    near = np.rint(peak.middle)
+    # About each peak's own pixel the powers of x stay small, and one matrix product sums them for all peaks.
+    most = int(peak.reach.max())
     x = np.arange(-most, most + 1, dtype=np.float32)
     powers = x ** np.arange(5, dtype=np.float32)[:, None]
     pixels = _pixels(near, x[:, None])
-    middle = lobe.middle - near
-    signal = lobe.window.take(pixels, mode="clip") - (lobe.base + lobe.slope * (x[:, None] - middle))
+    middle = peak.middle - near
+    signal = peak.window.take(pixels, mode="clip") - (peak.base + peak.slope * (x[:, None] - middle))
     sampled = slice(None, None, max(1, near.size // _SAMPLED))
-    noise = _floor(lobe, near, sampled)
-    floor = np.where(np.abs(x)[:, None] > lobe.reach, np.inf, noise**2 + np.square(_UNMODELLED * lobe.height))
+    noise = _floor(peak, near, sampled)
+    floor = np.where(np.abs(x)[:, None] > peak.reach, np.inf, noise**2 + np.square(_UNMODELLED * peak.height))
 
-    half_width = (0.5 * FWHM_PER_SIGMA) * lobe.sigma
+    half_width = (0.5 * FWHM_PER_SIGMA) * peak.sigma
     first, last = middle - half_width, middle + half_width
     centre, contrast = middle, _USUAL_CONTRAST
-    log_height = np.log(np.maximum(lobe.height, np.finfo(np.float32).tiny))
-    log_sigma = np.log(np.maximum(lobe.sigma, _NARROWEST))
+    log_height = np.log(np.maximum(peak.height, np.finfo(np.float32).tiny))
+    log_sigma = np.log(np.maximum(peak.sigma, _NARROWEST))
     widest = log_sigma + math.log(_WIDENING)
     for step in range(_STEPS):
         variance = np.exp(2.0 * log_sigma)
@@ -83,7 +82,7 @@ def fit_profiles(lobe: Lobe) -> np.ndarray:
         log_height = log_height + change[0]
         centre = np.minimum(np.maximum(centre + np.sqrt(variance) * change[1], first), last)
         log_sigma = np.minimum(np.maximum(log_sigma + change[2], math.log(_NARROWEST)), widest)
-    return near + centre
+    return near + centre, None
 
 
 def _pixels(near: np.ndarray, x: np.ndarray, lines: slice = slice(None)) -> np.ndarray:
@@ -92,12 +91,12 @@ def _pixels(near: np.ndarray, x: np.ndarray, lines: slice = slice(None)) -> np.n
     return x.astype(np.intp) * width + (near.astype(np.intp) * width + np.arange(width))[lines]
 
 
-def _floor(lobe: Lobe, near: np.ndarray, sampled: slice) -> float:
+def _floor(peak: PeakWindow, near: np.ndarray, sampled: slice) -> float:
     """Standard deviation of the pixels of both flanks about the line through them, grey levels: the usual line's."""
-    away = lobe.reach[sampled] + np.arange(FLANK, dtype=np.float32)[:, None]
+    away = peak.reach[sampled] + np.arange(FLANK, dtype=np.float32)[:, None]
     away = np.vstack([-away, away])
-    values = lobe.window.take(_pixels(near, away, sampled), mode="clip")
-    left = values - (lobe.base + lobe.slope * (near - lobe.middle))[sampled] - lobe.slope[sampled] * away
+    values = peak.window.take(_pixels(near, away, sampled), mode="clip")
+    left = values - (peak.base + peak.slope * (near - peak.middle))[sampled] - peak.slope[sampled] * away
     return max(_LEAST_NOISE, math.sqrt(np.median(np.square(left).mean(axis=0)) / _MEDIAN_MEAN_SQUARE))
 
 
