@@ -100,11 +100,11 @@ def test_both_halves_make_the_whole(path):
         whole = reconstruct(capture, CALIBRATION)
         stripes = find_stripes(capture)
         halves = reconstruct_stripes(capture, stripes, CALIBRATION)
-    np.testing.assert_array_equal(halves.cloud.points_mm, whole.cloud.points_mm)
-    np.testing.assert_array_equal(halves.cloud.frame, stripes.frame)
-    np.testing.assert_array_equal(halves.cloud.line, stripes.line)
-    np.testing.assert_array_equal(halves.cloud.intensity, whole.cloud.intensity)
-    assert halves.cloud.metadata == whole.cloud.metadata
+    np.testing.assert_array_equal(halves.points_mm, whole.points_mm)
+    np.testing.assert_array_equal(halves.frame, stripes.frame)
+    np.testing.assert_array_equal(halves.line, stripes.line)
+    np.testing.assert_array_equal(halves.intensity, whole.intensity)
+    assert halves.metadata == whole.metadata
     assert halves.lines_by_status == whole.lines_by_status == stripes.lines_by_status
     assert halves.rays_by_status == whole.rays_by_status
 
