@@ -23,17 +23,9 @@ from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.evaluate import evaluate, write_evaluation
 from uwlts.library import load_sensor
-<<<<<<< HEAD
-from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.report import plot
 from uwlts.report.campaign_page import report_page, write_report
 from uwlts.report.gather import gather_campaign, load_reference
-=======
-from uwlts.report.cloud_picture import cloud_picture
-from uwlts.report.colours import PLAIN, UNKNOWN, colour_limit_mm, coloured
-from uwlts.report.figures import MOST_POINTS, cloud_figure, histogram_figure
-from uwlts.report.gather import gather_campaign
->>>>>>> 2a39051 (Evaluations, clouds and verifications as typed results with one model for the evaluation file; metrology, uncertainty and cloud in fewer modules)
 from uwlts.report.numbers import as_fine_as, fixed, small_length
 from uwlts.report.page_toolkit import png_of, svg_of
 from uwlts.report.pictures import StripeView, stripe_picture, write_pictures
