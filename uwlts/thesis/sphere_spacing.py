@@ -13,8 +13,8 @@ from uwlts.calibration.window import StepImage, solve_window, step_profile
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError
 from uwlts.metrology.artefact_descriptions import SphereStandard
-from uwlts.metrology.sphere_evaluation import evaluate_spheres
 from uwlts.metrology.round_fits import fit_sphere
+from uwlts.metrology.sphere_evaluation import evaluate_spheres
 from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.scan import reconstruct_stripes
