@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.scene import CirclePlate, Flat, Placed
+from twin.pattern import pattern_texture
+from twin.scene import CirclePlate, Flat, Placed, TargetPlate
 from uwlts.errors import DescriptionError
 from uwlts.media import check_range
 
@@ -80,11 +81,8 @@ def _glossy(
 
 def _reflectance(thing: Placed, scale: float = 1.0) -> float | dict[str, Any]:
     """Mitsuba's description of an object's reflectance, a number or a texture, times ``scale``."""
-    if isinstance(thing, CirclePlate):
-        changes = {
-            key: scale * getattr(thing, key) for key in ("reflectance", "circle_reflectance", "marker_reflectance")
-        }
-        return {"type": "circle_pattern", "plate": thing.model_copy(update=changes).model_dump_json()}
+    if isinstance(thing, CirclePlate | TargetPlate):
+        return pattern_texture(thing.dimmed(scale))
     if thing.texture is None:
         return scale * thing.reflectance
     # Texture coordinates count v upwards from a picture's last row; Mitsuba counts its rows from the first.

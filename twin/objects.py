@@ -14,8 +14,21 @@ import trimesh
 
 from twin.arrays import Bool, Float, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.finish import albedo_parts, finish_bsdf, square_on
-from twin.pattern import register_circle_pattern
-from twin.scene import AnyObject, Block, CirclePlate, FreeForm, Head, Mesh, Pipe, Plate, Scene, Sphere, Weld
+from twin.pattern import register_patterns
+from twin.scene import (
+    AnyObject,
+    Block,
+    CirclePlate,
+    FreeForm,
+    Head,
+    Mesh,
+    Pipe,
+    Plate,
+    Scene,
+    Sphere,
+    TargetPlate,
+    Weld,
+)
 from twin.shapes import bowed_plate, head_surface, weld_surface
 from uwlts.errors import DescriptionError
 
@@ -100,7 +113,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     RangeError
         The wavelength lies outside the table of a metal.
     """
-    register_circle_pattern()
+    register_patterns()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
     things, poses = scene.objects, scene.object_poses()
     shapes = [
@@ -167,6 +180,11 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
             kind = "cylinder"
         case CirclePlate() if thing.bow_mm != 0:
             return _mesh(thing, pose, bsdf)
+        case TargetPlate():
+            first, last = thing.bounds_mm()
+            matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
+            matrix[:2, 3] = (first + last) / 2
+            matrix, kind = pose @ matrix, "rectangle"
         case Mesh() | Head() | Weld():
             return _mesh(thing, pose, {"type": "twosided", "bsdf": bsdf})
         case Plate() | CirclePlate():
@@ -252,7 +270,7 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
         case Plate():
             half = np.array([thing.width_mm, thing.height_mm]) / 2
             yield MirrorFace(pose @ _FACING_SENSOR, half, thing.mirror_share())
-        case Sphere() | Pipe() | Mesh() | Head() | Weld() | CirclePlate():
+        case Sphere() | Pipe() | Mesh() | Head() | Weld() | CirclePlate() | TargetPlate():
             raise NotImplementedError(f"a {thing.kind} has no flat face that could be a mirror")
         case _:
             assert_never(thing)

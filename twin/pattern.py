@@ -1,19 +1,39 @@
-"""Texture of the circle plate, evaluated exactly instead of from a bitmap whose texels would blur the rims."""
+"""Textures of calibration targets, evaluated exactly instead of from a bitmap whose texels would blur the edges."""
 
 from __future__ import annotations
+
+from typing import Any, assert_never
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.arrays import to_jit
-from twin.scene import CirclePlate
+from twin.arrays import Bool, Float, SurfaceInteraction3f, to_jit
+from twin.scene import CirclePlate, TargetPlate
 
 _SHIFT = "circle_shift_mm"
+_CELLS_PER_PATCH = 4
+"""Cells of the grid that lists the patches near a place: so many that most cells list at most three patches."""
+_PATCH_VALUES = 6
+"""Columns of the table of patches."""
+_ROUNDING_MM = 1e-3
+"""Places on a plate of 1 m are rounded by less than this in 32 bits."""
 
 
-def register_circle_pattern() -> None:
-    """Make the texture ``circle_pattern`` known to the selected Mitsuba variant."""
+def pattern_texture(plate: CirclePlate | TargetPlate) -> dict[str, Any]:
+    """Mitsuba's description of a plate's reflectance, for a variant with `register_patterns`."""
+    match plate:
+        case CirclePlate():
+            kind = "circle_pattern"
+        case TargetPlate():
+            kind = "target_pattern"
+        case _:
+            assert_never(plate)
+    return {"type": kind, "plate": plate.model_dump_json()}
+
+
+def register_patterns() -> None:
+    """Make the textures ``circle_pattern`` and ``target_pattern`` known to the selected Mitsuba variant."""
 
     class CirclePattern(mi.Texture):
         """Reflectance of a `CirclePlate` on a rectangle whose uv run from 0 to 1 over width and height."""
@@ -29,10 +49,10 @@ def register_circle_pattern() -> None:
         def parameters_changed(self, keys: list[str]) -> None:
             pass
 
-        def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
+        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             return self.eval_1(si, active)
 
-        def eval_1(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Float:
+        def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
             plate = self.plate
             x, y = (si.uv.x - 0.5) * plate.width_mm, (0.5 - si.uv.y) * plate.height_mm
             i, j = dr.round(x / plate.spacing_x_mm), dr.round(y / plate.spacing_y_mm)
@@ -48,7 +68,7 @@ def register_circle_pattern() -> None:
             value = dr.select(circle, plate.circle_reflectance, plate.reflectance)
             return dr.select(marked & (radius < plate.marker_diameter_mm / 2), plate.marker_reflectance, value)
 
-        def mean(self) -> mi.Float:
+        def mean(self) -> Float:
             return mi.Float(self.plate.reflectance)
 
         def is_spatially_varying(self) -> bool:
@@ -57,7 +77,88 @@ def register_circle_pattern() -> None:
         def to_string(self) -> str:
             return f"CirclePattern[{self.plate.columns} x {self.plate.rows}]"
 
+    class TargetPattern(mi.Texture):
+        """Reflectance of a `TargetPlate` on a rectangle whose uv run from 0 to 1 over its bounds."""
+
+        def __init__(self, props: mi.Properties):
+            mi.Texture.__init__(self, props)
+            self.plate = TargetPlate.model_validate_json(props["plate"])
+            first, last = self.plate.bounds_mm()
+            self.middle, self.size = ((first + last) / 2).tolist(), (last - first).tolist()
+            lists, self.cell_mm = _patches_by_cell(self.plate)
+            self.rows, self.columns, self.depth = lists.shape
+            self.first = first.tolist()
+            self.lists = to_jit(mi.UInt32, lists.ravel())
+            self.patches = to_jit(mi.Float, _patch_table(self.plate).ravel())
+
+        def traverse(self, callback: mi.TraversalCallback) -> None:
+            pass
+
+        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            return self.eval_1(si, active)
+
+        def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            x = self.middle[0] + (si.uv.x - 0.5) * self.size[0]
+            y = self.middle[1] + (0.5 - si.uv.y) * self.size[1]
+            column = dr.clip(dr.floor((x - self.first[0]) / self.cell_mm), 0, self.columns - 1)
+            row = dr.clip(dr.floor((y - self.first[1]) / self.cell_mm), 0, self.rows - 1)
+            start = mi.UInt32((row * self.columns + column) * self.depth)
+            value = mi.Float(self.plate.reflectance)
+            for k in range(self.depth):
+                entry = dr.gather(mi.UInt32, self.lists, start + k, active) * _PATCH_VALUES
+                x_min, y_min, x_max, y_max, rounded, reflectance = (
+                    dr.gather(mi.Float, self.patches, entry + i, active) for i in range(_PATCH_VALUES)
+                )
+                # From -1 to 1 over a patch.
+                u, v = (2 * x - x_min - x_max) / (x_max - x_min), (2 * y - y_min - y_max) / (y_max - y_min)
+                in_box = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
+                inside = in_box & ((rounded == 0) | (u * u + v * v < 1))
+                value = dr.select(inside, reflectance, value)
+            return value
+
+        def mean(self) -> Float:
+            return mi.Float(self.plate.reflectance)
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return f"TargetPattern[{type(self.plate.target).__name__}]"
+
     mi.register_texture("circle_pattern", CirclePattern)
+    mi.register_texture("target_pattern", TargetPattern)
+
+
+def _patch_table(plate: TargetPlate) -> np.ndarray:
+    """Box in mm, roundness and reflectance (N + 1, 6) of each patch of a plate; the last one is never hit."""
+    rows = [
+        (p.x_min_mm, p.y_min_mm, p.x_max_mm, p.y_max_mm, p.round, plate.ink_reflectance if p.ink else plate.reflectance)
+        for p in plate.target.patches()
+    ]
+    return np.array([*rows, (1.0, 1.0, 0.0, 0.0, 0.0, 0.0)], float)
+
+
+def _patches_by_cell(plate: TargetPlate) -> tuple[np.ndarray, float]:
+    """Numbers (rows, columns, depth) of the patches that reach into each cell of a grid, and the cells' side in mm.
+
+    They are in the order of printing; lists are filled up with the patch that is never hit.
+    """
+    first, last = plate.bounds_mm()
+    boxes = _patch_table(plate)[:-1, :4]
+    cell_mm = float(np.sqrt(np.prod(last - first) / (_CELLS_PER_PATCH * len(boxes))))
+    columns, rows = np.ceil((last - first) / cell_mm).astype(int).tolist()
+    start = np.floor((boxes[:, :2] - first - _ROUNDING_MM) / cell_mm).astype(int).clip(min=0)
+    stop = np.floor((boxes[:, 2:] - first + _ROUNDING_MM) / cell_mm).astype(int) + 1
+    count = np.zeros((rows, columns), int)
+    for (i, j), (k, m) in zip(start, stop, strict=True):
+        count[j:m, i:k] += 1
+    lists = np.full((rows, columns, count.max()), len(boxes))
+    count[:] = 0
+    for number, ((i, j), (k, m)) in enumerate(zip(start, stop, strict=True)):
+        y, x = np.mgrid[j : min(m, rows), i : min(k, columns)]
+        lists[y, x, count[y, x]] = number
+        count[y, x] += 1
+    return lists, cell_mm
 
 
 def printed_shifts(plate: CirclePlate) -> np.ndarray:

@@ -7,15 +7,16 @@ direction of a scan; Y along the stripe; Z along the laser's axis away from the 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import DescriptionError
 from uwlts.library import find, names, read_table, validated
 from uwlts.sensor import Description, NotNegative, Positive, Vector
+from uwlts.targets import Target, parse_target
 
 Reflectance = Annotated[float, Field(ge=0, le=1)]
 Finish = Literal["diffuse", "painted", "pvc", "metal"]
@@ -212,7 +213,24 @@ class Weld(FreeForm):
         return self
 
 
-class CirclePlate(Placed):
+class Printed(Placed):
+    """Base of flat plates, facing -z, with a printed pattern, which takes the place of a ``texture``."""
+
+    @model_validator(mode="after")
+    def _has_one_pattern(self) -> Self:
+        if self.texture is not None:
+            raise ValueError(
+                f"texture {self.texture} on a plate with a printed pattern: put it on an object of kind 'plate'"
+            )
+        return self
+
+    def dimmed(self, scale: float) -> Self:
+        """The same plate with every reflectance multiplied by ``scale``."""
+        names = [name for name in type(self).model_fields if name.endswith("reflectance")]
+        return self.model_copy(update={name: scale * getattr(self, name) for name in names})
+
+
+class CirclePlate(Printed):
     """Flat plate, facing -z, with a lattice of circles; three of them carry a dot and mark origin, X and Y.
 
     The lattice has ``columns`` along x and ``rows`` along y; ``origin`` is the marked origin's column and row, and
@@ -243,14 +261,33 @@ class CirclePlate(Placed):
     detection_std_px: NotNegative = 0.0
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
-    @model_validator(mode="after")
-    def _has_one_pattern(self) -> "CirclePlate":
-        if self.texture is not None:
-            raise ValueError(f"texture {self.texture} on a circle_plate, which has its lattice: put it on a plate")
-        return self
+
+def _described_target(value: Any) -> Target:
+    return value if isinstance(value, Target) else parse_target(value)
 
 
-AnyObject = Annotated[Sphere | Plate | Block | Pipe | Mesh | Head | Weld | CirclePlate, Field(discriminator="kind")]
+class TargetPlate(Printed):
+    """A calibration target of any kind, exactly as described; its own frame is the target's, so it faces -z.
+
+    ``target`` is a description as in a scene's ``[target]``, which is used if it is left out. ``reflectance`` is the
+    ground's, ``ink_reflectance`` that of what is printed on it: dark squares, or circles, which may be brighter than
+    the ground. The plate reaches ``rim_mm`` beyond the print on all sides.
+    """
+
+    kind: Literal["target_plate"]
+    target: Annotated[SerializeAsAny[Target], BeforeValidator(_described_target)]
+    ink_reflectance: Reflectance = 0.05
+    rim_mm: NotNegative = 10.0
+
+    def bounds_mm(self) -> np.ndarray:
+        """Corners (2, 2) of the plate in its own x-y plane: the one with the smallest x and y, and the opposite one."""
+        boxes = np.array([(p.x_min_mm, p.y_min_mm, p.x_max_mm, p.y_max_mm) for p in self.target.patches()])
+        return np.array([boxes[:, :2].min(axis=0) - self.rim_mm, boxes[:, 2:].max(axis=0) + self.rim_mm])
+
+
+AnyObject = Annotated[
+    Sphere | Plate | Block | Pipe | Mesh | Head | Weld | CirclePlate | TargetPlate, Field(discriminator="kind")
+]
 
 
 class Motion(Description):
@@ -319,7 +356,7 @@ class Scene(Description):
     ``medium`` is one of the sensor's; ``water`` replaces what is dissolved and floats in it, by the name of a water or
     a turbidity from 0 (pure) to 3 (harbour).
     ``artefact`` and ``target`` are what an operator would note about the things before the sensor: calibrated values,
-    lattice; they travel in the capture.
+    the target's description; they travel in the capture.
     """
 
     title: str
@@ -332,6 +369,20 @@ class Scene(Description):
     window_mounted: bool = True
     artefact: dict[str, Any] | None = None
     target: dict[str, Any] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _targets_described(cls, table: Any) -> Any:
+        """A target_plate without a description of its own shows the scene's target."""
+        if not isinstance(table, dict) or table.get("target") is None or not isinstance(table.get("objects"), list):
+            return table
+        objects = [
+            {"target": table["target"]} | thing
+            if isinstance(thing, dict) and thing.get("kind") == "target_plate"
+            else thing
+            for thing in table["objects"]
+        ]
+        return table | {"objects": objects}
 
     @model_validator(mode="after")
     def _placement_known(self) -> "Scene":

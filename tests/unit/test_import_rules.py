@@ -17,11 +17,14 @@ ROOT = Path(__file__).resolve().parents[2]
 # library that finds descriptions), how a capture and its ground truth are stored, how files are written, the errors,
 # how both commands speak on the terminal, how they work in several processes, how pages are made, and where the library
 # of GigE Vision is found. Nothing of how the software computes:
-# camera, refraction, sheet, stripe, targets, calibration, reconstruction, metrology.
+# camera, refraction, sheet, stripe, detection of targets, calibration, reconstruction, metrology.
 SHARED_WITH_TWIN = {
     "errors", "sensor", "media", "waters", "phase_functions", "placement", "library", "capture", "truth", "files",
     "unfinished", "file_label", "console", "workers", "aravis_library", "report.page_toolkit",
 }  # fmt: skip
+
+# Of the targets the twin knows the descriptions alone, which it draws.
+DESCRIBED_TARGETS = {"targets.Patch", "targets.Target", "targets.parse_target"}
 
 RENDERER = {"mitsuba", "drjit"}
 
@@ -59,7 +62,7 @@ def tops(names: Iterable[str]) -> set[str]:
 def beyond_shared(names: Iterable[str]) -> set[str]:
     """Names from uwlts that the twin may not import; the package itself and its version are free."""
     foreign = {name for name in names if name.split(".")[0] == "uwlts"}
-    shared = tuple(f"uwlts.{name}." for name in SHARED_WITH_TWIN)
+    shared = tuple(f"uwlts.{name}." for name in SHARED_WITH_TWIN | DESCRIBED_TARGETS)
     return {n for n in foreign - {"uwlts", "uwlts.__version__"} if not f"{n}.".startswith(shared)}
 
 
@@ -103,6 +106,12 @@ def test_the_oracles_use_numpy_and_the_standard_library_alone():
         assert not foreign, path
 
 
+def test_the_twin_searches_for_no_target():
+    for path in (ROOT / "twin").rglob("*.py"):
+        calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+        assert "detect" not in {_name(call.func) for call in calls}, path
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -116,6 +125,9 @@ def test_the_oracles_use_numpy_and_the_standard_library_alone():
         "try:\n    import uwlts.camera\nexcept ImportError:\n    pass",
         "import importlib\nimportlib.import_module('uwlts.stripe')",
         "__import__('uwlts.stripe')",
+        "from uwlts.targets import detection",
+        "from uwlts.targets.detection import find_circles",
+        "import uwlts.targets.circles",
     ],
 )
 def test_a_forbidden_import_is_detected(source):

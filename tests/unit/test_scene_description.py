@@ -250,7 +250,7 @@ def test_paths_of_meshes_and_textures_start_at_the_scenes_folder(tmp_path):
 
 def test_a_circle_plate_takes_no_texture():
     plate = load_scene("target").objects[0].model_dump()
-    with pytest.raises(ValueError, match="texture grey.png on a circle_plate, which has its lattice"):
+    with pytest.raises(ValueError, match="texture grey.png on a plate with a printed pattern"):
         scene_of(plate | {"texture": "grey.png"})
 
 

@@ -4,7 +4,6 @@ Everything is laid out for the sensor at hand, in its object coordinate system (
 along Z, so that every image shows the same object at another depth.
 """
 
-
 import math
 from dataclasses import dataclass
 from typing import Any
