@@ -254,7 +254,7 @@ class CaptureWriter:
 
 
 def _what_is_wrong(error: Exception) -> str:
-    """HDF5's words on a file that it cannot open, or the two most usual ones in plain words."""
+    """HDF5's message about a file that it cannot open; the two most usual ones in plain English."""
     found = re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error))
     if found:
         return f"{int(found[1]):,} of its {int(found[2]):,} bytes are there; copy it again"

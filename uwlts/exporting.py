@@ -1,4 +1,4 @@
-"""A capture as a folder of images with a table of positions, which `uwlts import` reads back."""
+"""Export of captures as folders of images that `uwlts import` reads back, and of clouds as PLY, HDF5, XYZ, LAZ, E57."""
 
 import csv
 import os
@@ -63,8 +63,8 @@ def export_capture(
             table.writeheader()
             table.writerows(rows)
         (aside / HEADER).write_text(capture.header.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        told = {"header": HEADER, "table": TABLE, "repeated": True}
-        (aside / NAME).write_text(tomli_w.dumps(told), encoding="utf-8")
+        description = {"header": HEADER, "table": TABLE, "repeated": True}
+        (aside / NAME).write_text(tomli_w.dumps(description), encoding="utf-8")
         os.rename(aside, folder)
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}") from error

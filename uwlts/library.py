@@ -101,6 +101,28 @@ def _explained(problem: Any) -> str:
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:
-    """Sensor description by name (``thesis``) or path."""
+    """Read a sensor description.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of a shipped sensor, such as "thesis", or path of a TOML file, which may name a ``base``.
+
+    Returns
+    -------
+    Sensor
+        The nominal data of camera, laser, windows, detector, stage, measuring volume and media; validated, frozen.
+
+    Raises
+    ------
+    DescriptionError
+        No sensor has this name, or the file is missing, not TOML, or has an unknown or wrong key; the message lists
+        what was found and what is expected.
+
+    Examples
+    --------
+    >>> sensor = uwlts.load_sensor("thesis")
+    >>> sensor.medium("water").refractive_index(sensor.laser.wavelength_nm)
+    """
     path = find(name_or_path, "sensors")
     return validated(Sensor, read_table(path, "sensors"), path)

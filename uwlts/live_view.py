@@ -1,4 +1,4 @@
-"""What the pages have in common that show a camera at work: the server, and images small enough to be sent often."""
+"""Pages that show a camera at work: a recording while it grows, with its latest image, stripe, warnings and cloud."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _FAINT, _MANY = 0.1, 0.05
 class Seen:
     """One image of a recording: its number, position in mm, light, picture (H, W, 3), stripe, and points (N, 3) in mm.
 
-    ``found`` tells the profile lines with a stripe, of ``lines``; ``remarks`` what should be seen to. ``planned`` is
+    ``found`` of the ``lines`` have a stripe; ``remarks`` are warnings. ``planned`` is
     how many images there will be, where that is known, and ``left_s`` the time they take.
     """
 

@@ -83,7 +83,7 @@ class Distortion(Description):
 class Camera(Description):
     """Image sensor and lens. ``focal_length_mm`` is the pinhole's image distance (camera constant).
 
-    ``stripe_along`` tells along which side of the image the laser stripe runs: "width" (1280 in the thesis's camera,
+    ``stripe_along`` is the side of the image along which the laser stripe runs: "width" (1280 in the thesis's camera,
     one peak per column) or "height" (1024, one peak per row). It also places the laser: above the camera (-y) for
     "width", to its right (+x) for "height".
     """

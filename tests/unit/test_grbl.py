@@ -420,7 +420,7 @@ def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(cont
 @pytest.mark.parametrize(
     ("fault", "message", "recovers"),
     [
-        (lambda c: c.disconnect(), "connection is lost.*CANNOT be told", False),
+        (lambda c: c.disconnect(), "connection is lost.*CANNOT be switched", False),
         (lambda c: c.stall(), "stall: the stage has stood at", True),
         (lambda c: c.alarm(1), "ALARM:1, hard limit.*home", True),
         (lambda c: c.alarm(3), "ALARM:3, reset while moving", True),

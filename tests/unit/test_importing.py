@@ -410,7 +410,7 @@ def test_empty_folder(tmp_path: Path):
         (TOLD | {"background": "l2*"}, "l2.png would be both laser and background image"),
         (TOLD | {"laser": "l1*", "background": "l[23]*"}, "2 background images for 1 laser images"),
         (TOLD | {"laser": "l[12]*", "lamp": "l3*"}, "2 laser and 1 lamp images: it is open"),
-        (TOLD | {"header": "header.json"}, "the header tells sensor, medium, stage.direction already"),
+        (TOLD | {"header": "header.json"}, "the header gives sensor, medium, stage.direction already"),
         (TOLD | {"saturation_dn": 1000}, "saturation_dn is 1000; images of uint8"),
     ],
 )

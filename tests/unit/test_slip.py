@@ -32,7 +32,7 @@ def test_the_slip_is_found_to_its_standard_error(slip_mm):
     # lines that share speckle would need. All draws share the place's own noise.
     assert 0.006 < errors.mean() < 0.012
     assert abs(slips.mean() - slip_mm) < 0.02 and slips.std() < errors.mean()
-    assert all(relief.tells(*each) == (abs(slip_mm) > 0.05) for each in found)
+    assert all(relief.is_significant(*each) == (abs(slip_mm) > 0.05) for each in found)
 
 
 def test_where_the_picture_stays_the_same_nothing_is_told():
@@ -53,8 +53,8 @@ def test_the_earliest_place_with_relief_counts():
 def test_an_object_that_is_gone_is_no_slip():
     rng = np.random.default_rng(4)
     relief = watched(np.full(LINES, 2.0), rng).relief
-    assert not relief.tells(*relief.slip(np.full(LINES, np.nan)))
+    assert not relief.is_significant(*relief.slip(np.full(LINES, np.nan)))
     # A third of the lines now show something else.
     again = centres(2.0, np.full(LINES, 2.0), rng)
     again[: LINES // 3] += 40
-    assert not relief.tells(*relief.slip(again))
+    assert not relief.is_significant(*relief.slip(again))

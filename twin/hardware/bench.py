@@ -1,4 +1,4 @@
-"""Faults of the served twin, named as on the command line: NAME[:ARGUMENT][@FRAME]."""
+"""The served twin's bench: scene, stage and laser as its camera sees them, and faults NAME[:ARGUMENT][@FRAME]."""
 
 import math
 import re
@@ -188,7 +188,7 @@ class Bench:
     Raises
     ------
     DesignError
-        The detector has not 8 bit.
+        The detector does not have 8 bit.
     """
 
     def __init__(self, studio: Studio, *, state: Callable[[], StageState], track: Track, lamp: bool):

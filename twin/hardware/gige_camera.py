@@ -1,4 +1,4 @@
-"""Sends images after GigE Vision's stream protocol, at the speed of a real cable."""
+"""A GigE Vision camera on the loopback interface, whose images are sent at the speed of a real cable."""
 
 import ctypes
 import socket
@@ -380,7 +380,7 @@ def _functions() -> SimpleNamespace:
 
 
 def _refuse_second_camera() -> None:
-    """See that the port is free, which Aravis does not tell."""
+    """Check that the port is free, which Aravis does not report."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
         try:
             trial.bind((LOOPBACK, PORT))

@@ -121,7 +121,7 @@ class GrblController:
                 os.close(self._master)
 
     def mute(self, silent: bool = True) -> None:
-        """Break the wire on which the controller answers; it still hears."""
+        """Break the wire on which the controller answers; it still receives."""
         with self._lock:
             self._muted = silent
 

@@ -1,4 +1,4 @@
-"""Reading one block of G-code as Grbl 1.1 does, for one axis: its words, or the number of its error."""
+"""Grbl 1.1 for one axis: its answers, states and alarms, and its reading of G-code blocks."""
 
 import re
 from collections.abc import Callable, Generator, Mapping
@@ -155,7 +155,7 @@ class GrblFirmware:
         self._say(f"{text}\r\n".encode("ascii"))
 
     def restart(self) -> None:
-        """Start anew: the laser is off, position and queue are forgotten."""
+        """Restart: the laser is off, position and queue are forgotten."""
         now = self._now()
         self.shift_mm += self.axis.at(now)[0]
         self.axis.place(0.0)

@@ -36,7 +36,7 @@ def import_images(folder: Path, *, out: Path, description: Path | None = None, o
     out
         Capture to write.
     description
-        TOML file that tells sensor, medium, positions, and which image is what; import.toml in the folder unless given.
+        TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless given.
     overwrite
         Replace an existing file.
     """

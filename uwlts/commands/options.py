@@ -30,5 +30,5 @@ else:
 
 
 def warn(text: str) -> None:
-    """Say on standard error what does not keep a command from its work."""
+    """Print a warning on standard error."""
     print(f"warning: {text}", file=sys.stderr, flush=True)

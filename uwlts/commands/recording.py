@@ -34,7 +34,7 @@ def scan(
     Parameters
     ----------
     plan
-        TOML file that tells sensor, medium, positions, lights and exposures (docs/scan.md).
+        TOML file with sensor, medium, positions, lights and exposures (docs/scan.md).
     out
         Capture to write.
     camera
@@ -67,7 +67,7 @@ def scan(
     address, port = camera or described.camera, stage or described.stage.port
     if address is None or port is None:
         what = "camera" if address is None else "stage"
-        raise DescriptionError(f"neither the plan nor the command line tells the {what}: give --{what}")
+        raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
     if not resume:
         refuse_unsuitable(out, overwrite=overwrite)
     if calibration:

@@ -224,7 +224,7 @@ def try_stage(port: str) -> list[Finding]:
 
 def _judge_build(who: str, built: list[str]) -> Finding:
     options = next((text.removeprefix("OPT:").split(",")[0] for text in built if text.startswith("OPT:")), "")
-    found = f"{who}, options {options or 'not told'}"
+    found = f"{who}, options {options or 'not given'}"
     if "V" not in options:
         return Finding("stage", "missing", f"{found}, without V: it cannot switch the laser",
                        "flash a Grbl with VARIABLE_SPINDLE, see docs/hardware-stage.md")  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 
 from uwlts.aravis_library import load_aravis
 from uwlts.errors import HardwareError
-from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
 
 BUFFER_COMPLETE = 0
 
@@ -251,25 +251,25 @@ class AravisCamera(Camera):
         for thing in things:
             self._functions.g_object_unref(thing)
 
-    def _configure(self, wishes: Wishes) -> CameraSettings:
+    def _configure(self, requested: RequestedSettings) -> CameraSettings:
         info = self.info
         self._call("set_acquisition_mode", 0)
         self._call("clear_triggers")
-        self._set_pixel_format(wishes.bits)
-        region = wishes.region or Region(0, 0, info.width_px, info.height_px)
+        self._set_pixel_format(requested.bits)
+        region = requested.region or Region(0, 0, info.width_px, info.height_px)
         self._call("set_region", region.x_px, region.y_px, region.width_px, region.height_px)
-        for feature, value in (("exposure_time", wishes.exposure_ms), ("gain", wishes.gain_db)):
+        for feature, value in (("exposure_time", requested.exposure_ms), ("gain", requested.gain_db)):
             if value is not None:
                 self._set_number(feature, 1e3 * value if feature == "exposure_time" else value)
-        if wishes.frame_rate_hz is not None:
-            self._set_number("frame_rate", wishes.frame_rate_hz)
-        if wishes.trigger != "free":
-            self._call("set_trigger", b"Software" if wishes.trigger == "software" else b"Line0")
+        if requested.frame_rate_hz is not None:
+            self._set_number("frame_rate", requested.frame_rate_hz)
+        if requested.trigger != "free":
+            self._call("set_trigger", b"Software" if requested.trigger == "software" else b"Line0")
         exposure_us, gain, rate = (self._get_number(feature) for feature in ("exposure_time", "gain", "frame_rate"))
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us, gain_db=gain,
-            region=Region(*self._numbers("get_region", 4)), bits=_BITS[self._pixel_format()], trigger=wishes.trigger,
-            frame_rate_hz=rate if wishes.trigger == "free" else None,
+            region=Region(*self._numbers("get_region", 4)), bits=_BITS[self._pixel_format()], trigger=requested.trigger,
+            frame_rate_hz=rate if requested.trigger == "free" else None,
         )  # fmt: skip
 
     def _set_number(self, feature: str, value: float) -> None:
@@ -382,10 +382,10 @@ class AravisCamera(Camera):
 
 
 def _widen(port: int) -> None:
-    """Make room in the system for the packets of whole frames; how much it allows, net.core.rmem_max tells.
+    """Make room in the system for the packets of whole frames; net.core.rmem_max limits it.
 
     Aravis does so only once the first frame has come, too late for it and for all others if its first packet was lost.
-    It tells the port of its socket, but not the socket.
+    Aravis gives the port of its socket, but not the socket.
     """
     for number in _open_sockets():
         with socket.socket(fileno=os.dup(number)) as same:
@@ -394,7 +394,7 @@ def _widen(port: int) -> None:
 
 
 def _open_sockets() -> list[int]:
-    """Numbers of this process's sockets; none where the system does not tell."""
+    """Numbers of this process's sockets; none where the system does not list them."""
     folder = Path("/proc/self/fd")
     numbers = [int(entry.name) for entry in folder.iterdir()] if folder.is_dir() else []
     found = []

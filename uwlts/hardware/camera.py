@@ -149,7 +149,7 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What the camera really does; None where it has no such setting, or does not tell."""
+    """What the camera really does; None where it has no such setting, or does not report it."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -160,7 +160,7 @@ class CameraSettings:
 
 
 @dataclass(frozen=True)
-class Wishes:
+class RequestedSettings:
     """What a camera is asked to do; None leaves a setting as it is, but the region becomes the whole image."""
 
     exposure_ms: float | None
@@ -185,8 +185,8 @@ class Delivered:
 class GrabbedFrame:
     """An image (H, W) of uint8 or uint16, complete, with its number and the camera's time stamp in s.
 
-    The camera's clock has an origin of its own. ``exposure_ms`` is None where the camera does not tell. ``status`` is
-    OK, or DROPPED or LATE where such frames are wanted.
+    The camera's clock has an origin of its own. ``exposure_ms`` is None where the camera does not report it.
+    ``status`` is OK, or DROPPED or LATE where such frames are wanted.
     """
 
     image: np.ndarray
@@ -285,8 +285,8 @@ class Camera(ABC):
             raise HardwareError(f"gain_db is {gain_db}: it must be finite")
         if region is not None:
             _refuse_outside(region, info)
-        wishes = Wishes(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz)
-        self._settings = self._configure(wishes)
+        requested = RequestedSettings(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz)
+        self._settings = self._configure(requested)
         return self._settings
 
     def start(self, *, faults: Literal["raise", "skip"] = "raise") -> None:
@@ -399,7 +399,7 @@ class Camera(ABC):
         """Let go of everything that ``_open`` acquired, even if the camera is gone."""
 
     @abstractmethod
-    def _configure(self, wishes: Wishes) -> CameraSettings:
+    def _configure(self, requested: RequestedSettings) -> CameraSettings:
         """Set what is wished, and read back what came of it."""
 
     @abstractmethod

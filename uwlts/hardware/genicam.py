@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import HardwareError, SetupError
-from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
 
 # A wait in the producer holds up Ctrl-C.
 _WAIT_S = 0.1
@@ -93,31 +93,31 @@ class GenicamCamera(Camera):
         if harvester is not None:
             harvester.reset()
 
-    def _configure(self, wishes: Wishes) -> CameraSettings:
+    def _configure(self, requested: RequestedSettings) -> CameraSettings:
         try:
             self._set_if_there("AcquisitionMode", "Continuous")
             self._set_if_there("TriggerMode", "Off")
-            self._set_pixel_format(wishes.bits)
-            self._set_region(wishes.region)
-            self._set_number(_EXPOSURE_US, wishes.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
-            self._set_number(("Gain",), wishes.gain_db, "gain", automatic="GainAuto")
-            if wishes.frame_rate_hz is not None:
+            self._set_pixel_format(requested.bits)
+            self._set_region(requested.region)
+            self._set_number(_EXPOSURE_US, requested.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
+            self._set_number(("Gain",), requested.gain_db, "gain", automatic="GainAuto")
+            if requested.frame_rate_hz is not None:
                 self._set_if_there("AcquisitionFrameRateEnable", True)
-            self._set_number(_FRAME_RATE, wishes.frame_rate_hz, "frame rate")
-            if wishes.trigger != "free":
-                self._set_trigger("Software" if wishes.trigger == "software" else "Line0")
-            return self._settings_read(wishes)
+            self._set_number(_FRAME_RATE, requested.frame_rate_hz, "frame rate")
+            if requested.trigger != "free":
+                self._set_trigger("Software" if requested.trigger == "software" else "Line0")
+            return self._settings_read(requested)
         except self._faults as error:
             raise self._failed("configuring it", error) from error
 
-    def _settings_read(self, wishes: Wishes) -> CameraSettings:
+    def _settings_read(self, requested: RequestedSettings) -> CameraSettings:
         exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, ("Gain",), _FRAME_RATE))
         x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
         region = Region(x, y, int(self._node("Width").value), int(self._node("Height").value))
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us, gain_db=gain, region=region,
-            bits=_BITS[self._node("PixelFormat").value], trigger=wishes.trigger,
-            frame_rate_hz=rate if wishes.trigger == "free" else None,
+            bits=_BITS[self._node("PixelFormat").value], trigger=requested.trigger,
+            frame_rate_hz=rate if requested.trigger == "free" else None,
         )  # fmt: skip
 
     def _set_pixel_format(self, bits: int | None) -> None:
@@ -169,7 +169,7 @@ class GenicamCamera(Camera):
             raise HardwareError(f"the camera {self.address} cannot be triggered by {source}: use trigger 'free'")
 
     def _set_if_there(self, name: str, value: object) -> None:
-        # Cameras that know but one value refuse to be told it.
+        # Cameras with only one value refuse to have it set.
         if self._has(name) and self._node(name).value != value:
             self._node(name).value = value
 

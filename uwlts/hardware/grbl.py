@@ -31,11 +31,13 @@ from types import TracebackType
 from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, GrblSettings, Message, Setting, Status, parse_settings
 
-# A stage that has not moved by a step in this time, and in that of some steps, stands still.
+# A stage that moves by less than a step in this time, and in that of some steps, stands still.
 _STALL_S, _STALL_STEPS = 1.0, 5
+# Time allowed for a movement: this factor of the computed time, plus the time to answer.
 _MARGIN, _MARGIN_S = 1.5, 2.0
 # The offset comes with every 10th report at rest and every 30th in motion.
 _REPORTS_TO_OFFSET = 31
+# A limit switch opens this far from where it closes.
 _PIN_MARGIN_MM = 0.5
 
 
@@ -102,7 +104,7 @@ class GrblStage:
 
     @property
     def laser_power(self) -> float:
-        """Power that the laser was last told, 0 when off."""
+        """Power last set, 0 when off."""
         return 0.0 if self._line.fault else self._power
 
     def home(self) -> float:
@@ -241,7 +243,7 @@ class GrblStage:
     def laser(self, on: bool, *, power: float = 1.0) -> None:
         """Switch the laser at once and see that the controller says so.
 
-        Whether light comes out only the camera can tell. Below full power the pin is pulsed at some kHz.
+        Only the camera can show whether light comes out. Below full power the pin is pulsed at some kHz.
 
         Parameters
         ----------
@@ -258,7 +260,7 @@ class GrblStage:
         if not 0 < power <= 1:
             raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
         if not on:
-            # A fault has told it to go off already.
+            # The fault has switched it off already.
             if self._line.fault is not None:
                 return
             self._line.command("M5")

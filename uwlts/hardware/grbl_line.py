@@ -235,9 +235,17 @@ SOFT_RESET, STATUS_QUERY, FEED_HOLD = b"\x18", b"?", b"!"
 ANSWER_S = 2.0
 # Grbl's documentation asks for no more than 5 to 10 status queries a second while it moves.
 POLL_S = 0.1
+# Grbl's own lines are shorter than 130 characters.
 _LONGEST_LINE = 200
-_READ_S, _QUIET_S, _WAKE_S = 0.05, 0.2, 1.0
-_QUERY_S, _QUERIES = 0.7, 3
+# A read returns after this time, so that deadlines and Ctrl-C are seen.
+_READ_S = 0.05
+# A restarted controller that sends nothing for this long has nothing more to say.
+_QUIET_S = 0.2
+# Time to the greeting after Ctrl-X, which comes within some ms.
+_WAKE_S = 1.0
+# Status queries are answered within some ms; one that was lost is repeated.
+_QUERY_S = 0.7
+_QUERIES = 3
 
 
 class GrblLine:
@@ -398,8 +406,8 @@ class GrblLine:
         self.fault = what
         sent = self._try_to_reset()
         laser = (
-            "the laser was told to go off" if sent
-            else "the laser CANNOT be told to go off: switch its power off before going near"
+            "the laser was switched off" if sent
+            else "the laser CANNOT be switched off: switch its power off before going near"
         )  # fmt: skip
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
 
@@ -522,7 +530,7 @@ def _open(port: str, baud: int) -> serial.Serial:
 
 
 def _hang_up_on_close(descriptor: int) -> None:
-    """See that DTR drops when the port is closed, by whomever: see docs/hardware-stage.md for what hangs on it."""
+    """Have DTR drop when the port is closed by any process; docs/hardware-stage.md explains why."""
     try:
         attributes = termios.tcgetattr(descriptor)
         attributes[2] |= termios.HUPCL

@@ -21,7 +21,7 @@ _SIGNAL_WHEN_PARENT_ENDS = 1
 class PageBeside:
     """Shows a recording from `start` on until the ``with`` ends; what goes wrong with it is said and has no effect.
 
-    ``say`` gets the line that tells where the page is, from a thread of its own.
+    ``say`` is called with the line that states the page's address, from another thread.
     """
 
     def __init__(self, capture: Path, *, calibration: Path | None, say: Callable[[str], None]):

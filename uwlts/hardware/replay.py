@@ -8,7 +8,7 @@ import numpy as np
 
 from uwlts.capture import Capture
 from uwlts.errors import HardwareError, ImageError
-from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, Wishes
+from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
 from uwlts.importing.images import SUFFIXES, read_image
 
 # Frames that may wait to be fetched, as in the buffers of a camera's driver; later ones are lost.
@@ -67,18 +67,18 @@ class ReplayCamera(Camera):
         if capture is not None:
             capture.close()
 
-    def _configure(self, wishes: Wishes) -> CameraSettings:
+    def _configure(self, requested: RequestedSettings) -> CameraSettings:
         info = self.info
-        if wishes.trigger == "line":
+        if requested.trigger == "line":
             raise HardwareError(f"{self.address} has no trigger input: use trigger 'free' or 'software'")
-        if wishes.bits not in (None, info.bits):
-            raise HardwareError(f"{self.address} has images of {info.bits} bits, not {wishes.bits}")
-        if wishes.gain_db is not None:
+        if requested.bits not in (None, info.bits):
+            raise HardwareError(f"{self.address} has images of {info.bits} bits, not {requested.bits}")
+        if requested.gain_db is not None:
             raise HardwareError(f"{self.address} has no gain: its images are what they are")
-        exposure_ms = wishes.exposure_ms if self._capture is None else float(self._capture.exposure_ms[0])
-        rate = wishes.frame_rate_hz if wishes.trigger == "free" else None
-        region = wishes.region or Region(0, 0, info.width_px, info.height_px)
-        return CameraSettings(exposure_ms, None, region, info.bits, wishes.trigger, rate)
+        exposure_ms = requested.exposure_ms if self._capture is None else float(self._capture.exposure_ms[0])
+        rate = requested.frame_rate_hz if requested.trigger == "free" else None
+        region = requested.region or Region(0, 0, info.width_px, info.height_px)
+        return CameraSettings(exposure_ms, None, region, info.bits, requested.trigger, rate)
 
     def _start(self) -> None:
         self._began_s, self._due, self._triggers = time.monotonic(), 0, 0
@@ -137,7 +137,7 @@ class ReplayCamera(Camera):
         return self._capture.image(index), float(self._capture.exposure_ms[index])
 
     def _answers(self) -> None:
-        """Files are always there, or tell when they are read."""
+        """Files need no check; reading a missing one raises an error."""
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -22,18 +22,29 @@ from uwlts.stripe import StripeStatus, extract_stripe
 BRIGHT_SHARE = 0.98
 """The brightest pixel of every line that counts is looked at; 2 % of the lines may be brighter than is wished."""
 START_MS = 1.0
-_FEW, _LEAST = 0.01, 3
-_DIM = 0.05
-_MANY = 0.05
+"""First exposure that is tried: in the middle of the usual range, on a logarithmic scale."""
+_FEW_SHARE = 0.01
+_FEWEST_LINES = 3
+"""Fewer lines, as a share of all and as a number, are a reflection or noise."""
+_DIM_SHARE = 0.05
+"""Lines below this share of the brightest one are dark."""
+_MANY_SHARE = 0.05
+"""More saturated lines than this share are more than a reflection accounts for."""
 _CLOSE = 0.1
+"""Relative change of the exposure below which no further image is taken."""
 _SHORTEST_MS = 1e-3
+"""Shortest exposure of usual cameras."""
 _STEPS = 12
-_DOWN, _UP = 1 / 16, 30.0
+"""Images at most: from the start to either end of the range takes three, and the bisection in between a few more."""
+_DOWN = 1 / 16
+"""Factor from a saturated image, in which it is unknown by how much it is too bright."""
+_UP = 30.0
+"""Largest factor from a dark image, in which noise limits the estimate."""
 
 
 def not_few(count: int, lines: int) -> bool:
     """Whether so many of all lines are a sign of light, rather than a reflection or noise."""
-    return count >= max(_FEW * lines, _LEAST)
+    return count >= max(_FEW_SHARE * lines, _FEWEST_LINES)
 
 
 @dataclass(frozen=True)
@@ -41,7 +52,7 @@ class Brightness:
     """How bright an image is.
 
     ``level`` is the share of the full scale that all but 2 % of the ``counted`` lines keep to: 0 where no line counts,
-    1 where nothing tells by how much it is too bright. ``saturated`` of the counted lines reach the full scale.
+    1 where it is too bright by an unknown amount. ``saturated`` of the counted lines reach the full scale.
     """
 
     lines: int
@@ -51,13 +62,13 @@ class Brightness:
 
     @property
     def dark(self) -> bool:
-        """Whether too few lines count for an exposure to be told by them."""
+        """Whether too few lines count to derive an exposure from them."""
         return not not_few(self.counted, self.lines)
 
     @property
     def overexposed(self) -> bool:
         """Whether many lines are saturated, more than a reflection accounts for."""
-        return self.saturated > _MANY * self.counted and not_few(self.saturated, self.lines)
+        return self.saturated > _MANY_SHARE * self.counted and not_few(self.saturated, self.lines)
 
 
 def brightness(image: np.ndarray, sensor: Sensor, light: Light) -> Brightness:
@@ -65,7 +76,7 @@ def brightness(image: np.ndarray, sensor: Sensor, light: Light) -> Brightness:
     along, full = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
     black = sensor.detector.black_level_dn
     peak = image.max(axis=0 if along == "width" else 1).astype(float)
-    counts = peak - black > _DIM * (peak.max() - black)
+    counts = peak - black > _DIM_SHARE * (peak.max() - black)
     if light == "laser":
         counts &= extract_stripe(image, stripe_along=along, saturation=full).status != StripeStatus.NO_STRIPE
     if not counts.any():
@@ -90,7 +101,7 @@ def settled_exposure(
             if exposure_ms <= _SHORTEST_MS:
                 break
             too_long_ms = exposure_ms
-            # At the full scale nothing tells by how much it is too bright; from below one more step is enough.
+            # At full scale it is unknown by how much it is too bright; from below one more step is enough.
             exposure_ms = max(exposure_ms * _DOWN, _SHORTEST_MS)
             continue
         needed_ms = math.inf if seen.dark else exposure_ms * wished / max(seen.level, 1e-6)
@@ -106,7 +117,9 @@ def settled_exposure(
 _TRIES = 3
 """How often an image is asked for whose frame was lost on its way."""
 _PATIENCE_S = 3.0
+"""Longest wait for a frame beyond its exposure: several repeats of a lost GigE command."""
 _RUN_UP_MM = 1.0
+"""More than the play of a ball screw or belt."""
 
 
 class LaserStage(Protocol):

@@ -1,4 +1,4 @@
-"""What a scan with real hardware shall do: a TOML file with sensor, camera, stage, positions, lights and exposures."""
+"""Plan of a scan with real hardware: a TOML file with sensor, camera, stage, positions, lights and exposures."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -115,7 +115,7 @@ def load_plan(path: Path) -> ScanPlan:
 def plan_table(path: Path, *, wanted: str) -> dict[str, Any]:
     """A plan's TOML with the path of a sensor that lies beside it; DescriptionError where it is missing or no TOML."""
     if not path.is_file():
-        raise DescriptionError(f"no plan at {path}: write one that tells {wanted}")
+        raise DescriptionError(f"no plan at {path}: write one that gives {wanted}")
     table = read_table(path)
     beside = path.parent / str(table.get("sensor", ""))
     if beside.suffix == ".toml" and beside.is_file():

@@ -24,9 +24,11 @@ from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 LOOKS = 9
 """Positions at which a stripe is looked for before a scan is given up."""
 _DROP = 0.5
+"""A stripe on fewer lines, or at a lower level, than this share of the image before is checked."""
 _AGAIN = 25
-"""After so many images without stripe the laser is tried anew."""
+"""After so many images without stripe the laser is tried again."""
 _SAME_PX = 1.0
+"""Stripes of both images within this distance are the same; edges shown by noise lie elsewhere."""
 _ITS_OWN = 0.5
 """Of a stripe of the laser at least this share of the height is gone when the laser is off."""
 
@@ -38,9 +40,9 @@ def spread(positions_mm: Sequence[float], count: int) -> list[float]:
 
 
 def shows_laser(lit: np.ndarray, unlit: np.ndarray, sensor: Sensor, *, difference: bool) -> bool:
-    """Whether an image has a stripe that another one (H, W) of the same place without laser has not.
+    """Whether an image has a stripe that another one (H, W) of the same place without laser does not have.
 
-    ``difference`` tells that the stripe is measured in the difference of both; else it has to be in the image itself,
+    ``difference``: the stripe is measured in the difference of both; else it has to be in the image itself,
     as a lamp that is on while the laser is off leaves a difference of its own.
     """
     along, full = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
@@ -89,7 +91,7 @@ class LaserWatch:
     ) -> None:
         """Judge a laser image (H, W), its stripe and brightness, before it is stored; may move the stage.
 
-        ``unlit`` is an image without laser beside it, if there is one; ``last`` tells that no further image comes.
+        ``unlit`` is an image without laser beside it, if there is one; ``last``: no further image comes.
 
         Raises
         ------
@@ -142,11 +144,13 @@ def no_light(positions_mm: Sequence[float], exposure_ms: float) -> HardwareError
 LARGEST_MM = 0.05
 """From here on steps are lost: four of 0.0125 mm, as much as the sensor's errors."""
 _LEAST_RELIEF = 0.2
-"""Way of the stripe in px per mm of the stage on lines that tell something; elsewhere its noise is no way."""
+"""Motion of the stripe in px per mm of the stage on lines that are used; below it noise dominates."""
 _LARGEST_BEND_PX = 2.0
-"""Where the way changes by more from one image to the next there is an edge."""
+"""Where the motion changes by more from one image to the next there is an edge."""
 _FEWEST_LINES = 20
+"""Lines from which a median and its scatter are estimated."""
 _SIGMAS = 4.0
+"""A slip within this many standard errors is not reported: 6e-5 false alarms per scan."""
 _GRAIN = 2.0
 """Neighbouring lines share their speckle, so that the scatter of their mean is so many times as large."""
 
@@ -162,10 +166,10 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """A place whose picture tells where the stage is: ``way_px_per_mm`` (N,), NaN on lines that tell nothing."""
+    """A place whose image shows where the stage is: ``motion_px_per_mm`` (N,), NaN on lines without relief."""
 
     place: Place
-    way_px_per_mm: np.ndarray
+    motion_px_per_mm: np.ndarray
 
     def slip(self, again: np.ndarray) -> tuple[float, float]:
         """How far from it, in mm, the stage stands when the place shows the centres (N,) in px, and the standard error.
@@ -173,24 +177,24 @@ class Relief:
         Infinite where too few lines are left.
         """
         away = again - self.place.centre_px
-        good = np.isfinite(away) & np.isfinite(self.way_px_per_mm)
+        good = np.isfinite(away) & np.isfinite(self.motion_px_per_mm)
         if good.sum() < _FEWEST_LINES:
             return np.inf, np.inf
-        way, away = self.way_px_per_mm[good], away[good]
-        # A weighted median of the slips that the lines tell: a line whose stripe is another one now has no say.
-        slips, weights = away / way, np.abs(way)
+        motion, away = self.motion_px_per_mm[good], away[good]
+        # A weighted median over the lines is robust to lines on which another stripe is found now.
+        slips, weights = away / motion, np.abs(motion)
         order = np.argsort(slips)
         heaped = np.cumsum(weights[order])
         slip_mm = float(slips[order][np.searchsorted(heaped, heaped[-1] / 2)])
-        return slip_mm, _standard_error(away - slip_mm * way, way)
+        return slip_mm, _standard_error(away - slip_mm * motion, motion)
 
-    def tells(self, slip_mm: float, error_mm: float) -> bool:
+    def is_significant(self, slip_mm: float, error_mm: float) -> bool:
         """Whether the stage has slipped beyond doubt."""
         return np.isfinite(slip_mm) and abs(slip_mm) > max(LARGEST_MM, _SIGMAS * error_mm)
 
 
 class SlipWatch:
-    """Looks at the laser images of a scan, in their order, for the earliest place that tells where the stage is.
+    """Finds the earliest laser image of a scan with enough relief to show where the stage is.
 
     Attributes
     ----------
@@ -214,18 +218,18 @@ def centres_of(stripe: Stripe) -> np.ndarray:
 
 
 def _relief(before: Place, here: Place, after: Place) -> Relief | None:
-    """What the place between two others tells, None where that is more than a third of `LARGEST_MM` in doubt."""
-    way = (after.centre_px - before.centre_px) / (after.position_mm - before.position_mm)
+    """Relief of the place between two others; None where its uncertainty exceeds a third of `LARGEST_MM`."""
+    motion = (after.centre_px - before.centre_px) / (after.position_mm - before.position_mm)
     bend = after.centre_px - 2 * here.centre_px + before.centre_px
     with np.errstate(invalid="ignore"):
-        tells = (np.abs(way) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
+        steep = (np.abs(motion) > _LEAST_RELIEF) & (np.abs(bend) < _LARGEST_BEND_PX)
     # The bend has six times the variance of a centre, which counts twice in it, and a slip twice that of a centre.
-    if tells.sum() < _FEWEST_LINES or _standard_error(bend[tells] / np.sqrt(3), way[tells]) > LARGEST_MM / 3:
+    if steep.sum() < _FEWEST_LINES or _standard_error(bend[steep] / np.sqrt(3), motion[steep]) > LARGEST_MM / 3:
         return None
-    return Relief(here, np.where(tells, way, np.nan))
+    return Relief(here, np.where(steep, motion, np.nan))
 
 
-def _standard_error(scatter_px: np.ndarray, way_px_per_mm: np.ndarray) -> float:
-    """Of the slip that lines tell together, in mm."""
+def _standard_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:
+    """Standard error of the slip of all lines, in mm."""
     spread = MAD_TO_STD * np.median(np.abs(scatter_px - np.median(scatter_px)))
-    return float(_GRAIN * spread / np.sqrt(np.sum(way_px_per_mm**2)))
+    return float(_GRAIN * spread / np.sqrt(np.sum(motion_px_per_mm**2)))

@@ -37,6 +37,7 @@ from uwlts.sensor import Sensor
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 _FAINT = 0.1
+"""Laser images below this share of the full scale are reported as faint."""
 _EXPOSED_AT = 5
 """Positions, evenly spread over a plan, at which automatic exposure looks."""
 
@@ -68,7 +69,7 @@ class Seen:
     exposure_ms: dict[Light, float] = field(default_factory=dict)
 
     def warnings(self) -> list[str]:
-        """What should be seen to."""
+        """Warnings for the operator."""
         said = []
         if self.saturated:
             said.append(f"{self.saturated} laser images are saturated on many lines: shorten laser_ms")
@@ -268,16 +269,16 @@ class _Taking:
         image = self._rig.image("laser", place.exposure_ms)[0]
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
         slip_mm, error_mm = self._slip.relief.slip(centres_of(self._stripe(image, unlit)))
-        if self._slip.relief.tells(slip_mm, error_mm):
+        if self._slip.relief.is_significant(slip_mm, error_mm):
             raise HardwareError(
                 f"the stage has lost steps, or sensor or object were moved: back at {place.position_mm:g} mm the "
                 f"stripe lies as if the stage stood {slip_mm:+.2f} mm (std {error_mm:.2f} mm) beside it. All images "
                 "are recorded, but from somewhere on at wrong positions: find the cause (feed, acceleration, something "
-                "in the way) and scan anew with --overwrite, or take them as they are with --resume"
+                "in the way) and scan again with --overwrite, or take them as they are with --resume"
             )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:
-        """Settle the exposure of a light anew where it turns out to be too long; False where that does not help."""
+        """Settle the exposure of a light again if it turns out to be too long; False if that does not help."""
         before_ms, shorter_ms = self._seen.exposure_ms[light], self._settled(light)
         if shorter_ms is None or shorter_ms >= before_ms:
             return False
@@ -301,7 +302,7 @@ class _Taking:
 
 
 def plan_text(plan: ScanPlan) -> str:
-    """What a plan is going to do, in words."""
+    """Summary of a plan: positions and images."""
     positions = plan.stage.positions_mm()
     images = len(positions) * (len(plan.lights) + int(plan.background and "laser" in plan.lights))
     return f"{len(positions)} positions from {positions[0]:g} to {positions[-1]:g} mm, {images} images to take"

@@ -1,7 +1,7 @@
 """Images of any camera and program turned into a capture that every other command takes.
 
-`description` reads what is told about the images, `matching` and `positions` say which image is what and where it was
-taken, `images` reads them by `decoding`, `content` refuses those that show nothing, and `folder` writes the capture.
+`description` reads the description of a folder, `matching` assigns images to lights and positions, `images` reads them,
+and `folder` refuses those that show nothing and writes the capture.
 `intrinsics` reads cameras that other programs calibrated.
 """
 

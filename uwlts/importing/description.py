@@ -1,4 +1,4 @@
-"""What is told about a folder of images: a TOML file with the sensor, the medium, what each image is, and the stage."""
+"""Description of a folder of images: a TOML file with the sensor, the medium, what each image is, and the stage."""
 
 import json
 from pathlib import Path
@@ -48,12 +48,12 @@ class StageMotion(Description):
 
 
 class ImportDescription(Description):
-    """Everything told about a folder of images.
+    """Everything that is known about a folder of images.
 
     ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
     description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
     name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; ``table`` is a CSV
-    file that tells each image's values.
+    file with each image's values.
     """
 
     header: str | None = None
@@ -80,7 +80,7 @@ class ImportDescription(Description):
     provenance: dict[str, Any] | None = None
 
     @model_validator(mode="after")
-    def _told_once(self) -> "ImportDescription":
+    def _given_once(self) -> "ImportDescription":
         if self.header is None:
             missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
             if missing:
@@ -89,7 +89,7 @@ class ImportDescription(Description):
             twice = [name for name in _OF_THE_HEADER if name in self.model_fields_set]
             twice += ["stage.direction"] if self.stage.direction is not None else []
             if twice:
-                raise ValueError(f"the header tells {', '.join(twice)} already: leave out one of the two")
+                raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
         return self
 
 
@@ -97,19 +97,25 @@ def read_description(path: Path) -> ImportDescription:
     """Description in a TOML file; DescriptionError where it is missing, no TOML, or holds an unknown or wrong key."""
     if not path.is_file():
         raise DescriptionError(
-            f"no description at {path}: write one that tells sensor, medium, and which image is what (docs/import.md)"
+            f"no description at {path}: write one with sensor, medium, and which image is what (docs/import.md)"
         )
     return validated(ImportDescription, read_table(path), path)
 
 
 def capture_header(
-    told: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: dict[str, Any]
+    given: ImportDescription,
+    sensor: Sensor,
+    *,
+    beside: Path,
+    name: str,
+    saturation_dn: int,
+    remarks: dict[str, Any],
 ) -> CaptureHeader:
     """Header of the capture.
 
     Parameters
     ----------
-    told : ImportDescription
+    given : ImportDescription
     sensor : Sensor
         As `described_sensor` gives it.
     beside : Path
@@ -128,28 +134,29 @@ def capture_header(
     EvaluationError
         The artefact is not valid.
     """
-    if told.header is not None:
-        return read_header(beside / told.header)
-    direction = told.stage.direction
+    if given.header is not None:
+        return read_header(beside / given.header)
+    direction = given.stage.direction
     if direction is None:
-        if not told.stage.free:
+        if not given.stage.free:
             raise DescriptionError(
                 "stage.direction is missing: give the unit direction in which the stage moves the sensor, in the OCS, "
                 "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
             )
         direction = (1.0, 0.0, 0.0)
-    if told.medium is None:
+    if given.medium is None:
         raise DescriptionError("medium is missing: a capture states the medium in which the sensor was used")
-    if told.target is not None:
-        parse_target(told.target)
-    if told.artefact is not None:
-        parse_artefact(told.artefact)
+    if given.target is not None:
+        parse_target(given.target)
+    if given.artefact is not None:
+        parse_artefact(given.artefact)
     table = {
-        "name": told.name or name, "sensor": sensor, "medium_name": told.medium, "medium": sensor.medium(told.medium),
-        "stage_direction": direction, "target": told.target, "artefact": told.artefact,
-        "saturation_dn": saturation_dn, "provenance": remarks if told.provenance is None else told.provenance,
+        "name": given.name or name, "sensor": sensor, "medium_name": given.medium,
+        "medium": sensor.medium(given.medium),
+        "stage_direction": direction, "target": given.target, "artefact": given.artefact,
+        "saturation_dn": saturation_dn, "provenance": remarks if given.provenance is None else given.provenance,
     }  # fmt: skip
-    return validated(CaptureHeader, table, "what the description tells")
+    return validated(CaptureHeader, table, "the header from the description")
 
 
 def read_header(path: Path) -> CaptureHeader:
@@ -162,21 +169,21 @@ def read_header(path: Path) -> CaptureHeader:
         raise DescriptionError(f"{path} is no header in JSON, or is truncated: {error}") from error
 
 
-def described_sensor(told: ImportDescription, *, beside: Path) -> Sensor:
+def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
     """The sensor that took the images, with the intrinsics of another program's calibration where given."""
-    if told.header is not None:
-        return read_header(beside / told.header).sensor
-    if isinstance(told.sensor, dict):
-        table = dict(told.sensor)
+    if given.header is not None:
+        return read_header(beside / given.header).sensor
+    if isinstance(given.sensor, dict):
+        table = dict(given.sensor)
         base = table.pop("base", None)
         if base is not None:
             table = merged(read_table(find(_beside(beside, base), "sensors"), "sensors"), table)
         sensor = validated(Sensor, table, "sensor")
     else:
-        sensor = load_sensor(_beside(beside, told.sensor))
-    if told.intrinsics is None:
+        sensor = load_sensor(_beside(beside, given.sensor))
+    if given.intrinsics is None:
         return sensor
-    return with_intrinsics(sensor, read_intrinsics(beside / told.intrinsics), source=told.intrinsics)
+    return with_intrinsics(sensor, read_intrinsics(beside / given.intrinsics), source=given.intrinsics)
 
 
 def _beside(folder: Path, name: object) -> str:

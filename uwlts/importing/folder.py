@@ -1,4 +1,4 @@
-"""What the images of a folder show, looked at while they pass: black, saturated, without a stripe."""
+"""Import of a folder of images as a capture, with checks for black, saturated and stripe-free images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from uwlts.stripe.recording import BLACK, WHITE, has_stripe, is_black, runs_acro
 
 
 def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> None:
-    """Refuse an image (H, W) or (H, W, 3) of another size than the sensor's; the ``first`` one's tells of the sensor.
+    """Refuse an image (H, W) or (H, W, 3) of another size than the sensor's; the advice differs for the ``first`` one.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> 
 
 @dataclass(eq=False)
 class Content:
-    """Keeps account of the images of one import; ``saturation_dn`` is that of the files, ``target``: one is told.
+    """Keeps account of the images of one import; ``saturation_dn`` is that of the files, ``target``: one is given.
 
     ``black`` has the names of the dark images and ``seen`` the number of all, by whether the laser was on;
     ``with_stripe`` counts the images with a stripe, ``sideways`` those with one across.
@@ -178,18 +178,18 @@ def import_folder(
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
     path = folder / NAME if description is None else description
-    told = read_description(path)
-    sensor = described_sensor(told, beside=path.parent)
-    rows = None if told.table is None else read_rows(path.parent / told.table)
-    matched = match(folder, told, rows)
-    frames = planned_frames(folder, told, matched, in_table=rows is not None)
-    reader = _Reader(told, sensor, folder)
+    given = read_description(path)
+    sensor = described_sensor(given, beside=path.parent)
+    rows = None if given.table is None else read_rows(path.parent / given.table)
+    matched = match(folder, given, rows)
+    frames = planned_frames(folder, given, matched, in_table=rows is not None)
+    reader = _Reader(given, sensor, folder)
     first, bits = reader.image(frames[0].path, laser_on=frames[0].laser_on)
-    zero = _zero_dn(told, frames, bits)
-    saturation = 2**bits - 1 if told.saturation_dn is None else told.saturation_dn
+    zero = _zero_dn(given, frames, bits)
+    saturation = 2**bits - 1 if given.saturation_dn is None else given.saturation_dn
     header = capture_header(
-        told, sensor, beside=path.parent, name=folder.resolve().name, saturation_dn=saturation + zero,
-        remarks=_remarks(told, frames, folder, bits=bits, zero_dn=zero),
+        given, sensor, beside=path.parent, name=folder.resolve().name, saturation_dn=saturation + zero,
+        remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
     )  # fmt: skip
     if header.saturation_dn - zero > np.iinfo(first.dtype).max:
         raise DescriptionError(
@@ -201,11 +201,11 @@ def import_folder(
     return Imported(len(matched.laser), len(matched.lamp), (*content.verdict(), *_unmatched(matched)))
 
 
-def _zero_dn(told: ImportDescription, frames: list[PlannedFrame], bits: int) -> int:
+def _zero_dn(given: ImportDescription, frames: list[PlannedFrame], bits: int) -> int:
     """What is added to a difference; 0 where nothing is subtracted."""
     if all(frame.background is None for frame in frames):
         return 0
-    if told.header is not None:
+    if given.header is not None:
         raise DescriptionError(
             "a background is to be subtracted, but the header is that of a finished capture: leave out one of the two"
         )
@@ -220,24 +220,24 @@ def _zero_dn(told: ImportDescription, frames: list[PlannedFrame], bits: int) -> 
 class _Reader:
     """Reads images as grey values that all have the size and depth of the first; keeps the last background."""
 
-    def __init__(self, told: ImportDescription, sensor: Sensor, folder: Path):
-        self._told, self._sensor, self._folder = told, sensor, folder
+    def __init__(self, given: ImportDescription, sensor: Sensor, folder: Path):
+        self._given, self._sensor, self._folder = given, sensor, folder
         self.dtype: np.dtype | None = None
         self._kept: tuple[Path, np.ndarray] | None = None
 
     def image(self, path: Path, *, laser_on: bool) -> tuple[np.ndarray, int]:
         """Grey image (H, W) and its bits; ImageError where it is not like the others."""
-        told, name = self._told, path.relative_to(self._folder).as_posix()
+        given, name = self._given, path.relative_to(self._folder).as_posix()
         raw = read_image(path)
         check_size(raw, self._sensor, name=name, first=self.dtype is None)
         if self.dtype not in (None, raw.dtype):
             raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
-        channel = told.channel if laser_on or told.lamp_channel is None else told.lamp_channel
+        channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
         grey = one_channel(raw, channel, name=name)
-        # A header tells no bits, and grey values that a capture held fit in it.
-        bits = 8 * raw.itemsize if told.header is not None else bits_of(raw, told.bits, name=name)
+        # A header has no bits, and grey values that a capture held fit in it.
+        bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self.dtype = raw.dtype
-        return grey_values(grey, bits=bits, aligned=told.aligned, name=name), bits
+        return grey_values(grey, bits=bits, aligned=given.aligned, name=name), bits
 
     def background(self, path: Path) -> np.ndarray:
         """Grey image (H, W) without laser, in the laser's channel."""
@@ -276,14 +276,14 @@ def _frame(image: np.ndarray, planned: PlannedFrame) -> Frame:
 
 
 def _remarks(
-    told: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int
+    given: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int
 ) -> dict[str, object]:
     """What the capture says of its origin."""
     remarks: dict[str, object] = {
         "source": "imported images", "uwlts": uwlts.__version__, "folder": folder.resolve().name, "bits": bits,
-        "stage": stage_remark(told),
+        "stage": stage_remark(given),
     }  # fmt: skip
-    remarks |= {key: getattr(told, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(told, key)}
+    remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
     if zero_dn:
         remarks["background"] = f"subtracted from the laser images, {zero_dn} added"
     for name, values in (("exposure", [f.exposure_ms for f in frames]), ("time", [f.time_s for f in frames])):
@@ -296,4 +296,4 @@ def _unmatched(matched: Matched) -> list[str]:
     if not matched.unmatched:
         return []
     few = ", ".join(matched.unmatched[:3])
-    return [f"{len(matched.unmatched)} images of the folder are left out, as nothing tells what they are: {few}"]
+    return [f"{len(matched.unmatched)} images of the folder are left out, as nothing says what they are: {few}"]

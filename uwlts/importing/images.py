@@ -1,7 +1,7 @@
-"""Decodes an image file, and hears when the decoder finds it damaged.
+"""Reads image files as grey values and finds those that are damaged.
 
 libpng, libjpeg and libtiff make up what they cannot decode, and say so on the process's standard error only. So that is
-listened to meanwhile: what tells of damage is returned, and what anybody else writes is passed on.
+read meanwhile: lines about damage are returned, everything else is passed on.
 """
 
 import os
@@ -25,7 +25,7 @@ _AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*er
 
 
 def decode(content: bytes) -> tuple[np.ndarray | None, str]:
-    """Image as OpenCV decodes it unchanged, None where it cannot, and what tells of damage, empty if nothing does.
+    """Image as OpenCV decodes it unchanged, None where it cannot, and the message about damage, empty if there is none.
 
     Raises
     ------
@@ -131,21 +131,21 @@ def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndar
     return image.max(axis=2) if channel == "max" else cv2.extractChannel(image, _CHANNELS[channel])
 
 
-def bits_of(image: np.ndarray, told: int | None, *, name: str) -> int:
-    """Bits of the grey values: 8 for a file of 8 bit, else as told.
+def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
+    """Bits of the grey values: 8 for a file of 8 bit, else as given.
 
     Raises
     ------
     ImageError
-        A file of 16 bit, and nothing is told; a file of 8 bit that should have more.
+        A file of 16 bit without given bits; a file of 8 bit that should have more.
     """
     if image.dtype == np.uint8:
-        if told not in (None, 8):
-            raise ImageError(f"{name} is a file of 8 bit, but bits = {told}: save it with 16 bit, or leave out bits")
+        if bits not in (None, 8):
+            raise ImageError(f"{name} is a file of 8 bit, but bits = {bits}: save it with 16 bit, or leave out bits")
         return 8
-    if told is None:
+    if bits is None:
         raise ImageError(f"{name} is a file of 16 bit: say how many the camera used, bits = 10, 12 or 16")
-    return told
+    return bits
 
 
 def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.ndarray:

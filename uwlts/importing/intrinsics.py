@@ -24,7 +24,7 @@ _LARGEST_ASPECT = 0.01
 
 @dataclass(frozen=True)
 class KnownCamera:
-    """Focal lengths and principal point in px, distortion, and the image size (width, height) where it is told."""
+    """Focal lengths and principal point in px, distortion, and the image size (width, height) where it is given."""
 
     fx_px: float
     fy_px: float

@@ -38,7 +38,7 @@ class Row:
 class Matched:
     """Images by what they are, as paths below the folder, in order; ``background`` holds one per laser image or none.
 
-    ``unmatched`` are images of the folder that nothing tells of.
+    ``unmatched`` are images of the folder that nothing describes.
     """
 
     laser: list[Row]
@@ -96,7 +96,7 @@ def read_rows(path: Path) -> list[Row]:
     return rows
 
 
-def match(folder: Path, told: ImportDescription, rows: list[Row] | None) -> Matched:
+def match(folder: Path, given: ImportDescription, rows: list[Row] | None) -> Matched:
     """Sort a folder's images by what they are.
 
     Raises
@@ -111,29 +111,29 @@ def match(folder: Path, told: ImportDescription, rows: list[Row] | None) -> Matc
         if missing:
             raise DescriptionError(f"the table names {', '.join(missing[:3])}, which {folder} does not hold")
     if rows is not None and any(row.light is not None for row in rows):
-        if told.laser or told.lamp:
+        if given.laser or given.lamp:
             raise DescriptionError(
                 "the table has a column light, and there are patterns laser or lamp: give one of them"
             )
         dark = [row.file for row in rows if row.light is None]
         if dark:
-            raise DescriptionError(f"the table does not tell the light of {', '.join(dark[:3])}: laser, lamp or ignore")
+            raise DescriptionError(f"the table does not give the light of {', '.join(dark[:3])}: laser, lamp or ignore")
         laser, lamp = ([row for row in rows if row.light == light] for light in ("laser", "lamp"))
         ignored = [row.file for row in rows if row.light == "ignore"]
     else:
         known = [Row(name) for name in files] if rows is None else rows
-        ignored = [row.file for row in known if matches(row.file, told.ignore)]
+        ignored = [row.file for row in known if matches(row.file, given.ignore)]
         known = [row for row in known if row.file not in ignored]
-        laser, lamp = ([row for row in known if matches(row.file, light)] for light in (told.laser, told.lamp))
+        laser, lamp = ([row for row in known if matches(row.file, light)] for light in (given.laser, given.lamp))
     _refuse_both(laser, lamp)
     if not laser and not lamp:
         raise DescriptionError(
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "
             "'laser*.png' and lamp = 'lamp*.png', or a table with a column light"
         )
-    background = _backgrounds(folder, [name for name in files if matches(name, told.background)], told, laser)
+    background = _backgrounds(folder, [name for name in files if matches(name, given.background)], given, laser)
     used = {row.file for row in [*laser, *lamp]} | set(background) | set(ignored)
-    unmatched = [name for name in files if name not in used and not matches(name, told.ignore)]
+    unmatched = [name for name in files if name not in used and not matches(name, given.ignore)]
     return Matched(laser, lamp, background, unmatched)
 
 
@@ -152,20 +152,24 @@ def _refuse_both(laser: list[Row], lamp: list[Row]) -> None:
         )
 
 
-def _backgrounds(folder: Path, found: list[str], told: ImportDescription, laser: list[Row]) -> list[str]:
+def _backgrounds(folder: Path, found: list[str], given: ImportDescription, laser: list[Row]) -> list[str]:
     """One background per laser image, or none at all."""
     named = [row.background for row in laser if row.background is not None]
-    if named and (told.background or len(named) < len(laser)):
+    if named and (given.background or len(named) < len(laser)):
         raise DescriptionError(
             f"the table names a background for {len(named)} of {len(laser)} laser images"
-            + (", and there is a pattern as well: give one of them" if told.background else ": name it for all or none")
+            + (
+                ", and there is a pattern as well: give one of them"
+                if given.background
+                else ": name it for all or none"
+            )
         )
     if named:
         missing = [name for name in named if not (folder / name).is_file()]
         if missing:
             raise DescriptionError(f"the table names the background {missing[0]}, which {folder} does not hold")
         return named
-    if not told.background:
+    if not given.background:
         return []
     lit = sorted(set(found) & {row.file for row in laser}, key=natural_key)
     if lit:
@@ -224,7 +228,7 @@ class PlannedFrame:
     background: Path | None
 
 
-def planned_frames(folder: Path, told: ImportDescription, matched: Matched, *, in_table: bool) -> list[PlannedFrame]:
+def planned_frames(folder: Path, given: ImportDescription, matched: Matched, *, in_table: bool) -> list[PlannedFrame]:
     """All frames in the order of the table, or of their positions, at each the lamp image before the laser image.
 
     Raises
@@ -232,10 +236,10 @@ def planned_frames(folder: Path, told: ImportDescription, matched: Matched, *, i
     DescriptionError
         Positions are missing, given twice, or the same for two images of one light.
     """
-    positions = _positions(told, matched)
+    positions = _positions(given, matched)
     ordered = []
     for laser_on, rows in ((False, matched.lamp), (True, matched.laser)):
-        exposure = told.exposure_ms if laser_on or told.lamp_exposure_ms is None else told.lamp_exposure_ms
+        exposure = given.exposure_ms if laser_on or given.lamp_exposure_ms is None else given.lamp_exposure_ms
         for place, row in enumerate(rows):
             frame = PlannedFrame(
                 path=folder / row.file, laser_on=laser_on,
@@ -245,27 +249,27 @@ def planned_frames(folder: Path, told: ImportDescription, matched: Matched, *, i
             )  # fmt: skip
             ordered.append((row.number if in_table else place, laser_on, frame))
     frames = [frame for *_, frame in sorted(ordered, key=lambda entry: entry[:2])]
-    if not told.repeated:
+    if not given.repeated:
         _refuse_repeated(frames)
     return frames
 
 
-def stage_remark(told: ImportDescription) -> str:
-    """How the positions are known, in words for the capture's provenance."""
-    if told.stage.free:
+def stage_remark(given: ImportDescription) -> str:
+    """How the positions are known, for the capture's provenance."""
+    if given.stage.free:
         return "none: stage_mm counts the poses"
-    if told.stage.start_mm is not None:
-        return f"from {told.stage.start_mm:g} mm in steps of {told.stage.step_mm:g} mm"
+    if given.stage.start_mm is not None:
+        return f"from {given.stage.start_mm:g} mm in steps of {given.stage.step_mm:g} mm"
     return "positions as listed"
 
 
-def _positions(told: ImportDescription, matched: Matched) -> list[float] | None:
-    """Position for each place in the natural order; None where the table tells them."""
+def _positions(given: ImportDescription, matched: Matched) -> list[float] | None:
+    """Position for each place in the natural order; None where the table gives them."""
     rows = [*matched.laser, *matched.lamp]
-    stage, in_column = told.stage, any(row.stage_mm is not None for row in rows)
+    stage, in_column = given.stage, any(row.stage_mm is not None for row in rows)
     elsewhere = stage.free or stage.start_mm is not None or stage.positions_mm is not None
     if in_column and elsewhere:
-        raise DescriptionError("the table has a column stage_mm, and [stage] tells positions too: give one of them")
+        raise DescriptionError("the table has a column stage_mm, and [stage] gives positions too: give one of them")
     if in_column:
         return None
     if not elsewhere:

@@ -71,11 +71,11 @@ class GuidedImages:
         return found is not None
 
     def resettle(self, light: Light) -> bool:
-        """Find the exposure anew; whether that can change anything."""
+        """Find the exposure again; whether that can change anything."""
         return self._planned[light] == "auto" and self.settle(light)
 
 
-# The stage's steps may be small; the poses are told apart by its position.
+# The stage's steps may be small; the poses are distinguished by its position.
 _STAGE_CHANGE_PX = 0.5
 
 

@@ -117,7 +117,7 @@ class GuidedPage(LivePage):
         return was
 
     def request(self, text: str) -> None:
-        """What the operator shall do."""
+        """Show what the operator is asked to do."""
         if self._request.content != f"## {text}":
             self._request.content = f"## {text}"
 

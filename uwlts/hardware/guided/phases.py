@@ -20,7 +20,7 @@ from uwlts.targets import TargetView
 
 _TRIES = 3
 _SAME_POSITION_MM = 0.02
-# Free poses have no stage position; this tells their images apart without looking like a way that the stage went.
+# Free poses have no stage position; this numbers their images without looking like a motion of the stage.
 _NUMBER_MM = 1e-3
 # A pose is taken without being asked for if it helps this much of what the best one would.
 _USEFUL = 0.25
@@ -154,11 +154,11 @@ class TargetPhase:
         """Show the image, and say what to do next."""
         pose = None if found.usable is None else pose_of(found.usable, state.camera)
         sheet = missing_sheet(state)
-        words = "move the target" if wish is None else wish_words(wish, state, pose)
+        request = "move the target" if wish is None else wish_words(wish, state, pose)
         if sheet and not missing(state):
-            words = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
-        self._page.request(words if reasons else "hold it still")
-        self._operator.hint(f"next: {words if wish is None or sheet else wish_words(wish, state, None)}")
+            request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
+        self._page.request(request if reasons else "hold it still")
+        self._operator.hint(f"next: {request if wish is None or sheet else wish_words(wish, state, None)}")
         points = None if found.view is None else found.view.pixels
         self._page.live(
             found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=None,
@@ -166,7 +166,7 @@ class TargetPhase:
         )  # fmt: skip
 
     def _improve_light(self, reasons: tuple[str, ...]) -> bool:
-        """Settle the lamp's exposure anew where an image was too bright or too dark, but not all the time."""
+        """Settle the lamp's exposure again where an image was too bright or too dark, but not all the time."""
         light = any(reason.startswith(("saturated", "faint", "too dark")) for reason in reasons)
         if not light or self._clock() - self._settled_s < _RESETTLE_S:
             return False
@@ -308,7 +308,7 @@ class StepPhase:
         depth_mm, reasons = quality.depth_mm, quality.reasons
         if depth_mm is not None and not reasons:
             reasons = self._why_not_here(depth_mm, before_mm)
-        self._tell(image, quality, reasons)
+        self._report(image, quality, reasons)
         if reasons or depth_mm is None:
             return None
         self._writer.append(Frame(image, stage_mm, True, exposure_ms, time.monotonic() - self._start_s))
@@ -323,7 +323,7 @@ class StepPhase:
             f"{least_apart_mm(self._judge.sensor):.0f} mm or more",
         )
 
-    def _tell(self, image: np.ndarray, quality: StepQuality, reasons: tuple[str, ...]) -> None:
+    def _report(self, image: np.ndarray, quality: StepQuality, reasons: tuple[str, ...]) -> None:
         if reasons:
             line = f"refused: {'; '.join(reasons)}"
         else:

@@ -1,4 +1,4 @@
-"""What a guided calibration shall do: a TOML file with sensor, camera, stage, target, step and what is wanted."""
+"""Plan of a guided calibration: a TOML file with sensor, camera, stage, target, step and goals."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -45,7 +45,7 @@ class GuidedStage(Description):
         return self
 
     def places_mm(self) -> list[float]:
-        """All positions in their order; empty where none are told."""
+        """All positions in their order; empty where none are given."""
         if self.first_mm is None or self.last_mm is None:
             return list(self.positions_mm)
         return np.linspace(self.first_mm, self.last_mm, self.count).tolist()
@@ -67,8 +67,8 @@ class GuidedStep(Description):
 
     def artefact(self) -> dict[str, Any]:
         """The standard as captures name it."""
-        told = self.model_dump(include={"height_mm", "height_uncertainty_mm", "reference", "edge_mm"})
-        return StepStandard.model_validate(told).model_dump(exclude_none=True)
+        given = self.model_dump(include={"height_mm", "height_uncertainty_mm", "reference", "edge_mm"})
+        return StepStandard.model_validate(given).model_dump(exclude_none=True)
 
 
 class WantedPlan(Description):
@@ -91,7 +91,7 @@ class WantedPlan(Description):
 class GuidedPlan(Description):
     """A guided calibration as read from TOML.
 
-    The target stands in ``medium``; ``window_mounted`` tells whether the camera sees it through its window, as it does
+    The target stands in ``medium``; ``window_mounted``: whether the camera sees it through its window, as it does
     in any medium but air. ``poses`` are as for `solve_camera`. Exposures are in ms or "auto". A free pose is taken once
     the target has stood still for ``still_s``.
     """
@@ -207,7 +207,7 @@ def load_guided_plan(path: Path) -> GuidedPlan:
         plan.described_sensor().medium(plan.step.medium)
         if not plan.target_in_air():
             raise DescriptionError(
-                f"{path}: the target stands in {plan.medium} and a [step] is planned; a target there tells the "
+                f"{path}: the target stands in {plan.medium} and a [step] is planned; a target there determines the "
                 "window's distance itself: leave out [step], or set medium to air"
             )
     return plan

@@ -71,7 +71,7 @@ def record_guided(
     resume : bool
         Go on with what is recorded, also with a finished capture of the target that is not enough.
     overwrite : bool
-        Begin anew.
+        Replace earlier recordings.
     refractions, camera
         As the calibration is going to be made.
 
@@ -87,9 +87,9 @@ def record_guided(
         A capture exists, or cannot be written.
     """
     if plan.camera is None:
-        raise DescriptionError("neither the plan nor the command line tells the camera: give --camera")
+        raise DescriptionError("neither the plan nor the command line gives the camera: give --camera")
     if plan.stage is not None and plan.stage.port is None:
-        raise DescriptionError("neither the plan nor the command line tells the stage's port: give --stage")
+        raise DescriptionError("neither the plan nor the command line gives the stage's port: give --stage")
     camera = camera or CameraOptions()
     setting = replace(plan.setting(), camera=camera)
     port = None if plan.stage is None else plan.stage.port
@@ -192,7 +192,7 @@ class _Phases:
 
     @contextmanager
     def _opened(self, medium: str, positions_mm: list[float]) -> Iterator[tuple[Rig, dict[str, Any], np.dtype]]:
-        """Camera and stage, ready to take images, with what captures tell of them."""
+        """Camera and stage, ready to take images, with their provenance for the captures."""
         sensor = self.setting.sensor
         with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
             check_camera(camera, sensor)
@@ -208,16 +208,16 @@ class _Phases:
 
     @contextmanager
     def _stage(self, positions_mm: list[float]) -> Iterator[GrblStage | HandSwitchedLaser]:
-        told = self.plan.stage
-        if told is None or self.port is None:
+        planned = self.plan.stage
+        if planned is None or self.port is None:
             yield HandSwitchedLaser(self.operator)
             return
         with GrblStage(self.port) as stage:
             check_positions(positions_mm, limits_mm=stage.limits_mm)
             fastest = stage.settings.max_feed_mm_per_min
-            if told.feed_mm_per_min > fastest:
-                raise RangeError(f"feed_mm_per_min is {told.feed_mm_per_min:g}, the stage does at most {fastest:g}")
-            if told.home:
+            if planned.feed_mm_per_min > fastest:
+                raise RangeError(f"feed_mm_per_min is {planned.feed_mm_per_min:g}, the stage does at most {fastest:g}")
+            if planned.home:
                 stage.home()
             elif not stage.position_known:
                 stage.unlock()
