@@ -10,6 +10,7 @@ blur moves light from one line to the next and with it the centre that is seen t
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -171,7 +172,7 @@ def _slopes(
     there, z = np.zeros(shape), np.zeros(shape)
     there[row, column - first] = 1.0
     z[row, column - first] = values - values.mean()
-    size = 2 * rows + 1, 2 * columns + 1
+    size: Any = (2 * rows + 1, 2 * columns + 1)  # SciPy takes a size for each axis
     s = np.broadcast_to((position - position.mean())[:, None], shape)
     x = np.broadcast_to(np.arange(shape[1]) - 0.5 * shape[1], shape)
 

@@ -107,7 +107,14 @@ def minimised(
     The sum is infinite where the search does not converge, so that the best of several starts can be taken.
     """
     solution = least_squares(
-        residuals, start, jac=jacobian, method="lm", xtol=1e-13, ftol=1e-15, gtol=1e-15, max_nfev=_STEPS
+        residuals,
+        start,
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        method="lm",
+        xtol=1e-13,
+        ftol=1e-15,
+        gtol=1e-15,
+        max_nfev=_STEPS,
     )
     converged = solution.success and np.isfinite(solution.x).all()
     return solution.x, 2.0 * float(solution.cost) if converged else np.inf

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.metrology.least_squares import (
@@ -271,7 +271,7 @@ def _cylinder_starts(points: np.ndarray, known: float | None, axis_start: Any) -
 
 def _normal_to_normals(points: np.ndarray) -> np.ndarray:
     """The direction most nearly normal to the surface normals of small neighbourhoods."""
-    _, nearest = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
+    _, nearest = KDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))
     patches = points[nearest] - points[nearest].mean(axis=1, keepdims=True)
     _, vectors = np.linalg.eigh(np.swapaxes(patches, 1, 2) @ patches)
     normals = vectors[:, :, 0]

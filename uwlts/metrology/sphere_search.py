@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from uwlts.errors import EvaluationError
@@ -119,7 +119,7 @@ def _best_centre(points: np.ndarray, radius: float, rng: np.random.Generator) ->
 def _proposed_centres(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray:
     """Centres (M, 3) of the spheres through triples of points that lie within one radius of their first point."""
     seeds = rng.integers(len(points), size=_SEEDS)
-    balls = cKDTree(points).query_ball_point(points[seeds], radius)
+    balls = KDTree(points).query_ball_point(points[seeds], radius)
     picks = rng.random((_SEEDS, 2))
     triples = np.array(
         [

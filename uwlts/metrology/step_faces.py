@@ -8,7 +8,7 @@ from enum import IntEnum
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
 from uwlts.metrology.flat_fits import LineFit, PlaneFit, fit_line, fit_plane
@@ -225,5 +225,5 @@ def _away_from_edges(along: np.ndarray, on_it: np.ndarray, edge: float) -> np.nd
     face, others = np.flatnonzero(on_it), along[~on_it]
     if not len(others) or not len(face) or edge == 0:
         return face
-    distance, _ = cKDTree(others).query(along[face], distance_upper_bound=edge)
+    distance, _ = KDTree(others).query(along[face], distance_upper_bound=edge)
     return face[distance > edge]

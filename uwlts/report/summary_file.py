@@ -73,10 +73,11 @@ def _key_figures(measurements: Iterable[Measurement]) -> dict[str, Any]:
     for name, (kind, quantity) in KEY_FIGURES.items():
         values = {}
         for measurement in measurements:
-            evaluation = None if measurement.judged is None else measurement.judged.evaluation
-            if evaluation is None or kind not in (None, evaluation.kind):
+            record = measurement.judged
+            evaluation = None if record is None else record.evaluation
+            if record is None or evaluation is None or kind not in (None, evaluation.kind):
                 continue
-            keys = measurement.judged.figure_keys()
+            keys = record.figure_keys()
             found = [
                 value
                 for figure, value in evaluation.figures_mm.items()
