@@ -24,9 +24,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from uwlts.errors import CaptureError, ImageError, OutputError
-from uwlts.file_label import read_label, write_label
+from uwlts.hdf5_file import UnfinishedFile, has_writer, read_label, write_label
 from uwlts.sensor import Description, Medium, Sensor, Vector
-from uwlts.unfinished import UnfinishedFile, has_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 1

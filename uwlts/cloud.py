@@ -14,8 +14,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.errors import CaptureError
-from uwlts.file_label import format_of, read_label, write_label
 from uwlts.files import written_aside
+from uwlts.hdf5_file import format_of, read_label, write_label
 from uwlts.sensor import Description
 
 FORMAT = "uwlts-cloud"

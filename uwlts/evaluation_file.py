@@ -14,8 +14,7 @@ from pydantic import (
 )
 
 from uwlts.errors import CaptureError
-from uwlts.files import written_aside
-from uwlts.json_file import read_json
+from uwlts.files import read_json, written_aside
 from uwlts.metrology.artefact_descriptions import Artefact
 from uwlts.metrology.evaluation import FigureKey, figure_keys
 

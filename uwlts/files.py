@@ -1,13 +1,20 @@
-"""Outputs appear whole or not at all: written beside their place, flushed to the disk, then renamed."""
+"""Files that appear whole or not at all, and files of JSON: one object, whose "format" and "version" say what it is.
+
+Outputs are written beside their place, flushed to the disk, then renamed.
+"""
 
 import errno
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeVar
 
-from uwlts.errors import OutputError
+from pydantic import BaseModel, ValidationError
+
+from uwlts.errors import CaptureError, OutputError
 
 
 @contextmanager
@@ -95,3 +102,46 @@ def _flush_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+AnyModel = TypeVar("AnyModel", bound=BaseModel)
+
+_MOST_PROBLEMS = 5
+"""Problems named in a message; a damaged table would be reported number by number."""
+
+
+def read_json(path: str | Path, *, called: str) -> dict[str, Any]:
+    """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
+    a_thing = f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read the {called} {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path} is not {a_thing}, or is truncated: {error}") from error
+    if not isinstance(content, dict):
+        raise CaptureError(f'{path} is JSON but not {a_thing}: expected an object with a "format"')
+    return content
+
+
+def described(
+    content: dict[str, Any], model: type[AnyModel], *, path: str | Path, format: str, version: int,
+    called: str, foreign: str,
+) -> AnyModel:  # fmt: skip
+    """The description in a file's object; CaptureError where it is foreign (in these words), newer or damaged."""
+    if content.pop("format", None) != format:
+        raise CaptureError(f'{path} is JSON but {foreign}: expected "format": "{format}"')
+    if (found := content.pop("version", None)) != version:
+        raise CaptureError(f"{path} has version {found}; this program reads {version}")
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        problems = error.errors()[:_MOST_PROBLEMS]
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
+        raise CaptureError(f"{path} is not a valid {called}: {details}") from error
+
+
+def json_text(content: BaseModel | dict[str, Any] | list[Any], *, indent: int | None = None, ascii: bool = True) -> str:
+    """Text of a JSON file, of a model with the fields that were set; ValueError for numbers that are not finite."""
+    plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
+    return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"

@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 
 from uwlts.errors import CaptureError
-from uwlts.file_label import read_label, write_label
 from uwlts.files import written_aside
+from uwlts.hdf5_file import read_label, write_label
 from uwlts.sensor import Description, Medium, Sensor
 
 FORMAT = "uwlts-truth"

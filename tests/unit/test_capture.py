@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 from uwlts import capture as capture_module
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
 from uwlts.errors import CaptureError, ImageError, OutputError, UwltsError
-from uwlts.file_label import read_label, write_label
+from uwlts.hdf5_file import has_writer, lookup3, read_label, write_label
 from uwlts.library import load_sensor
 from uwlts.sensor import Sensor
-from uwlts.unfinished import has_writer, lookup3
 
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHT, WIDTH = 20, 24

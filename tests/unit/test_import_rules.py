@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # camera, refraction, sheet, stripe, detection of targets, calibration, reconstruction, metrology.
 SHARED_WITH_TWIN = {
     "errors", "sensor", "media", "waters", "phase_functions", "placement", "library", "capture", "truth", "files",
-    "unfinished", "file_label", "console", "workers", "aravis_library", "report.page_toolkit",
+    "hdf5_file", "console", "workers", "aravis_library", "report.page_toolkit",
 }  # fmt: skip
 
 # Of the targets the twin knows the descriptions alone, which it draws.

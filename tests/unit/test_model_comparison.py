@@ -17,7 +17,7 @@ from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE, Misses,
 from uwlts.calibration.model_comparison.scores import tally
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.errors import CalibrationError
-from uwlts.json_file import json_text
+from uwlts.files import json_text
 from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
 
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)

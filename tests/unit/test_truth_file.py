@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from uwlts.errors import CaptureError, OutputError, UwltsError
-from uwlts.file_label import write_label
+from uwlts.hdf5_file import write_label
 from uwlts.library import load_sensor
 from uwlts.truth import Truth, TruthHeader, TruthStatus, read_truth, truth_path, write_truth
 

@@ -7,7 +7,7 @@ from typing import Protocol
 from uwlts.calibration.model import Calibration, read_calibration
 from uwlts.calibration.polynomial_model import FORMAT, PolynomialCalibration, read_polynomials
 from uwlts.errors import CalibrationError
-from uwlts.json_file import read_json
+from uwlts.files import read_json
 from uwlts.sensor import Medium, Sensor
 
 AnyCalibration = Calibration | PolynomialCalibration

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts.calibration.joint_estimate import JointEstimate, Origin, joint_estimate_in
-from uwlts.files import written_aside
-from uwlts.json_file import described, read_json
+from uwlts.files import described, read_json, written_aside
 from uwlts.sensor import Description, Distortion, Medium, Positive, Vector
 
 FORMAT = "uwlts-calibration"

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from uwlts.calibration.model import require_plain_json
-from uwlts.files import written_aside
-from uwlts.json_file import described, read_json
+from uwlts.files import described, read_json, written_aside
 from uwlts.sensor import Description, Medium, Positive
 
 FORMAT = "uwlts-polynomials"

@@ -9,7 +9,7 @@ from pydantic import JsonValue
 
 from uwlts.calibration.sources import sha256_of
 from uwlts.errors import CaptureError
-from uwlts.json_file import read_json
+from uwlts.files import read_json
 
 FORMAT = "uwlts-certificate"
 VERSION = 1

@@ -14,7 +14,7 @@ from uwlts.calibration.model_comparison.candidates import DIMENSIONS, Candidate,
 from uwlts.calibration.model_comparison.comparison import Choice, Comparison, Judged
 from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE
 from uwlts.calibration.model_comparison.scores import POINTS, STRIPES, PolynomialScore
-from uwlts.json_file import json_text
+from uwlts.files import json_text
 from uwlts.report.numbers import fixed, small_length
 from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
 
