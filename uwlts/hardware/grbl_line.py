@@ -406,7 +406,7 @@ class GrblLine:
         self.fault = what
         sent = self._try_to_reset()
         laser = (
-            "the laser was switched off" if sent
+            "the command to switch the laser off was sent" if sent
             else "the laser CANNOT be switched off: switch its power off before going near"
         )  # fmt: skip
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
