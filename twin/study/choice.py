@@ -22,7 +22,7 @@ def pareto(values: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     values : (N, M) float
-        Smaller is better. A design with a value NaN is no candidate: it is not on the front and beats nobody.
+        Smaller is better. A design with a value NaN is no candidate: it is not on the front and beats no other.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def choose(study: Study, columns: Columns) -> Chosen:
 
 
 def _better_than(study: Study, columns: Columns, place: int) -> Callable[[Design], bool]:
-    """Whether a design is better than one of the sweep, judged alike."""
+    """Whether a design is better than one of the sweep, by the same formulas."""
     objective = study.objectives[0]
     best = _cost(columns[objective.figure][place], objective.goal)
 

@@ -133,7 +133,7 @@ class Study(Description):
     """
 
     title: str
-    sensor: Annotated[dict[str, Any], Field(validate_default=True)] = "thesis"
+    sensor: dict[str, Any] = Field(default="thesis", validate_default=True)
     medium: str = "water"
     reflectance: Annotated[float, Field(gt=0, le=1)] = 0.5
     water_depth_m: NotNegative = 100.0

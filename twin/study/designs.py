@@ -147,7 +147,8 @@ def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
     if reason:
         raise DesignError(f"{label}: {reason}")
     table = sensor.model_dump()
-    values: dict[str, Value] = {
+    # `load_study` has checked that the paths lead to values.
+    values: dict[str, Any] = {
         name: label if name in study.choices else reduce(lambda place, key: place[key], name.split("."), table)
         for name in study.free()
     }

@@ -41,7 +41,7 @@ class Field:
     """What is where in the measuring volume, arrays that go with (N, DEPTHS, PLACES).
 
     ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties by the
-    stripe's noise. ``lit`` tells where the fan has a line in view of the image's other sides, ``in_view`` where the
+    stripe's noise. ``lit`` is where the fan has a line in view of the image's other sides, ``in_view`` where the
     camera sees it.
     """
 
@@ -379,7 +379,7 @@ def laser_class(p: Parameters) -> np.ndarray:
     nm = 1e6 * p.wavelength_mm
     class_1 = 3.9e-5 * 10 ** (0.02 * (np.clip(nm, 450, 500) - 450))
     limits = (class_1, _CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W)
-    return 1 + sum((power > limit).astype(int) for limit in limits)
+    return np.sum([power > limit for limit in limits], axis=0) + 1
 
 
 def window_needed_mm(p: Parameters, *, water_depth_m: float) -> np.ndarray:

@@ -101,9 +101,9 @@ class Path:
 
     ``slope`` is the tangent of the angle to the window's normal in air, ``slope_outside`` that in the medium,
     ``across`` the unit vector square to the normal in which the ray leans, ``height_mm`` the point's distance from the
-    origin along the normal. ``apparent_mm`` is the ray's way across over its slope in air, the distance from which it
-    seems to come sideways; ``growth_mm`` is the change of the way across by the slope, the distance from which a
-    bundle seems to come in the plane of incidence.
+    origin along the normal. ``apparent_mm`` is the ray's distance across over its slope in air, the distance from which
+    it seems to come sideways; ``growth_mm`` is the change of the distance across by the slope, the distance from which
+    a bundle seems to come in the plane of incidence.
     """
 
     slope: Array
@@ -180,7 +180,7 @@ def direction_outside(xp: ModuleType, window: FlatWindow, path: Path) -> Vector:
 
 
 def length_outside_mm(xp: ModuleType, window: FlatWindow, path: Path) -> Array:
-    """Way of rays through the medium."""
+    """Path length of rays through the medium."""
     return (path.height_mm - window.outer_mm) * xp.sqrt(1 + path.slope_outside * path.slope_outside)
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.polynomial import Chebyshev
+from numpy.typing import ArrayLike
 
 from twin.speckle import coherence, pixel_contrast
 from twin.study.geometry import (
@@ -224,7 +225,7 @@ def _vector(parts: Sequence[Array]) -> Vector:
     return x, y, z
 
 
-def _column(values: Sequence[float]) -> np.ndarray:
+def _column(values: ArrayLike) -> np.ndarray:
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
@@ -256,10 +257,10 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
     cx, cy = camera.principal_point()
-    d = camera.distortion
+    d, angle = camera.distortion, laser.triangulation_angle_deg
     numbers = {
-        "baseline_mm": math.nan if by_axis else laser.baseline_mm,
-        "angle_rad": math.nan if by_axis else math.radians(laser.triangulation_angle_deg),
+        "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
+        "angle_rad": math.nan if by_axis or angle is None else math.radians(angle),
         "roll_rad": math.radians(laser.roll_deg),
         "along_width": float(camera.stripe_along == "width"),
         "width_px": camera.width_px, "height_px": camera.height_px,
@@ -289,7 +290,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "dark_e_per_ms": 1e-3 * detector.dark_current_e_per_s * detector.dark_current_growth(),
         "offset_e": math.hypot(detector.dsnu_e, detector.dsnu_row_e, detector.dsnu_column_e), "prnu": detector.prnu,
         "step_e": 1 / detector.gain_dn_per_e(), "bits": detector.bits,
-        "exposure_ms": math.nan if exposure.laser_ms == "auto" else exposure.laser_ms,
+        "exposure_ms": math.nan if isinstance(exposure.laser_ms, str) else exposure.laser_ms,
         "exposure_level": exposure.auto_level, "longest_ms": exposure.longest_ms,
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
         "speckle_coherence": float(

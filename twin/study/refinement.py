@@ -127,11 +127,8 @@ class DerivedFigures:
 
     def at(self, values: np.ndarray) -> Derived:
         """Figures and derivatives at values (K,) of the free numbers."""
-        columns = []
-        for number in range(len(self.paths)):
-            found, change = self._derived(values, number)
-            columns.append(change)
-        return Derived(np.array(found), np.array(columns).T)
+        found = [self._derived(values, number) for number in range(len(self.paths))]
+        return Derived(np.array(found[-1][0]), np.array([change for _, change in found]).T)
 
     def _derived(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
         """Figures, and their derivatives by one number."""
@@ -155,7 +152,7 @@ class DerivedFigures:
         outputs = [self._float(SMOOTH[name](dr, p, f, mean)) for name in self._figures]
         dr.set_grad(numbers, seeds)
         dr.enqueue(dr.ADMode.Forward, numbers)
-        # What one figure is, another may be derived from: gradients on the way are kept.
+        # Figures may share intermediate results: their gradients are kept.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
         changes = [dr.grad(output) for output in outputs]
         dr.eval(outputs, changes)
@@ -166,9 +163,9 @@ class DerivedFigures:
 def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> Design | None:
     """The design moved along the gradient until the first objective is best within ranges and constraints.
 
-    Sequential quadratic programming (Kraft 1988). Constraints that cannot be derived are left to ``accepts``, which
-    tells whether a design is better than the start; where it does not like the end, the way there is halved. None if
-    nothing can be derived, or nothing better is found.
+    Sequential quadratic programming (Kraft 1988). Constraints without a derivative are left to ``accepts``, which
+    returns whether a design is better than the start; where it rejects the end, the step is halved. None if nothing has
+    a derivative, or nothing better is found.
     """
     objective = study.objectives[0]
     bounds = [(name, bound) for name, bound in study.constraints.items() if name in SMOOTH]

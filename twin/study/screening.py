@@ -134,7 +134,7 @@ class Search:
         )
         self._optuna = optuna.create_study(
             storage=journal, sampler=sampler, study_name=_NAME, load_if_exists=True,
-            directions=[objective.goal.replace("ise", "ize") for objective in study.objectives],
+            directions=["minimize" if objective.goal == "minimise" else "maximize" for objective in study.objectives],
         )  # fmt: skip
 
     def ask(self, count: int) -> list[Design]:
@@ -143,7 +143,7 @@ class Search:
         free = self._study.free()
         return [Design(trial.number, {name: free[name].taken(trial.params[name]) for name in free}) for trial in trials]
 
-    def tell(self, columns: Columns) -> None:
+    def report(self, columns: Columns) -> None:
         """Report columns of designs as `judged` returns them; those reported before are left alone."""
         trials = {trial.number: trial for trial in self._optuna.get_trials(deepcopy=False)}
         for place, number in enumerate(columns["design"].tolist()):
@@ -162,7 +162,7 @@ class Search:
 def _distribution(variable: Variable) -> BaseDistribution:
     if variable.values is not None:
         return CategoricalDistribution(variable.values)
-    return FloatDistribution(variable.least, variable.most, log=variable.scale == "log")
+    return FloatDistribution(*variable.ends(), log=variable.scale == "log")
 
 
 Progress = Callable[[str, int, int], None]
@@ -236,7 +236,7 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
     search = Search(study, folder)
     known = read_parts(place)
     if known:
-        search.tell(known)
+        search.report(known)
     total = study.sampling.designs
     # Other machines may add designs of their own.
     while (done := sum(map(rows_in, parts(place)))) < total:
@@ -251,7 +251,7 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
             content = _content(batch, result)
             write_part(place, batch.first, content)
             table = pq.read_table(pa.BufferReader(content))
-            search.tell({name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names})
+            search.report({name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names})
             done += batch.count
             progress("optimising", done, total)
 

@@ -1,4 +1,4 @@
-"""How bright and how wide the stripe is at points of the sheet, and how well its centre can be found there."""
+"""Brightness and width of the stripe at points of the sheet, and the uncertainty of its centre there."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from twin.study.parameters import Parameters
 _BRIGHT_LINES = 2.05
 """Automatic exposure lets 2 % of the profile lines be brighter: standard deviations of speckle above the mean."""
 _UNMODELLED = 0.02
-"""Part of the height by which stripes differ from the Gaussian that is fitted to them; it limits what flanks tell."""
+"""Part of the height by which stripes differ from the Gaussian that is fitted to them; it limits the flanks' weight."""
 _FLANK, _NODES = 4.0, 16
 """The profile is summed up to so many standard deviations, at so many places."""
 _DIFFRACTION = 0.42
@@ -88,8 +88,8 @@ def stripe_at(
     lit = _lit(xp, p, angle)
     per_mm = p.power_w * lit / (2 * p.fan_half_rad) / ((1 + fan.slope * fan.slope) * fan.growth_mm)
     back = length_outside_mm(xp, window, view.path)
-    way = length_outside_mm(xp, laser_window, fan) + back
-    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * p.laser_window_passes * xp.exp(-p.extinction_per_mm * way)
+    passed = xp.exp(-p.extinction_per_mm * (length_outside_mm(xp, laser_window, fan) + back))
+    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * p.laser_window_passes * passed
     a, b = view.slopes
     cosine_squared = 1 / (1 + a * a + b * b)
     lens = math.pi / 4 / (number * number) * cosine_squared * cosine_squared

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from twin.scene import Scene
-from twin.study.geometry import FlatWindow, Lens, dot, seen
+from twin.study.geometry import Array, FlatWindow, Lens, dot, seen
 from uwlts.errors import DesignError
 from uwlts.library import validated
 from uwlts.placement import camera_from_object, check_design, laser_pose
@@ -45,15 +45,15 @@ class LineOfSight:
             fan_slope=sine / math.sqrt(1 - sine**2),
         )  # fmt: skip
 
-    def depth_mm(self, z: np.ndarray | float) -> np.ndarray | float:
+    def depth_mm(self, z: Array) -> Array:
         """Depth along the camera's axis, from its pupil, of points on the laser's axis through the stand-off."""
         return self.pose[2, 3] + self.pose[2, 2] * z
 
-    def z_at(self, depth_mm: np.ndarray | float) -> np.ndarray | float:
+    def z_at(self, depth_mm: Array) -> Array:
         """Z of the points at such a depth."""
         return (depth_mm - self.pose[2, 3]) / self.pose[2, 2]
 
-    def blur_px(self, depth_mm: np.ndarray | float) -> np.ndarray | float:
+    def blur_px(self, depth_mm: Array) -> Array:
         """Diameter in px of the blur of a point in air: that of the pupil over the distance from the focused plane."""
         camera = self.camera
         pupil = camera.focal_length_mm / camera.f_number
@@ -65,10 +65,10 @@ class LineOfSight:
         cx, cy = camera.principal_point()
         d = camera.distortion
         lens = Lens(camera.focal_length_px(), cx, cy, d.k1, d.k2, d.k3, d.p1, d.p2)
-        point = tuple(self.pose[:3, :3] @ points.T + self.pose[:3, 3:])
-        # Nothing before the window's outer face can be asked for.
-        outside = (dot(point, window.normal) > window.outer_mm) & (point[2] > 0)
-        image = seen(np, lens, window, tuple(np.where(outside, p, q) for p, q in zip(point, (0, 0, 1e3), strict=True)))
+        x, y, z = self.pose[:3, :3] @ points.T + self.pose[:3, 3:]
+        # The formulas hold beyond the window's outer face only.
+        outside = (dot((x, y, z), window.normal) > window.outer_mm) & (z > 0)
+        image = seen(np, lens, window, (np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3)))
         within = margin_px - 0.5
         in_width = (image.x >= within) & (image.x <= camera.width_px - 1 - within)
         return outside & in_width & (image.y >= within) & (image.y <= camera.height_px - 1 - within)
@@ -131,7 +131,7 @@ _MARGIN = 0.03
 """Share of the depth range left out at either end: there the stripe runs into the image's edge."""
 _OVERSIZE = 1.2
 _STEP_HEIGHT = 0.2
-"""Share of the depth range. A high step weighs the window's distance more than the scatter of its treads."""
+"""Share of the depth range. A high step constrains the window's distance better than the scatter on its faces."""
 _EDGE = 0.02
 """Share of the line's length beside the step's riser that is left out."""
 _NEARER, _FARTHER = 0.75, 1.5

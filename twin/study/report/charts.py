@@ -12,11 +12,11 @@ import matplotlib
 import numpy as np
 import plotly.graph_objects as go
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import Delaunay, KDTree, QhullError
 
 from twin.study.choice import pareto
 from twin.study.description import Value, Variable
@@ -156,7 +156,7 @@ def curves(judged: Judged, marked: Sequence[Point], x: str) -> Static:
     others = [name for name in judged.study.free() if name != x]
     groups: dict[str, list[int]] = {}
     for place in np.flatnonzero(judged.works):
-        groups.setdefault(_combination(judged, others, place), []).append(int(place))
+        groups.setdefault(_combination(judged, others, int(place)), []).append(int(place))
     caption = ""
     if len(groups) > len(COLOURS):
         groups = {"best": judged.best_first.tolist()}
@@ -228,7 +228,7 @@ class Map:
     """Figures over two variables: values (ny, nx) by name at x (nx,) and y (ny,), NaN where no design works.
 
     ``reasons`` (ny, nx) says where and why designs there do not do, "" where they do or nothing is known. ``smooth``
-    tells whether neighbours are of one kind, so that contours make sense, ``dots`` whether designs are shown as well.
+    says whether neighbours are of one kind, so that contours make sense, ``dots`` whether designs are shown as well.
     """
 
     x: np.ndarray
@@ -309,7 +309,7 @@ def _interpolated(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map
     known = np.column_stack([judged.figure(name)[judged.works] for name in figures])
     found = LinearNDInterpolator(mesh, known)(nodes)
     # A node belongs to its nearest design: near one that fails nothing is known.
-    nearest = cKDTree(places).query(nodes)[1]
+    nearest = KDTree(places).query(nodes)[1]
     found[~judged.works[nearest]] = np.nan
     if not np.isfinite(found[..., 0]).any():
         return None
@@ -326,7 +326,7 @@ def _reasons(judged: Judged, values: dict[str, np.ndarray], failures: np.ndarray
     bounded = [name for name in judged.study.constraints if name in values]
     for place in np.ndindex(reasons.shape):
         if not reasons[place] and bounded:
-            reasons[place] = "; ".join(misses(judged.study, {name: values[name][place] for name in bounded}))
+            reasons[place] = "; ".join(misses(judged.study, {name: float(values[name][place]) for name in bounded}))
     return reasons
 
 
@@ -340,7 +340,7 @@ def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Static 
     figure, panels, names = _panels(figures)
     variables = [judged.study.variables[name] for name in (x, y)]
     dots = np.flatnonzero(sample(judged.works, np.zeros(len(judged), bool), _MOST_DOTS)) if found.dots else []
-    for axes, name in zip(panels, names, strict=True):
+    for number, (axes, name) in enumerate(zip(panels, names, strict=True)):
         _fill(axes, found, name)
         _shade(axes, found)
         if len(judged.study.free()) == 2:
@@ -350,9 +350,7 @@ def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Static 
             axes.plot(*at, ".", color=INK, markersize=1.0, alpha=0.5, rasterized=True)
         _mark(axes, marked, x, y)
         axes.grid(visible=False)
-        axes.set(xlabel=label_of(x), title=label_of(name))
-        if axes.get_subplotspec().is_first_col():
-            axes.set_ylabel(label_of(y))
+        axes.set(xlabel=label_of(x), ylabel="" if number % _PANEL_COLUMNS else label_of(y), title=label_of(name))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
         axes.set(xlim=_with_margin(variables[0]), ylim=_with_margin(variables[1]))
     legend_below(figure)
@@ -397,7 +395,7 @@ def _fill(axes: Axes, found: Map, name: str) -> None:
         drawn = axes.contourf(found.x, found.y, np.ma.masked_invalid(values), levels=steps, norm=norm, extend="both")
     else:
         drawn = axes.pcolormesh(found.x, found.y, values, norm=norm, shading="nearest", rasterized=True)
-    ticks = np.geomspace(low, high, 5) if log else None
+    ticks = np.geomspace(low, high, 5).tolist() if log else None
     bar = axes.figure.colorbar(drawn, ax=axes, ticks=ticks)
     if ticks is not None:
         bar.set_ticks(ticks, labels=[number_text(tick, 2) for tick in ticks], minor=False)
@@ -410,7 +408,7 @@ def _shade(axes: Axes, found: Map) -> None:
     for where, colour, strength in ((works, "#e4e7eb", 0.72), (~works, "#969ea8", 1.0)):
         shaded = np.where((found.reasons != "") & where, 1.0, np.nan)
         if np.isfinite(shaded).any():
-            shades = matplotlib.colors.ListedColormap([colour])
+            shades = ListedColormap([colour])
             axes.pcolormesh(
                 found.x, found.y, shaded, cmap=shades, alpha=strength, shading="nearest", rasterized=True,
                 linewidth=0, antialiased=False,
@@ -531,7 +529,8 @@ def _add_marked(
     figure: go.Figure, points: Sequence[Point], x: str, y: str, *, ends: Sequence[tuple[float, float]]
 ) -> None:
     """Add marked designs with their labels, which stand towards the middle between the ``ends`` of the x axis."""
-    logs = [figure.layout[axis].type == "log" for axis in ("xaxis", "yaxis")]
+    layout: Any = figure.layout
+    logs = [layout[axis].type == "log" for axis in ("xaxis", "yaxis")]
     low, high = (math.log10(end) if logs[0] else end for end in ends[0])
     for point in points:
         at, label = [point.value(x), point.value(y)], escaped(point.label)

@@ -385,8 +385,8 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
         axes.axis("off")
         start += room
     px = 1 / scale
-    _draw_side(views[0], side, None if behind is None else behind[0], low=boxes[0][0], high=sum(boxes[0]), px=px)
-    _draw_front(views[1], front, None if behind is None else behind[1], right=float(sum(boxes[1])[0]), px=px)
+    _draw_side(views[0], side, None if behind is None else behind[0], low=boxes[0][0], high=np.add(*boxes[0]), px=px)
+    _draw_front(views[1], front, None if behind is None else behind[1], right=float(np.add(*boxes[1])[0]), px=px)
     return Drawing(figure, behind is not None)
 
 

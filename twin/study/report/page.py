@@ -187,7 +187,7 @@ def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
     missed = not judged.feasible.any()
     rows = [
         [str(judged.columns["design"][place])]
-        + [value_text(name, judged.columns[name][place], unit=False) for name in names]
+        + [value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=False) for name in names]
         + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
         for place in (judged.best_first[:_BEST] if len(judged) else [])
     ]

@@ -106,10 +106,8 @@ def number_text(value: float | None, digits: int = 4) -> str:
     return text.replace("-", "\N{MINUS SIGN}")
 
 
-def value_text(name: str, value: Value | np.generic | None, *, unit: bool = True) -> str:
+def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
     """A value of a figure or of something free, with its unit."""
-    if isinstance(value, np.generic):
-        value = value.item()
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None:
@@ -209,7 +207,7 @@ class Judged:
 
     def text(self, name: str, place: int) -> str:
         """A design's value in words, with its unit."""
-        return value_text(name, self.columns[name][place])
+        return value_text(name, self.columns[name][place : place + 1].tolist()[0])
 
     def failure_counts(self) -> list[tuple[str, int]]:
         """Why designs cannot work, without the numbers, and how many; the most frequent first."""
