@@ -66,7 +66,7 @@ def equal_noise_advantage() -> tuple[float, str]:
     coastal = Medium(kind="fresh", water="coastal")
     a, b = (1e3 * f(635.0) for f in (coastal.absorption_per_mm, coastal.scattering_per_mm))
     medium = fog(absorption_per_m=a, scattering_per_m=b, phase="henyey-greenstein", asymmetry=0.924)
-    scene = load_scene("plane", changes={"medium": "air"})
+    scene = load_scene("plane", medium="air")
     effects = replace(NONE, haze=True, multiple_scattering=True, secondary_light=True)
     renderer = Renderer(sensor, medium, scene, effects=effects)
     for seed in range(2):
@@ -110,7 +110,7 @@ def campaign() -> tuple[int, float, float, float]:
     with tempfile.TemporaryDirectory() as folder:
         for number, (name, changes, seed) in enumerate(recordings):
             record_scene(
-                load_scene(name, changes=changes), load_sensor("thesis"), Path(folder, f"{number}.h5"),
+                load_scene(name, **changes), load_sensor("thesis"), Path(folder, f"{number}.h5"),
                 as_built=as_built, options=Options(seed=seed),
                 progress=lambda done, total: moments.append(time.perf_counter()),
             )  # fmt: skip

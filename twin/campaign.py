@@ -138,10 +138,9 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
 def _scenes(recording: Recording) -> Iterator[Scene]:
     for place in recording.placements or (None,):
         for medium in recording.media or (None,):
-            changes = {key: value for key, value in (("placement", place), ("medium", medium)) if value is not None}
-            scene = load_scene(recording.scene, changes=changes)
+            scene = load_scene(recording.scene, placement=place, medium=medium)
             motion = scene.motion.model_dump() | recording.motion
-            yield load_scene(recording.scene, changes=changes | {"motion": motion})
+            yield load_scene(recording.scene, placement=place, medium=medium, motion=motion)
 
 
 def _take(recording: Recording, scene: Scene, drawn: "_Drawn", *, every: int) -> Take:

@@ -216,11 +216,11 @@ def choose_scene(
     water: str | float | None = None,
 ) -> Scene:
     """The scene with what is given in place of its own placement, medium and water."""
-    wanted = {"placement": placement, "medium": medium, "water": water}
-    changes = {key: value for key, value in wanted.items() if value is not None}
-    if isinstance(scene, Scene):
-        return validated(Scene, scene.model_dump() | changes, scene.title)
-    return load_scene(scene, changes=changes)
+    if not isinstance(scene, Scene):
+        return load_scene(scene, placement=placement, medium=medium, water=water)
+    given = {"placement": placement, "medium": medium, "water": water}
+    changes = {key: value for key, value in given.items() if value is not None}
+    return validated(Scene, scene.model_dump() | changes, scene.title)
 
 
 def choose_sensors(sensor: str | Path | Sensor, as_built: str | Path | Sensor | None) -> tuple[Sensor, Sensor]:

@@ -4,7 +4,7 @@ Scene coordinates are the sensor's object coordinate system (OCS) at stage posit
 direction of a scan; Y along the stripe; Z along the laser's axis away from the sensor; the origin is the stand-off.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -408,10 +408,21 @@ def scene_names() -> list[str]:
     return names()
 
 
-def load_scene(name_or_path: str | Path, *, changes: dict[str, Any] | None = None) -> Scene:
-    """Scene by name (``spheres``) or path, with top-level ``changes`` such as ``placement`` laid over it."""
+def load_scene(
+    name_or_path: str | Path,
+    *,
+    placement: str | None = None,
+    medium: str | None = None,
+    water: str | float | None = None,
+    motion: Motion | Mapping[str, object] | None = None,
+) -> Scene:
+    """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
     path = find(name_or_path)
-    table = read_table(path) | (changes or {})
+    table = read_table(path)
+    if isinstance(motion, Motion):
+        motion = motion.model_dump()
+    given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
+    table |= {key: value for key, value in given.items() if value is not None}
     objects = table.get("objects", [])
     if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")

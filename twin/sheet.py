@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import cast
+from typing import assert_never, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -262,13 +262,16 @@ def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
 def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Power in W/rad at lit angles (N,), before the window. Its integral over the fan is the laser's power."""
     half = _fan_half_angle(laser)
-    if laser.fan_profile == "flat":
-        relative, total = np.ones_like(angle), 2 * half
-    elif laser.fan_profile == "gaussian":
-        relative, total = np.exp(-2 * (angle / half) ** 2), half * math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))
-    else:
-        nodes, powers = _fan_lit_angles(laser), [power for _, power in laser.fan_profile]
-        relative, total = np.interp(angle, nodes, powers), np.trapezoid(powers, nodes)
+    match laser.fan_profile:
+        case "flat":
+            relative, total = np.ones_like(angle), 2 * half
+        case "gaussian":
+            relative, total = np.exp(-2 * (angle / half) ** 2), half * math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))
+        case tuple() as profile:
+            nodes, powers = _fan_lit_angles(laser), [power for _, power in profile]
+            relative, total = np.interp(angle, nodes, powers), np.trapezoid(powers, nodes)
+        case _:
+            assert_never(laser.fan_profile)
     return 1e-3 * laser.power_mw * relative / total
 
 

@@ -27,7 +27,7 @@ def circles_table() -> str:
     sensor, rows = load_sensor("thesis"), []
     for name, stage in STAGE_MM.items():
         along = {"direction": (0.0, 0.0, 1.0), "start_mm": stage, "count": 1, "lights": ("lamp",)}
-        scene = load_scene("target", changes={"motion": along})
+        scene = load_scene("target", motion=along)
         studio = Studio(sensor, scene, Options(spp=64))
         image = studio.image(next(scene.motion.shots()), 0)
         truth, middles = _true_images(sensor, scene.objects[0], stage)

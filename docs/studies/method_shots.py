@@ -36,7 +36,7 @@ class Place(Case):
             changes["water"] = self.water
         if self.thing == "plane":
             changes["objects"] = [PLATE | {"rotation_deg": [*self.turned_deg, 0.0]}]
-        return load_scene(self.thing, changes=changes)
+        return Scene.model_validate(load_scene(self.thing).model_dump() | changes)
 
 
 @dataclass(frozen=True, eq=False)

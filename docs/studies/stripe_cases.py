@@ -64,7 +64,7 @@ class Case:
             changes["water"] = self.water
         if self.thing == "plane":
             changes["objects"] = [PLATE]
-        return load_scene(self.thing, changes=changes)
+        return Scene.model_validate(load_scene(self.thing).model_dump() | changes)
 
     def sensor(self) -> Sensor:
         """The thesis's sensor with this case's changes."""

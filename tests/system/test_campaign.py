@@ -41,7 +41,7 @@ def record(
 ) -> Path:
     built = load_sensor(as_built) if as_built else None
     options = Options(spp=64 if ideal else 16, seed=seed, effects=NONE if ideal else ALL)
-    record_scene(load_scene(scene, changes=changes), load_sensor("thesis"), path, as_built=built, options=options)
+    record_scene(load_scene(scene, **changes), load_sensor("thesis"), path, as_built=built, options=options)
     return path
 
 
@@ -130,7 +130,7 @@ def test_pipe_and_step_in_water(tmp_path: Path, campaign: tuple[Path, Calibratio
 
 def test_shadowed_lines_give_no_points(tmp_path: Path):
     """Behind a block that keeps the sheet off a plate there is no true stripe and no measured point."""
-    scene = load_scene("plane", changes={"motion": {"count": 1}})
+    scene = load_scene("plane", motion={"count": 1})
     block = {"kind": "block", "size_mm": (40.0, 30.0, 4.0), "position_mm": (0.0, 0.0, -40.0)}
     objects = (*[thing.model_dump() for thing in scene.objects], block)
     path = tmp_path / "plane.h5"

@@ -89,7 +89,7 @@ def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:
 )
 def test_it_agrees_with_the_twin(folder, sensor, tmp_path, name, placement):
     """At the same three positions: the first, the middle and the last."""
-    scene = load_scene(name, changes={"placement": placement} if placement else {})
+    scene = load_scene(name, placement=placement)
     motion = scene.motion
     way = (motion.count - 1) * motion.step_mm
     scene = scene.model_copy(update={"motion": motion.model_copy(update={"count": 3, "step_mm": way / 2})})

@@ -158,7 +158,8 @@ def test_without_imperfections_everything_is_as_built():
         assert take.built == sensor
         scene = load_scene(
             {"line": "pipe", "target-water": "target-through-window"}.get(name, name.split("-")[0]),
-            changes={"placement": take.scene.placement, "medium": take.scene.medium},
+            placement=take.scene.placement,
+            medium=take.scene.medium,
         )
         # Errors of size 0 are none, whatever their seed.
         changed = differing(scene.model_dump(), take.scene.model_dump())
@@ -186,7 +187,7 @@ def test_a_recording_as_described_has_no_imperfections():
     take = drawn(2, **SIZES)["line"]
     assert take.built == take.sensor
     assert take.sensor.camera.stripe_along == "height"
-    assert take.scene == load_scene("pipe", changes={"motion": load_scene("pipe").motion.model_dump() | {"count": 1}})
+    assert take.scene == load_scene("pipe", motion=load_scene("pipe").motion.model_dump() | {"count": 1})
 
 
 def test_size_of_the_windows_tilts():

@@ -37,7 +37,7 @@ def test_every_shipped_sensor_loads(name):
 
 @pytest.mark.parametrize(("name", "place"), PLACES)
 def test_every_shipped_scene_stands_before_the_thesis_sensor(thesis, name, place):
-    scene = load_scene(name, changes={"placement": place})
+    scene = load_scene(name, placement=place)
     assert built(scene).scene.bbox().valid()
     assert len(scene.object_poses()) == len(scene.objects)
     window = {"mounted": scene.window_mounted}
@@ -220,9 +220,9 @@ def test_a_mistake_in_a_scene_is_refused_by_name(tmp_path, mistake):
 
 
 def test_a_placement_may_be_chosen_and_must_be_known():
-    assert load_scene("plane", changes={"placement": "far"}).placement == "far"
+    assert load_scene("plane", placement="far").placement == "far"
     with pytest.raises(DescriptionError, match="placement 'further' is not one of"):
-        load_scene("plane", changes={"placement": "further"})
+        load_scene("plane", placement="further")
 
 
 def test_a_medium_that_the_sensor_does_not_know_is_refused(thesis):
