@@ -254,7 +254,7 @@ def test_a_folder_without_results_is_refused(tmp_path):
 
 
 def test_key_figures_are_those_worked_out_by_hand(campaign):
-    content = summary(campaign, load_reference("thesis"))
+    content = summary(campaign, load_reference("thesis")).model_dump()
     spacing = content["sphere_spacing_error_mm"]
     # 99.21 and 99.17 against 99.18; the third measurement belongs to the other calibration.
     assert spacing["by_measurement"] == pytest.approx({"spheres-near": 0.03, "spheres-far": -0.01}, abs=FIT_MM)
@@ -270,12 +270,12 @@ def test_key_figures_are_those_worked_out_by_hand(campaign):
     assert content["seconds"] == {"render": 12.5, "reconstruct": 1.0}
     # The published means: (0.08 + 0.06 + 0.23 + 0.18) / 4.
     published = content["published"]["sphere_spacing_error_mm"]
-    assert published["by_measurement"] == {"spheres-near": [0.08, 0.06], "spheres-far": [0.23, 0.18]}
+    assert published["by_measurement"] == {"spheres-near": (0.08, 0.06), "spheres-far": (0.23, 0.18)}
     assert published["mean_abs"] == pytest.approx(0.1375)
 
 
 def test_the_truth_is_pooled_over_points(campaign):
-    truth = summary(campaign)["truth"]
+    truth = summary(campaign).model_dump()["truth"]
     # Half of the points are 0.02 mm off, the others exact: rms 0.02 / sqrt(2).
     assert truth["share_within_tolerance"] == pytest.approx(0.5)
     assert truth["rms_mm"] == pytest.approx(0.02 / math.sqrt(2), rel=1e-6)
@@ -290,7 +290,7 @@ def test_the_truth_is_pooled_over_points(campaign):
     better = {"matched": 1200, "share_within_tolerance": 1.0, "rms_mm": 0.0, "after_best_fit": None}
     figures = step_only.judged.truth.model_copy(update=better)
     exact = replace(step_only, name="more", judged=step_only.judged.model_copy(update={"truth": figures}))
-    pooled = summary(replace(campaign, measurements=(step_only, exact)))["truth"]
+    pooled = summary(replace(campaign, measurements=(step_only, exact))).model_dump()["truth"]
     # 200 of 400 and 1200 of 1200 points; the squares of 400 points over 1600.
     assert pooled["share_within_tolerance"] == pytest.approx(1400 / 1600)
     assert pooled["rms_mm"] == pytest.approx(0.01 / math.sqrt(2), rel=1e-6)
@@ -499,7 +499,7 @@ def test_the_page_is_written_once(campaign, tmp_path):
 def test_a_campaign_may_hold_a_calibration_alone(folder, tmp_path):
     (tmp_path / "calibration.json").write_bytes((folder / "calibration.json").read_bytes())
     campaign = gather_campaign(tmp_path)
-    assert summary(campaign)["sphere_spacing_error_mm"]["mean_abs"] is None
+    assert summary(campaign).sphere_spacing_error_mm.mean_abs is None
     assert "window distance" in report_page(campaign)
 
 

@@ -296,7 +296,7 @@ def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
             "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
             "cannot_tell": tuple(told(weak)),
             "weaknesses": tuple(
-                WeaknessRow(**asdict(each) | {"parameters": tuple(key.text for key in each.parameters)})
+                WeaknessRow.model_validate(asdict(each) | {"parameters": tuple(key.text for key in each.parameters)})
                 for each in weak
             ),
             "next_shots": _shots(next_shots(calibration)),

@@ -5,12 +5,10 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 import uwlts
 from uwlts.calibration.model import Calibration
@@ -29,7 +27,7 @@ from uwlts.report.page_toolkit import (
     write_page,
 )
 from uwlts.report.pictures import cloud_png, stripe_png
-from uwlts.report.summary_file import summary
+from uwlts.report.summary_file import TruthSummary, summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table, true_window_distance
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
@@ -74,7 +72,7 @@ def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
         measurements=[_measurement(measurement, collected) for measurement in campaign.measurements],
         calibration=_calibrations(campaign),
         true_window=true_window_distance(campaign) is not None,
-        seconds=_svg(plot.seconds(campaign.seconds)) if campaign.seconds else None,
+        seconds=svg_of(plot.seconds(campaign.seconds)) if campaign.seconds else None,
         seconds_in_all=sum(campaign.seconds.values()),
         provenance=_provenance(campaign),
     )
@@ -129,16 +127,12 @@ def _measurement(measurement: Measurement, collected: FigureCollector) -> _Measu
         stripe=None if stripe is None else png_data_uri(stripe),
         no_stripe="no image of its capture shows a stripe" if capture else "its capture is not in the folder",
         cloud=shown,
-        histogram=_svg(plot.deviation_histogram(cloud)) if cloud is not None and coloured else None,
-        along=_svg(plot.along_stripe(cloud)) if cloud is not None and plot.has_profile(cloud) else None,
+        histogram=svg_of(plot.deviation_histogram(cloud)) if cloud is not None and coloured else None,
+        along=svg_of(plot.along_stripe(cloud)) if cloud is not None and plot.has_profile(cloud) else None,
         deviation_from="the artefact's fitted surface" if judged and judged.evaluation else "the true surface",
         figures=None if judged is None or judged.evaluation is None else _figure_table(judged.evaluation),
         truth=None if judged is None or judged.truth is None else _truth_table(judged.truth),
     )
-
-
-def _svg(ax: Axes) -> Markup:
-    return svg_of(cast(Figure, ax.figure))
 
 
 def _facts(measurement: Measurement) -> list[tuple[str, str]]:
@@ -205,7 +199,7 @@ def _calibrations(campaign: Campaign) -> _CalibrationSection | None:
         parameters=parameter_table(campaign),
         residuals=residual_table(campaign.calibrations),
         warnings=[(name, text) for name, each in by_name.items() for text in _warnings(each.provenance)],
-        curve=_svg(plot.window_curves(by_name, true_mm=true_mm)) if plot.has_window_curve(by_name) else None,
+        curve=svg_of(plot.window_curves(by_name, true_mm=true_mm)) if plot.has_window_curve(by_name) else None,
         groups=[_ResidualPlots(name, _residual_plots(calibration)) for name, calibration in by_name.items()],
     )
 
@@ -217,7 +211,7 @@ def _residual_plots(calibration: Calibration) -> list[tuple[Markup, str]]:
         caption = _CAPTIONS.get(
             f"{found.group} {found.name}", f"{found.group}: {words}." if found.group else f"{words}."
         )
-        plots.append((_svg(plot.residuals(calibration, which=found)), caption))
+        plots.append((svg_of(plot.residuals(calibration, which=found)), caption))
     return plots
 
 
@@ -302,28 +296,26 @@ _PUBLISHED = (
 def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile]:
     """The key figures that the campaign has."""
     content = summary(campaign, reference)
-    published = content["published"] or {}
+    published = content.published
     tiles = []
     for key, name in _TILES.items():
-        found = content[key]
-        count = len(found["by_measurement"])
-        if count:
-            mean = published.get(key, {}).get("mean_abs")
+        found = content.figure(key)
+        count = len(found.by_measurement)
+        if found.mean_abs is not None:
             note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
-            covered = len(published.get(key, {}).get("by_measurement", ()))
-            theirs = None if mean is None else small_length(mean)
-            if theirs and covered < count:
-                theirs += f" for {covered} of them"
-            tiles.append(Tile(name, small_length(found["mean_abs"]), _with_published(note, reference, theirs)))
-    if content["truth"]["share_within_tolerance"] is not None:
-        tiles.append(_truth_tile(content["truth"]))
-    window = content["window_distance_mm"]
-    if window["estimated"] is not None:
-        true = "" if window["true"] is None else f"true {fixed(window['true'])} mm"
-        values = published.get("window_distance_mm") or []
-        theirs = ", ".join(f"{value:g} mm" for value in values)
+            others = None if published is None else published.figure(key)
+            theirs = None if others is None or others.mean_abs is None else small_length(others.mean_abs)
+            if theirs and others and len(others.by_measurement) < count:
+                theirs += f" for {len(others.by_measurement)} of them"
+            tiles.append(Tile(name, small_length(found.mean_abs), _with_published(note, reference, theirs)))
+    if content.truth.share_within_tolerance is not None:
+        tiles.append(_truth_tile(content.truth))
+    window = content.window_distance_mm
+    if window.estimated is not None:
+        true = "" if window.true is None else f"true {fixed(window.true)} mm"
+        theirs = "" if published is None else ", ".join(f"{value:g} mm" for value in published.window_distance_mm)
         note = _with_published(true, reference, theirs)
-        tiles.append(Tile("Window distance", f"{fixed(window['estimated'])} mm", note))
+        tiles.append(Tile("Window distance", f"{fixed(window.estimated)} mm", note))
     return tiles
 
 
@@ -331,15 +323,15 @@ def _with_published(note: str, reference: Reference | None, theirs: str | None) 
     return f"{note}\n{reference.title}: {theirs}" if reference is not None and theirs else note
 
 
-def _truth_tile(truth: dict[str, Any]) -> Tile:
-    """Agreement with truth after the best-fit motion where there is one: the datum is the calibration's own choice."""
-    best, fitted = truth["after_best_fit"], truth["after_best_fit"]["share_within_tolerance"] is not None
-    shown = best if fitted else truth
-    note = f"rms distance {small_length(shown['rms_mm'])}"
+def _truth_tile(truth: TruthSummary) -> Tile:
+    """Agreement with truth after the best-fit motion if there is one: the datum is the calibration's own choice."""
+    fitted = truth.after_best_fit.share_within_tolerance is not None
+    shown = truth.after_best_fit if fitted else truth
+    note = f"rms distance {small_length(shown.rms_mm)}"
     if fitted:
-        note += f" after a best-fit motion; in the sensor's own coordinates {small_length(truth['rms_mm'])}"
-    name = f"Points within {1e3 * truth['tolerance_mm']:g} µm of the truth"
-    return Tile(name, f"{100 * shown['share_within_tolerance']:.2f} %", note)
+        note += f" after a best-fit motion; in the sensor's own coordinates {small_length(truth.rms_mm)}"
+    name = f"Points within {1e3 * (truth.tolerance_mm or 0):g} µm of the truth"
+    return Tile(name, f"{100 * (shown.share_within_tolerance or 0):.2f} %", note)
 
 
 def introduction(campaign: Campaign) -> list[tuple[str, str]]:

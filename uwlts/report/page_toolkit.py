@@ -36,7 +36,9 @@ from uwlts.files import refuse_unsuitable, written_aside
 if TYPE_CHECKING:
     import plotly.graph_objects as go
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
+
+    Drawn = Figure | SubFigure | Axes
 
 MISSING = "-"
 """What stands for a missing value in tables of text."""
@@ -47,14 +49,14 @@ INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b530
 COLOURS = (BLUE, "#d9822b", "#2e8b57", RED, "#7b4fa3", "#5b6770", "#12a3a8", "#a0722a")
 """Colours of the lines of one figure, in order."""
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9.0, "axes.edgecolor": INK, "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK,
     "ytick.color": INK, "axes.titlesize": 10.0, "axes.titleweight": "bold", "axes.titlelocation": "left",
     "axes.grid": True, "axes.axisbelow": True, "grid.color": FAINT, "axes.spines.top": False,
     "axes.spines.right": False,
 }  # fmt: skip
 # Text stays text, and the same figure gives the same file.
-_SVG = {"svg.fonttype": "none", "svg.hashsalt": "page"}
+_SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "page"}
 
 
 def render_page(package: str, template: str, /, *, interactive: FigureCollector | None = None, **values: Any) -> str:
@@ -181,12 +183,14 @@ def new_figure(
     rows: int = 1,
     columns: int = 1,
     height_ratios: list[float] | None = None,
-) -> tuple[Figure, list[Axes]]:  # fmt: skip
+) -> tuple[Figure, list[Axes]]:
     """A matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
     import matplotlib
+    from cycler import cycler
 
-    figure = figure_of(width, height)
-    with matplotlib.rc_context(_STYLE | {"axes.prop_cycle": matplotlib.cycler(color=COLOURS)}):
+    figure, style = figure_of(width, height), dict(_STYLE)
+    style["axes.prop_cycle"] = cycler(color=COLOURS)
+    with matplotlib.rc_context(style):
         return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios).flat)
 
 
@@ -203,23 +207,27 @@ def legend_below(figure: Figure, *, columns: int = 4) -> None:
         )  # fmt: skip
 
 
-def svg_of(figure: Figure) -> Markup:
-    """A matplotlib figure as an SVG element to stand in a page."""
-    drawn = _saved(figure, format="svg", metadata={"Date": None}).decode("utf-8")
+def svg_of(drawn: Drawn) -> Markup:
+    """A matplotlib figure, or that of axes, as an SVG element to stand in a page."""
+    text = _saved(drawn, format="svg", metadata={"Date": None}).decode("utf-8")
     # Ids of groups would occur in every figure, and nothing refers to them; within HTML, SVG needs no namespaces.
-    drawn = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", drawn, flags=re.S)
-    return Markup(drawn[drawn.index("<svg") :].replace("xlink:href", "href"))
+    text = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", text, flags=re.S)
+    return Markup(text[text.index("<svg") :].replace("xlink:href", "href"))
 
 
-def png_of(figure: Figure, *, dpi: int = 100) -> bytes:
-    """A matplotlib figure as PNG."""
+def png_of(drawn: Drawn, *, dpi: int = 100) -> bytes:
+    """A matplotlib figure, or that of axes, as PNG."""
     # The software's name with its version would change the file.
-    return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
+    return _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
 
 
-def _saved(figure: Figure, **options: Any) -> bytes:
+def _saved(drawn: Drawn, **options: Any) -> bytes:
     import matplotlib
+    from matplotlib.figure import Figure
 
+    figure = drawn
+    while not isinstance(figure, Figure):
+        figure = figure.figure
     data = io.BytesIO()
     with matplotlib.rc_context(_SVG), warnings.catch_warnings():
         # Names from files may have letters that the font lacks; a browser has others.
@@ -233,7 +241,7 @@ def plain_text(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def png_data_uri(picture: Figure | bytes, *, dpi: int = 100) -> str:
+def png_data_uri(picture: Drawn | bytes, *, dpi: int = 100) -> str:
     """A matplotlib figure, or the bytes of a PNG, as an address that holds the whole picture."""
     data = picture if isinstance(picture, bytes) else png_of(picture, dpi=dpi)
     return "data:image/png;base64," + base64.b64encode(data).decode("ascii")

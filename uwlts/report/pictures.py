@@ -73,7 +73,7 @@ def stripe_png(measurement: Measurement) -> bytes | None:
 
 def cloud_png(measurement: Measurement) -> bytes | None:
     """Picture of a measurement's cloud; None without one."""
-    return None if measurement.cloud is None else png_of(plot.cloud(measurement.cloud).figure)
+    return None if measurement.cloud is None else png_of(plot.cloud(measurement.cloud))
 
 
 def write_pictures(folder: str | Path, campaign: Campaign, *, overwrite: bool = False) -> list[Path]:

@@ -44,7 +44,9 @@ STOPS = (
 )  # fmt: skip
 """Colours of deviations: place between -1 and +1 limit (0 to 1), and red-green-blue."""
 
-DEVIATIONS = LinearSegmentedColormap.from_list("deviations", [(place, np.divide(rgb, 255)) for place, rgb in STOPS])
+DEVIATIONS = LinearSegmentedColormap.from_list(
+    "deviations", [(place, (red / 255, green / 255, blue / 255)) for place, (red, green, blue) in STOPS]
+)
 """Blue below, grey at zero, red above."""
 
 UNKNOWN, PLAIN, ORANGE, PALE = "#555550", "#5d82a8", "#ff7800", "#9dbad6"
@@ -89,7 +91,8 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
         # The axes are square: as wide as the room beside the colour bar, and higher than the figure, which cuts them.
         figure, side, room = figure_of(11.2, 6.0, layout=None), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
         height = side * 11.2 / 6.0
-        ax = figure.add_axes((0.02, 0.5 - height / 2, side, height), projection="3d")
+        ax = Axes3D(figure, (0.02, 0.5 - height / 2, side, height))
+        figure.add_axes(ax)
         legend_at, bar = figure.transFigure, figure.add_axes((0.92, 0.2, 0.02, 0.6))
     else:
         room, legend_at, bar = (0.8, 0.8), ax.transAxes, None
@@ -122,10 +125,10 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
         axis.labelpad = 18
         axis.set_view_interval(start, end, ignore=True)
         axis.set_major_locator(MaxNLocator(max(2, round(9 * (end - start) / (high - low).max()))))
-        axis.pane.set_facecolor("white")
+        axis.pane.set_facecolor("white")  # pyright: ignore[reportAttributeAccessIssue]
     ax.set_box_aspect(high - low)
-    corners = np.array(list(product(*zip(low, high, strict=True)))).T
-    x, y, _ = proj3d.proj_transform(*corners, ax.get_proj())
+    corners = np.array(list(product(*zip(low, high, strict=True))))
+    x, y, _ = proj3d.proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], ax.get_proj())
     width, height = room[0] * ax.viewLim.width / np.ptp(x), room[1] * ax.viewLim.height / np.ptp(y)
     ax.set_box_aspect(high - low, zoom=min(width, height))
     return ax

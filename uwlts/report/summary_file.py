@@ -1,13 +1,14 @@
-"""The campaign's key figures as plain JSON."""
+"""The key figures of a campaign, and their file summary.json."""
 
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Generic, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
-from uwlts.evaluation_file import TruthFigures
+from uwlts.evaluation_file import TruthComparisons, TruthFigures
 from uwlts.files import written_aside
 from uwlts.metrology.evaluation import Quantity
 from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
@@ -24,13 +25,112 @@ KEY_FIGURES = {
 """Key figures by name: kind of the artefact (None: any) and quantity; details are left out."""
 
 
-def summary(campaign: Campaign, reference: Reference | None = None) -> dict[str, Any]:
-    """Key figures of a campaign; what was not measured is None or empty.
+class _Stored(BaseModel):
+    """Base of what the summary holds; what was not measured is None or empty."""
 
-    The figures at the top are those of the measurements made with the campaign's main calibration; others stand under
-    ``other_calibrations``. An error's ``mean_abs`` is the mean of its absolute values over the measurements, each of
-    which counts with its largest.
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class KeyFigure(_Stored):
+    """An error of every measurement, its largest, and the mean of their absolute values."""
+
+    mean_abs: float | None
+    by_measurement: dict[str, float]
+
+
+class PublishedFigure(_Stored):
+    """Published errors of every measurement, and the mean of their absolute values."""
+
+    mean_abs: float | None
+    by_measurement: dict[str, tuple[float, ...]]
+
+
+_Figure = TypeVar("_Figure", KeyFigure, PublishedFigure)
+
+
+class _KeyFigures(_Stored, Generic[_Figure]):
+    """The figures of `KEY_FIGURES`."""
+
+    sphere_spacing_error_mm: _Figure
+    probing_error_mm: _Figure
+    std_mm: _Figure
+    step_height_error_mm: _Figure
+    pipe_diameter_error_mm: _Figure
+    plane_range_error_mm: _Figure
+
+    def figure(self, key: str) -> _Figure:
+        """The figure of a key of `KEY_FIGURES`."""
+        return getattr(self, key)
+
+
+class PooledTruth(_Stored):
+    """Share within the tolerance and rms distance over all points; None without any, or if the tolerances differ."""
+
+    tolerance_mm: float | None = None
+    share_within_tolerance: float | None = None
+    rms_mm: float | None = None
+
+
+class TruthSummary(PooledTruth):
+    """Comparison with truth over the points of all measurements, after the best fit of each, and of each."""
+
+    after_best_fit: PooledTruth
+    by_measurement: dict[str, TruthComparisons]
+
+
+class WindowDistance(_Stored):
+    """Distance of the camera's window in mm as calibrated, and as set in the twin."""
+
+    estimated: float | None
+    true: float | None
+
+
+class PointCount(_Stored):
+    """Points of an evaluation."""
+
+    total: int
+    used: int
+    rejected: int
+
+
+class CalibrationSummary(_KeyFigures[KeyFigure]):
+    """Key figures of the measurements made with another calibration than the main one."""
+
+    truth: TruthSummary
+
+
+class _Title(_Stored):
+    title: str
+
+
+class PublishedSummary(_KeyFigures[PublishedFigure], _Title):
+    """Published key figures of the measurements made, by the names that the reference gives them."""
+
+    window_distance_mm: tuple[float, ...]
+
+
+class _Names(_Stored):
+    campaign: str
+    calibration: str | None
+
+
+class Summary(_KeyFigures[KeyFigure], _Names):
+    """Key figures of a campaign.
+
+    The figures at the top are those of the measurements made with the campaign's main ``calibration``; others are
+    under ``other_calibrations``. ``seconds`` is the time of each stage.
     """
+
+    window_distance_mm: WindowDistance
+    truth: TruthSummary
+    points: dict[str, PointCount]
+    seconds: dict[str, float]
+    other_calibrations: dict[str, CalibrationSummary]
+    published: PublishedSummary | None
+
+
+def summary(campaign: Campaign, reference: Reference | None = None) -> Summary:
+    """Key figures of a campaign, with published ones if a reference is given."""
     main = campaign.main_measurements
     others: dict[str, list[Measurement]] = {}
     for measurement in campaign.measurements:
@@ -38,37 +138,35 @@ def summary(campaign: Campaign, reference: Reference | None = None) -> dict[str,
             known = measurement.calibration
             others.setdefault(known.name if known else str(measurement.digest), []).append(measurement)
     calibration = campaign.main_calibration
-    return {
-        "campaign": campaign.folder.resolve().name,
-        "calibration": None if calibration is None else calibration.name,
+    return Summary(
+        campaign=campaign.folder.resolve().name,
+        calibration=None if calibration is None else calibration.name,
         **_key_figures(main),
-        "window_distance_mm": _window(campaign),
-        "truth": _truth(main),
-        "points": {
-            m.name: {
-                "total": m.judged.evaluation.points_total,
-                "used": m.judged.evaluation.points_used,
-                "rejected": m.judged.evaluation.points_rejected,
-            }
+        window_distance_mm=_window(campaign),
+        truth=_truth(main),
+        points={
+            m.name: PointCount(total=found.points_total, used=found.points_used, rejected=found.points_rejected)
             for m in campaign.measurements
-            if m.judged is not None and m.judged.evaluation is not None
+            if m.judged is not None and (found := m.judged.evaluation) is not None
         },
-        "seconds": dict(campaign.seconds),
-        "other_calibrations": {name: _key_figures(found) | {"truth": _truth(found)} for name, found in others.items()},
-        "published": None if reference is None else _published(main, reference),
-    }
+        seconds=campaign.seconds,
+        other_calibrations={
+            name: CalibrationSummary(**_key_figures(found), truth=_truth(found)) for name, found in others.items()
+        },
+        published=None if reference is None else _published(main, reference),
+    )
 
 
 def write_summary(
     path: str | Path, campaign: Campaign, reference: Reference | None = None, *, overwrite: bool = False
 ) -> None:
     """Write the summary as indented JSON, whole or not at all; OutputError where that fails."""
-    text = json.dumps(summary(campaign, reference), indent=2, allow_nan=False)
+    text = json.dumps(summary(campaign, reference).model_dump(), indent=2, allow_nan=False)
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(text + "\n", encoding="utf-8")
 
 
-def _key_figures(measurements: Iterable[Measurement]) -> dict[str, Any]:
+def _key_figures(measurements: Iterable[Measurement]) -> dict[str, KeyFigure]:
     figures = {}
     for name, (kind, quantity) in KEY_FIGURES.items():
         values = {}
@@ -85,7 +183,7 @@ def _key_figures(measurements: Iterable[Measurement]) -> dict[str, Any]:
             ]
             if found:
                 values[measurement.name] = max(found, key=abs)
-        figures[name] = {"mean_abs": _mean_abs(values.values()), "by_measurement": values}
+        figures[name] = KeyFigure(mean_abs=_mean_abs(values.values()), by_measurement=values)
     return figures
 
 
@@ -94,44 +192,39 @@ def _mean_abs(values: Iterable[float]) -> float | None:
     return float(sizes.mean()) if len(sizes) else None
 
 
-def _window(campaign: Campaign) -> dict[str, float | None]:
+def _window(campaign: Campaign) -> WindowDistance:
     found = campaign.main_calibration
     window = None if found is None else found.calibration.window
     true = None if window is not None and window.refractions == 1 else true_window_distance(campaign)
-    return {"estimated": None if window is None else window.distance_mm, "true": true}
+    return WindowDistance(estimated=None if window is None else window.distance_mm, true=true)
 
 
-def _truth(measurements: Iterable[Measurement]) -> dict[str, Any]:
-    """Comparisons with truth: over the points of all measurements, and of each."""
+def _truth(measurements: Iterable[Measurement]) -> TruthSummary:
     compared = {m.name: m.judged.truth for m in measurements if m.judged is not None and m.judged.truth is not None}
     fitted = [truth.after_best_fit for truth in compared.values() if truth.after_best_fit is not None]
-    return {
-        **_pooled(list(compared.values())),
-        "after_best_fit": _pooled(fitted if len(fitted) == len(compared) else []),
-        "by_measurement": {name: truth.model_dump() for name, truth in compared.items()},
-    }
+    return TruthSummary(
+        **_pooled(list(compared.values())).model_dump(),
+        after_best_fit=_pooled(fitted if len(fitted) == len(compared) else []),
+        by_measurement=compared,
+    )
 
 
-def _pooled(compared: Sequence[TruthFigures]) -> dict[str, float | None]:
-    """Share and rms over all points; None without any, or where the tolerances differ."""
+def _pooled(compared: Sequence[TruthFigures]) -> PooledTruth:
     weights = [truth.matched for truth in compared]
     if not sum(weights) or len({truth.tolerance_mm for truth in compared}) > 1:
-        return dict.fromkeys(("tolerance_mm", "share_within_tolerance", "rms_mm"))
-    return {
-        "tolerance_mm": compared[0].tolerance_mm,
-        "share_within_tolerance": float(np.average([t.share_within_tolerance for t in compared], weights=weights)),
-        "rms_mm": float(np.sqrt(np.average([truth.rms_mm**2 for truth in compared], weights=weights))),
-    }
+        return PooledTruth()
+    return PooledTruth(
+        tolerance_mm=compared[0].tolerance_mm,
+        share_within_tolerance=float(np.average([t.share_within_tolerance for t in compared], weights=weights)),
+        rms_mm=float(np.sqrt(np.average([truth.rms_mm**2 for truth in compared], weights=weights))),
+    )
 
 
-def _published(measurements: Iterable[Measurement], reference: Reference) -> dict[str, Any]:
-    """Published key figures of the measurements made, by the names that the reference gives them."""
-    measurements = list(measurements)
-    result: dict[str, Any] = {"title": reference.title}
+def _published(measurements: Sequence[Measurement], reference: Reference) -> PublishedSummary:
+    figures = {}
     for key, (_, figure) in KEY_FIGURES.items():
-        values = {m.name: list(found) for m in measurements if (found := reference.values(m.known_as, figure))}
-        result[key] = {
-            "mean_abs": _mean_abs(value for several in values.values() for value in several), "by_measurement": values,
-        }  # fmt: skip
-    result["window_distance_mm"] = list(reference.values((CALIBRATION,), "window_distance_mm"))
-    return result
+        values = {m.name: found for m in measurements if (found := reference.values(m.known_as, figure))}
+        mean = _mean_abs(value for several in values.values() for value in several)
+        figures[key] = PublishedFigure(mean_abs=mean, by_measurement=values)
+    window = reference.values((CALIBRATION,), "window_distance_mm")
+    return PublishedSummary(title=reference.title, **figures, window_distance_mm=window)
