@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, assert_never
 
 import drjit as dr
@@ -40,13 +41,13 @@ def register_patterns() -> None:
 
         def __init__(self, props: mi.Properties):
             mi.Texture.__init__(self, props)
-            self.plate = CirclePlate.model_validate_json(props["plate"])
+            self.plate = CirclePlate.model_validate_json(str(props["plate"]))
             self.shift_mm = to_jit(mi.Float, printed_shifts(self.plate).ravel())
 
-        def traverse(self, callback: mi.TraversalCallback) -> None:
-            callback.put(_SHIFT, self.shift_mm, mi.ParamFlags.NonDifferentiable)
+        def traverse(self, cb: mi.TraversalCallback) -> None:
+            cb.put(_SHIFT, self.shift_mm, mi.ParamFlags.NonDifferentiable)
 
-        def parameters_changed(self, keys: list[str]) -> None:
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             pass
 
         def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
@@ -82,7 +83,7 @@ def register_patterns() -> None:
 
         def __init__(self, props: mi.Properties):
             mi.Texture.__init__(self, props)
-            self.plate = TargetPlate.model_validate_json(props["plate"])
+            self.plate = TargetPlate.model_validate_json(str(props["plate"]))
             first, last = self.plate.bounds_mm()
             self.middle, self.size = ((first + last) / 2).tolist(), (last - first).tolist()
             lists, self.cell_mm = _patches_by_cell(self.plate)
@@ -91,7 +92,7 @@ def register_patterns() -> None:
             self.lists = to_jit(mi.UInt32, lists.ravel())
             self.patches = to_jit(mi.Float, _patch_table(self.plate).ravel())
 
-        def traverse(self, callback: mi.TraversalCallback) -> None:
+        def traverse(self, cb: mi.TraversalCallback) -> None:
             pass
 
         def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:

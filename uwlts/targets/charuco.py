@@ -81,7 +81,7 @@ class CharucoTarget(Target):
         # One pixel for each cell of a marker, its border of one cell included.
         across = dictionary.markerSize + 2
         cell = self.marker_mm / across
-        for number, first in zip(board.getIds().ravel().tolist(), first_corners, strict=True):
+        for number, first in zip(np.ravel(board.getIds()).tolist(), first_corners, strict=True):
             x, y = (first[:, None] + cell * np.arange(across + 1)).tolist()
             dark = cv2.aruco.generateImageMarker(dictionary, number, across) == 0
             patches += [Patch(x[i], y[j], x[i + 1], y[j + 1]) for j, i in np.argwhere(dark).tolist()]
@@ -102,5 +102,5 @@ class CharucoTarget(Target):
             )
         # OpenCV 4 and 5 differ in the singleton dimensions of these arrays.
         pixels = np.asarray(corners, np.float64).reshape(-1, 2)
-        indices = self.indices[np.asarray(numbers).reshape(-1)]
+        indices = self.indices[np.asarray(numbers, np.int64).reshape(-1)]
         return TargetView(pixels, self.points_at(indices), indices, corner_quality(image, pixels))

@@ -115,7 +115,7 @@ def _local_levels(smooth, small, window):
     `small` is `smooth` at a quarter of its resolution, at which all local means are taken.
     """
     mean = _local_mean(small, window)
-    threshold = _enlarged(mean, smooth.shape)
+    threshold, bright, dark = _enlarged(mean, smooth.shape), mean, mean
     for _ in range(2):
         above = np.greater(smooth, threshold).astype(np.float32)
         share = np.clip(_local_mean(_reduced(above), window), 1e-4, 1 - 1e-4)

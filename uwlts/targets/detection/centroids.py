@@ -1,7 +1,7 @@
 """Sub-pixel centres of elliptic blobs from the grey area within their edge."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from uwlts.targets.detection.ellipses import REACH_OVER_MINOR_AXIS, rim_directions, sample
 
@@ -58,8 +58,8 @@ def _reaches(shape, ellipses):
     inner = np.minimum(wanted, REACH_OVER_MINOR_AXIS * semi_axes[:, 0])
     outer = wanted
     if len(ellipses) > 1:
-        distance, index = cKDTree(ellipses.centres).query(ellipses.centres, k=2)
-        gap = distance[:, 1] - semi_axes[:, 1] - semi_axes[index[:, 1], 1]
+        distance, index = KDTree(ellipses.centres).query(ellipses.centres, k=2)
+        gap = distance[:, 1] - semi_axes[:, 1] - semi_axes[np.asarray(index)[:, 1], 1]
         outer = np.minimum(outer, np.maximum(gap / 2, 1.0))
     half_width = np.sqrt((ellipses.shapes**2).sum(2))
     limit = np.array([shape[1], shape[0]]) - 2.0

@@ -28,7 +28,8 @@ def corner_quality(image, pixels):
     -------
     dict of (N,) float64
     """
-    grey = cv2.copyMakeBorder(image.astype(np.float32), *[HALF_WINDOW + 1] * 4, cv2.BORDER_REPLICATE)
+    rim = HALF_WINDOW + 1
+    grey = cv2.copyMakeBorder(image.astype(np.float32), rim, rim, rim, rim, cv2.BORDER_REPLICATE)
     slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
     span = np.arange(-HALF_WINDOW, HALF_WINDOW + 1) + HALF_WINDOW + 1
     centre = np.rint(pixels).astype(int)

@@ -104,7 +104,7 @@ def fit_ellipses(image, blobs):
 def _fitted(grey, blobs, reach, noise):
     """Ellipses of a float32 image (H, W) with edges sampled over one reach in px."""
     centres, shapes = blobs.centres, blobs.shapes
-    kept = np.ones(len(centres), bool)
+    kept, residual, edge = np.ones(len(centres), bool), np.empty(0), None
     for _ in range(PASSES):
         kept = kept & _inside(grey.shape, centres, shapes, reach)
         centres, shapes = centres[kept], shapes[kept]
@@ -113,7 +113,7 @@ def _fitted(grey, blobs, reach, noise):
         edge = _edges(grey, centres, shapes, reach, bright=blobs.bright, noise=noise)
         centres, shapes, residual, fitted = _moved(centres, shapes, edge)
         kept = edge.whole & fitted & _inside(grey.shape, centres, shapes, reach)
-    if len(centres) == 0:
+    if edge is None or len(centres) == 0:
         empty = np.empty(0)
         return Ellipses(np.empty((0, 2)), np.empty((0, 2, 2)), empty, empty, empty, blobs.bright)
     found = Ellipses(centres, shapes, residual, edge.contrast, edge.sharpness, blobs.bright)[kept]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from uwlts.errors import TargetError
 from uwlts.targets.detection.circles import find_circles
@@ -102,7 +102,7 @@ def label_lattice(centres, shapes):
     indices, labelled = np.zeros((len(centres), 2), np.int64), np.zeros(len(centres), bool)
     if len(centres) < MIN_LABELLED:
         return indices, labelled
-    tree = cKDTree(centres)
+    tree = KDTree(centres)
     radii = np.sqrt(np.linalg.det(shapes))
     bases, sines = _bases(centres, shapes, tree)
     tried = np.zeros(len(centres), bool)
@@ -189,8 +189,8 @@ def _grown(seed, centres, radii, basis, tree):
                     asked.append((circle, place, abs(dj)))
         fresh = []
         if asked:
-            expected = np.array(expected)
-            distance, index = tree.query(np.column_stack([expected.real, expected.imag]))
+            nearby = np.array(expected, complex)
+            distance, index = tree.query(np.column_stack([np.real(nearby), np.imag(nearby)]))
             for ask in np.argsort(distance, kind="stable").tolist():
                 (circle, place, axis), found = asked[ask], int(index[ask])
                 if place in places or found in where or distance[ask] > TOLERANCE * abs(steps[circle][axis]):
