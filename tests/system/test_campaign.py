@@ -18,7 +18,7 @@ from uwlts.calibration.model import Calibration
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate_sequentially
 from uwlts.capture import Capture
-from uwlts.evaluate import Evaluation, evaluate
+from uwlts.evaluation import Evaluation, evaluate
 from uwlts.library import load_sensor
 from uwlts.scan import reconstruct
 from uwlts.truth import truth_path

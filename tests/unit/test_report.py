@@ -21,7 +21,7 @@ from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.evaluate import evaluate, write_evaluation
+from uwlts.evaluation import evaluate, write_evaluation
 from uwlts.library import load_sensor
 from uwlts.report import plot
 from uwlts.report.campaign_page import report_page, write_report

@@ -20,7 +20,7 @@ from uwlts.calibration.nominal import nominal_calibration
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, read_cloud
 from uwlts.errors import EvaluationError
-from uwlts.evaluate import evaluate
+from uwlts.evaluation import evaluate
 from uwlts.thesis.campaign import ScanFile
 from uwlts.thesis.measurements import METHODS, _figures, _line_length, _range_within, measure_scan
 from uwlts.thesis.sphere_spacing import sphere_scan

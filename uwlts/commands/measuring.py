@@ -96,8 +96,8 @@ def evaluate(
         Replace existing files.
     """
     from uwlts.cloud import write_cloud
-    from uwlts.evaluate import evaluate as evaluated
-    from uwlts.evaluate import write_evaluation
+    from uwlts.evaluation import evaluate as evaluated
+    from uwlts.evaluation import write_evaluation
     from uwlts.inventory import evaluation_lines
 
     for path in (out, coloured):

@@ -166,7 +166,7 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
     limit
         Largest permissible error in mm.
     """
-    from uwlts.verify import verify as verified
+    from uwlts.verification import verify as verified
 
     verification = verified(capture, calibration, limit)
     print(verification.text)

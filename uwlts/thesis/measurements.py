@@ -22,7 +22,7 @@ from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequential
 from uwlts.capture import Capture
 from uwlts.cloud import PointCloud, write_cloud
 from uwlts.errors import CalibrationError, CaptureError, EvaluationError
-from uwlts.evaluate import Evaluation, evaluate
+from uwlts.evaluation import Evaluation, evaluate
 from uwlts.metrology.artefact_descriptions import parse_artefact
 from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
 from uwlts.scan import reconstruct_stripes
