@@ -166,7 +166,7 @@ def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_lim
             product[np.ix_(at, at)] += columns.T @ columns
         residuals.append(np.vstack([part.residuals for part in parts]))
         products.append(product)
-    shared_scale = _lengths(sum(np.diag(product)[:count] for product in products))
+    shared_scale = _lengths(sum((np.diag(product)[:count] for product in products), np.zeros(count)))
     matrix, gradient = np.zeros((count, count)), np.zeros(count)
     border, blocks, gradients, scales = [], [], [], []
     for product in products:

@@ -71,7 +71,8 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
     smooth = min(MOST_SMOOTH, (span - 1) // _LINES_PER_DEGREE)
     terms = (smooth + 1) * (degree + 1)
     used = np.ones(len(lines), dtype=bool)
-    for rounds in range(_ROUNDS):
+    rounds = 0
+    while True:
         if np.count_nonzero(used) <= terms:
             raise CalibrationError(
                 f"{np.count_nonzero(used)} stripe points on {span} lines are too few for polynomials of degree "
@@ -85,7 +86,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
             _scaled(lines, float(first), float(last)), _scaled(x, low, high), [smooth, degree]
         )
         # The triangular factor has the equations' solution and singular values and is small.
-        triangle = np.linalg.qr(np.column_stack([design, y])[used], mode="r")
+        triangle = np.asarray(np.linalg.qr(np.column_stack([design, y])[used], mode="r"))
         solution, _, _, singular = np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=None)
         if singular[-1] < _DETERMINED * singular[0]:
             raise CalibrationError(
@@ -98,9 +99,10 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         within = np.abs(residuals) <= max(_STRAYS * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:
             within &= used
-        if np.array_equal(within, used):
+        rounds += 1
+        settled, used = np.array_equal(within, used), within
+        if settled or rounds == _ROUNDS:
             break
-        used = within
     over_lines = legendre.legvander(_scaled(np.arange(first, last + 1), float(first), float(last)), smooth)
     coefficients = over_lines @ solution.reshape(smooth + 1, degree + 1)
     return LinePolynomials(first, (low, high), coefficients, residuals, used)
@@ -127,7 +129,7 @@ def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *,
         own = np.flatnonzero(pose == number)
         own = own[np.argsort(lines[own], kind="stable")]
         for piece in np.split(own, np.flatnonzero(np.diff(lines[own]) > largest_gap + 1) + 1):
-            seen = np.arange(lines[piece[0]], lines[piece[-1]] + 1)
+            seen = np.arange(int(lines[piece[0]]), int(lines[piece[-1]]) + 1)
             centres = np.interp(seen, lines[piece], centres_px[piece])
             part = domains[seen - first]
             domains[seen - first] = np.stack([np.minimum(part[:, 0], centres), np.maximum(part[:, 1], centres)], axis=1)

@@ -128,7 +128,7 @@ class Evidence:
     """
 
     sensor: Sensor
-    medium_kind: str
+    medium_kind: Literal["air", "fresh", "sea", "custom"]
     stage_direction: np.ndarray
     approaching: bool | None
     air: AirEvidence
@@ -224,7 +224,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     )
     used, window = [], None
     if evidence.plate is not None:
-        used, window, left_out = _window(calibration, evidence, options)
+        used, window, left_out = _window(calibration, evidence, evidence.plate, options)
         warnings += left_out
     figures: dict[str, Any] = {
         "camera": camera_figures(camera, unbiased),
@@ -303,9 +303,9 @@ def _approaching(air: Sequence[Capture]) -> bool:
 
 
 def _window(
-    calibration: Calibration, evidence: Evidence, options: CalibrationOptions
+    calibration: Calibration, evidence: Evidence, plate: Window, options: CalibrationOptions
 ) -> tuple[list[StepEvidence], WindowSolution, list[str]]:
-    window = nominal_window(evidence.plate, evidence.sensor, refractions=options.refractions)
+    window = nominal_window(plate, evidence.sensor, refractions=options.refractions)
     used, images, warnings = [], [], []
     for step in evidence.steps:
         try:
@@ -320,7 +320,7 @@ def _window(
     return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
 
 
-def step_image(calibration: Calibration, window: WindowModel, step: StepEvidence) -> StepImage:
+def step_image(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
     """A stripe on the step standard with its treads told apart; EvaluationError where it does not show two."""
     standard = step.standard
     return label_step(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -138,7 +137,7 @@ def fit_sheet(
         The points do not determine a plane, do not lie on one, or its normal is far from the nominal one.
     """
     try:
-        robust = fit_robustly(partial(fit_plane, towards=nominal_normal), points_mm)
+        robust = fit_robustly(lambda points: fit_plane(points, towards=nominal_normal), points_mm)
     except EvaluationError as error:
         raise CalibrationError(f"no laser sheet through the stripe points: {error}") from error
     plane, used = robust.fit, robust.inliers

@@ -12,7 +12,7 @@ from uwlts.calibration.window import WindowSolution
 
 def camera_figures(solution: CameraSolution, unbiased: UnbiasedSolution | None) -> dict[str, Any]:
     """Residuals, standard deviations and covariance of the camera; the stage's direction in the camera frame."""
-    direction, tilt = solution.stage_direction, solution.stage_tilt_rad
+    direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
     return {
         "images": len(solution.residuals_px),
         "points": sum(map(len, solution.residuals_px)),
@@ -24,7 +24,7 @@ def camera_figures(solution: CameraSolution, unbiased: UnbiasedSolution | None) 
         "covariance": solution.covariance.tolist(),
         "stage_direction": None if direction is None else direction.tolist(),
         "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
-        "stage_tilt_std_deg": None if tilt is None else float(np.degrees(solution.stage_tilt_std_rad)),
+        "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
         "largest_circle_bias_px": None if unbiased is None else unbiased.largest_bias_px(),
         "rounds": solution.rounds,
         "stopped": solution.stopped,

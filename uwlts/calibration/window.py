@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import least_squares, root_scalar
 
 from uwlts.calibration.model import Calibration, WindowModel
 from uwlts.errors import CalibrationError
@@ -83,7 +83,7 @@ class WindowSolution:
 
 
 def step_profile(
-    calibration: Calibration, window: WindowModel, pixels: np.ndarray, *, medium_index: float
+    calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
     """Points (N, 2) of a profile, Y and Z of the OCS in mm, seen through a window; NaN where a ray has no point."""
     seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
@@ -93,7 +93,7 @@ def step_profile(
 
 def label_step(
     calibration: Calibration,
-    window: WindowModel,
+    window: WindowModel | None,
     pixels: np.ndarray,
     *,
     height_mm: float,
@@ -258,4 +258,4 @@ def _own_distance(
     def error(distance: float) -> float:
         return float(_heights(calibration, window, [step], distance)[0, 0]) - step.height_mm
 
-    return float(brentq(error, tried[left], tried[left + 1], xtol=1e-7))
+    return float(root_scalar(error, bracket=(tried[left], tried[left + 1]), method="brentq", xtol=1e-7).root)

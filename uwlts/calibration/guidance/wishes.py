@@ -1,6 +1,6 @@
 """What a camera calibration still lacks, and which pose of the target would help most, in words for its holder."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,7 +162,7 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
     )  # fmt: skip
 
 
-def lack(state: State, information: np.ndarray, coverage: Coverage, poses: Sequence[np.ndarray]) -> float:
+def lack(state: State, information: np.ndarray, coverage: Coverage, poses: Iterable[np.ndarray]) -> float:
     """How much is missing: 0 once all that is wanted is reached, else logarithms of ratios and weighted shares."""
     std = state.expected_std(information)
     ratios = np.log([value / _wanted_std(state.wanted, name) for name, value in std.items() if _is_wanted(name)])
@@ -172,7 +172,7 @@ def lack(state: State, information: np.ndarray, coverage: Coverage, poses: Seque
     return float(np.maximum(ratios, 0).sum() + _COVERAGE_WEIGHT * max(short, 0.0) + _SPREAD_WEIGHT * tilts + beyond)
 
 
-def _untilted(state: State, poses: Sequence[np.ndarray]) -> np.ndarray:
+def _untilted(state: State, poses: Iterable[np.ndarray]) -> np.ndarray:
     """For each of the target's four sides, what share (4,) of the wanted tilt it was never farther by."""
     if state.setting.poses != "free":
         return np.zeros(4)

@@ -101,6 +101,7 @@ def estimate(
     found, own, rounds = list(evidence), list(own), 0
     known = dict(_FIRST)
     left_out: list[list[np.ndarray]] | None = None
+    moved = np.inf
     for number in range(_ROUNDS):
         first, last = number == 0, number == _ROUNDS - 1
         fit = problem.fit([_thinned(e) for e in evidence] if first else evidence, shared, own, known, left_out)
@@ -145,25 +146,27 @@ class _Problem:
         def model(group: int, shared: np.ndarray, own: np.ndarray) -> list[Observation] | None:
             if group == len(evidence):
                 return self._before(shared)
-            parts = evidence[group].residuals(self._parameters, shared, own)
+            piece = evidence[group]
+            parts = piece.residuals(self._parameters, shared, own)
             if parts is None:
                 return None
             masks = [np.zeros(len(r.values), dtype=bool) for r in parts] if left_out is None else left_out[group]
             rows = [_weighted(r, ~mask, noise[r.kind]) for r, mask in zip(parts, masks, strict=True)]
-            std = evidence[group].own_std(alignment=self._alignment, position_mm=self._position_mm)
+            std = piece.own_std(alignment=self._alignment, position_mm=self._position_mm)
             known = np.flatnonzero(np.isfinite(std))
             rows.append(_of_own(own[known] / std[known], np.diag(1.0 / std[known]), known, len(shared)))
-            if isinstance(evidence[group], SurfaceScanEvidence):
-                off, by_own = evidence[group].known_lengths(own)
+            if isinstance(piece, SurfaceScanEvidence):
+                off, by_own = piece.known_lengths(own)
                 rows.append(_of_own(off, by_own, np.arange(by_own.shape[1]), len(shared)))
             return rows
 
-        if left_out is None:
-            how = {"smallest_gain": _FIRST_GAIN, "damping": _FIRST_DAMPING, "soft_limit": _SOFT_LIMIT}
-            how |= {"enough_rounds": _FIRST_ROUNDS}
-        else:
-            how = {"smallest_gain": _SMALLEST_GAIN, "damping": _DAMPING}
-        return fit_bordered(model, shared, [*own, np.empty(0)], **how)
+        starts = [*own, np.empty(0)]
+        if left_out is not None:
+            return fit_bordered(model, shared, starts, smallest_gain=_SMALLEST_GAIN, damping=_DAMPING)
+        return fit_bordered(
+            model, shared, starts, smallest_gain=_FIRST_GAIN, damping=_FIRST_DAMPING, soft_limit=_SOFT_LIMIT,
+            enough_rounds=_FIRST_ROUNDS,
+        )  # fmt: skip
 
     def _before(self, shared: np.ndarray) -> list[Observation]:
         """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
@@ -179,9 +182,12 @@ class _Problem:
     def residuals(
         self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray]
     ) -> list[list[Residuals]]:
-        found = [e.residuals(self._parameters, shared, o) for e, o in zip(evidence, own, strict=True)]
-        if any(parts is None for parts in found):
-            raise CalibrationError("the joint calibration went astray: a ray that was seen meets no sheet or target")
+        found = []
+        for piece, values in zip(evidence, own, strict=True):
+            parts = piece.residuals(self._parameters, shared, values)
+            if parts is None:
+                raise CalibrationError("the joint calibration diverged: a ray that was seen meets no sheet or target")
+            found.append(parts)
         return found
 
     def noise(self, evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> dict[str, Noise]:

@@ -111,10 +111,11 @@ def gather_jointly(
 def refuse_two_lenses(gathered: Gathered) -> None:
     """CalibrationError where a lens that looks straight into a medium would have to be the one seen otherwise."""
     views = gathered.views()
-    wet = next((view for view in views if view.medium is not None and not view.window), None)
-    if wet is not None and any(view != wet for view in views):
+    for view in views:
+        if view.medium is None or view.window or all(other == view for other in views):
+            continue
         raise CalibrationError(
-            f"some captures in {list(gathered.media)[wet.medium]} were taken without a window and others were not: a "
+            f"some captures in {list(gathered.media)[view.medium]} were taken without a window and others were not: a "
             "lens that touches the medium is another lens; calibrate it by itself, or set window.mounted"
         )
 

@@ -84,7 +84,7 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
     known = estimate_in(calibration, region)
     lengths = lengths_over(calibration, known, region)
     found = [
-        _outlook(calibration, candidate, lengths, known)
+        _outlook(calibration, candidate, candidate.shot, lengths, known)
         for candidate in _candidates(calibration, known, region)
         if candidate.shot is not None
     ]
@@ -118,8 +118,10 @@ def _noise_of(calibration: Calibration, shot: Shot) -> dict[str, Noise]:
     return found
 
 
-def _outlook(calibration: Calibration, candidate: _Candidate, lengths: Lengths, known: StoredEstimate) -> Outlook:
-    shot, count = candidate.shot, len(known.values)
+def _outlook(
+    calibration: Calibration, candidate: _Candidate, shot: Shot, lengths: Lengths, known: StoredEstimate
+) -> Outlook:
+    count = len(known.values)
     covariance = _with(shot.known.covariance, information(calibration, shot))[:count, :count]
     return Outlook(
         candidate.words, _rms(lengths.std_mm(known.covariance)), _rms(lengths.std_mm(covariance)), covariance,

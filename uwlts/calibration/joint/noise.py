@@ -45,9 +45,9 @@ class Noise:
 
 def strays(residuals: Residuals, noise: Noise) -> np.ndarray:
     """Which residuals (n,) are too large to be noise; of the target's points both coordinates."""
-    large = np.abs(residuals.values) > _STRAY * noise.sigma_px
+    large = np.asarray(np.abs(residuals.values) > _STRAY * noise.sigma_px)
     if residuals.kind == TARGET:
-        large = np.repeat(large.reshape(-1, 2).any(axis=1), 2)
+        large = np.repeat(np.any(large.reshape(-1, 2), axis=1), 2)
     return large
 
 

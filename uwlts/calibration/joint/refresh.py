@@ -120,15 +120,15 @@ def solve_refreshed(
     if index_std is not None:
         for name in gathered.media:
             priors[MediumIndex(name)] = replace(priors[MediumIndex(name)], std=index_std)
+    earlier = EarlierEstimate(known.values, known.covariance)
     parameters = replace(
-        known.parameters, media=(*known.parameters.media, *gathered.media), priors=priors,
-        earlier=EarlierEstimate(known.values, known.covariance),
-    )  # fmt: skip
+        known.parameters, media=(*known.parameters.media, *gathered.media), priors=priors, earlier=earlier
+    )
     evidence = [profile for profile, _ in profiles]
     sources = [{profile.image: gathered.steps[profile.image][0].source} for profile in evidence]
-    result, against = _judged(parameters, evidence, sources, sensor)
+    result, against = _judged(parameters, earlier, evidence, sources, sensor)
     if against.contradictions:
-        raise CalibrationError(_other_water(parameters, evidence, sources, sensor) or against.refusal())
+        raise CalibrationError(_other_water(parameters, earlier, evidence, sources, sensor) or against.refusal())
     warnings += against.doubts
     refreshed = refreshed_calibration(calibration, gathered, result, evidence, sources, warnings=warnings)
     return Refreshed(refreshed, water_changes(refreshed, result), warnings)
@@ -136,11 +136,12 @@ def solve_refreshed(
 
 def _judged(
     parameters: Parameters,
+    earlier: EarlierEstimate,
     evidence: Sequence[StepProfileEvidence],
     sources: Sequence[Mapping[int, str]],
     sensor: Sensor,
 ) -> tuple[Estimate, Findings]:
-    shared = parameters.start(parameters.earlier.values[: len(parameters.intrinsics.names)])
+    shared = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
     own = [line_start(profile, parameters, shared) for profile in evidence]
     result = estimate(parameters, evidence, shared, own, uncertainty=sensor.uncertainty)
     return result, findings(result, evidence, sources, sensor=sensor)
@@ -148,14 +149,16 @@ def _judged(
 
 def _other_water(
     parameters: Parameters,
+    earlier: EarlierEstimate,
     evidence: Sequence[StepProfileEvidence],
     sources: Sequence[Mapping[int, str]],
     sensor: Sensor,
 ) -> str:
     """With which indices steps agree that contradict those described, in words; empty where with none."""
-    new = [key for key in parameters.keys[len(parameters.earlier.values) :] if isinstance(key, MediumIndex)]
+    new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
-    result, against = _judged(replace(parameters, priors=parameters.priors | free), evidence, sources, sensor)
+    without = replace(parameters, priors=parameters.priors | free)
+    result, against = _judged(without, earlier, evidence, sources, sensor)
     if against.contradictions:
         return ""
     found = dict(zip(parameters.keys, result.values, strict=True))
@@ -212,7 +215,8 @@ def _after(gathered: Gathered, media: Sequence[str]) -> Gathered:
         taken = {*media, *names}
         numbered = (f"{name} {number}" for number in range(2, len(taken) + 3))
         names.append(name if name not in taken else next(other for other in numbered if other not in taken))
-    return replace(
-        gathered, media=dict(zip(names, gathered.media.values(), strict=True)),
-        steps=[(step, View(view.window, len(media) + view.medium)) for step, view in gathered.steps],
-    )  # fmt: skip
+    steps = [
+        (step, view if view.medium is None else View(view.window, len(media) + view.medium))
+        for step, view in gathered.steps
+    ]
+    return replace(gathered, media=dict(zip(names, gathered.media.values(), strict=True)), steps=steps)

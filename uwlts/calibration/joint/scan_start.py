@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 
@@ -13,14 +14,13 @@ from uwlts.calibration.model import Calibration
 from uwlts.capture import Capture
 from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.metrology.artefact_descriptions import Pipe, PlaneStandard, SphereStandard, parse_artefact
-from uwlts.metrology.artefacts import PipeEvaluation, PlaneEvaluation, evaluate_pipe, evaluate_plane
-from uwlts.metrology.sphere_evaluation import SphereEvaluation, evaluate_spheres
+from uwlts.metrology.artefacts import evaluate_pipe, evaluate_plane
+from uwlts.metrology.sphere_evaluation import evaluate_spheres
 from uwlts.reconstruction import reconstruct_pixels
 from uwlts.sensor import Sensor
 from uwlts.stripe import StripeOptions, find_stripes
 
 Scanned = SphereStandard | PlaneStandard | Pipe
-_EVALUATION = {SphereStandard: evaluate_spheres, PlaneStandard: evaluate_plane, Pipe: evaluate_pipe}
 
 # More points of a scan tell hardly more: neighbours err together.
 _MOST_POINTS = 2000
@@ -103,7 +103,7 @@ def surface_scan(
     ).points_mm  # fmt: skip
     beside = beside_sheet(
         start, sensor, stripes.line, stripes.centre_px, stripes.width_px, stripes.slopes, medium_index=medium_index,
-        stage_direction=stripes.stage_direction,
+        stage_direction=stripes.stage_direction.tolist(),
     )  # fmt: skip
     points = points + beside
     # At the rims few points are left, and those are doubtful, as are those where the brightness changes fast.
@@ -113,12 +113,10 @@ def surface_scan(
         raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} profile lines, sharp and evenly bright")
     there = np.flatnonzero(good)
     there = there[:: -(-len(there) // _MOST_POINTS)]
-    artefact = stripes.artefact
-    evaluation = _EVALUATION[type(artefact)](points[there], artefact)
-    kept = there[np.isfinite(evaluation.deviation_mm)]
-    frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
     transform = start.object_transform()
-    surface, own = _surface(artefact, evaluation, points[kept], transform, sizes_known=sizes_known)
+    used, surface, own = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
+    kept = there[used]
+    frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
     rotation, direction = transform[:3, :3], stripes.stage_direction
     evidence = SurfaceScanEvidence(
         view=stripes.view, pixels=pixels[kept].astype(np.float64), beside_mm=rotation @ beside[kept].T,
@@ -158,10 +156,23 @@ def surface_scans(
 
 
 def _surface(
-    artefact: Scanned, evaluation: SphereEvaluation | PlaneEvaluation | PipeEvaluation, points: np.ndarray,
-    transform: np.ndarray, *, sizes_known: bool,
-) -> tuple[Surface, np.ndarray]:  # fmt: skip
-    """The surface in the camera frame, and the start of its own parameters; points (N, 3) are in the OCS."""
+    artefact: Scanned, points: np.ndarray, transform: np.ndarray, *, sizes_known: bool
+) -> tuple[np.ndarray, Surface, np.ndarray]:
+    """The surface through points (N, 3) of the OCS, in the camera frame.
+
+    Returns
+    -------
+    used : (N,) bool
+        Points that lie on it.
+    surface : Surface
+    own : (k,)
+        Start of its own parameters.
+
+    Raises
+    ------
+    EvaluationError
+        The points do not show what was scanned.
+    """
     rotation = transform[:3, :3]
 
     def std(expanded_mm: float | None) -> float:
@@ -171,25 +182,32 @@ def _surface(
     def in_camera(point_mm: Sequence[float]) -> np.ndarray:
         return rotation @ point_mm + transform[:3, 3]
 
-    match evaluation:
-        case SphereEvaluation():
-            centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
-            diameters = np.array([sphere.diameter_mm for sphere in evaluation.spheres])
-            off = np.abs(np.linalg.norm(points[:, None] - centres, axis=2) - diameters / 2)
+    match artefact:
+        case SphereStandard():
+            spheres = evaluate_spheres(points, artefact)
+            used = np.isfinite(spheres.deviation_mm)
+            centres = np.array([sphere.centre_mm for sphere in spheres.spheres])
+            diameters = np.array([sphere.diameter_mm for sphere in spheres.spheres])
+            off = np.abs(np.linalg.norm(points[used][:, None] - centres, axis=2) - diameters / 2)
             nominal, spacings = np.array(artefact.diameters_mm), np.array(artefact.spacings_mm)
-            spheres = Spheres(
+            surface = Spheres(
                 diameters_mm=nominal, diameter_std_mm=np.full(len(nominal), std(artefact.diameter_uncertainty_mm)),
                 spacings_mm=spacings, spacing_std_mm=np.full(len(spacings), std(artefact.spacing_uncertainty_mm)),
                 sphere=np.argmin(off, axis=1),
             )  # fmt: skip
-            return spheres, np.append((centres @ rotation.T + transform[:3, 3]).ravel(), diameters - nominal)
-        case PlaneEvaluation():
-            normal = np.array(evaluation.normal)
-            return Plane(in_camera(evaluation.point_mm), rotation @ normal, across_of(normal) @ rotation.T), np.zeros(3)
-        case PipeEvaluation():
-            axis = np.array(evaluation.axis)
-            cylinder = Cylinder(
-                point_mm=in_camera(evaluation.point_mm), axis=rotation @ axis, across=across_of(axis) @ rotation.T,
+            return used, surface, np.append((centres @ rotation.T + transform[:3, 3]).ravel(), diameters - nominal)
+        case PlaneStandard():
+            plane = evaluate_plane(points, artefact)
+            normal = np.array(plane.normal)
+            surface = Plane(in_camera(plane.point_mm), rotation @ normal, across_of(normal) @ rotation.T)
+            return np.isfinite(plane.deviation_mm), surface, np.zeros(3)
+        case Pipe():
+            pipe = evaluate_pipe(points, artefact)
+            axis = np.array(pipe.axis)
+            surface = Cylinder(
+                point_mm=in_camera(pipe.point_mm), axis=rotation @ axis, across=across_of(axis) @ rotation.T,
                 diameter_mm=artefact.diameter_mm, diameter_std_mm=std(artefact.diameter_uncertainty_mm),
             )  # fmt: skip
-            return cylinder, np.array([0.0, 0.0, 0.0, 0.0, evaluation.diameter_error_mm])
+            return np.isfinite(pipe.deviation_mm), surface, np.array([0.0, 0.0, 0.0, 0.0, pipe.diameter_error_mm])
+        case _:
+            assert_never(artefact)

@@ -159,7 +159,7 @@ def _lit(calibration: Calibration, known: StoredEstimate, target: Target, pose: 
     middle = np.append(target.extent_mm.mean(axis=0), 0.0)
     rows = np.stack([sheet.normal, facing, along])
     centre = pose[:3, :3] @ middle + pose[:3, 3]
-    start = np.linalg.solve(rows, [sheet.offset_mm, facing @ centre, along @ centre])
+    start = np.linalg.solve(rows, np.array([sheet.offset_mm, facing @ centre, along @ centre]))
     extent, margin = target.extent_mm, target.spacing_mm / 2
     reach = float(np.ptp(extent, axis=0).sum())
     points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
@@ -196,7 +196,7 @@ def _seen(known: StoredEstimate, points: np.ndarray) -> np.ndarray:
 
 def _in_image(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
     camera = known.parameters.camera(known.values)
-    return ((pixels >= 0) & (pixels <= [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
+    return np.all((pixels >= 0) & (pixels <= [camera.width_px - 1, camera.height_px - 1]), axis=1)
 
 
 def _across(calibration: Calibration) -> int:

@@ -65,12 +65,14 @@ def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChang
         That of the estimate.
     result : Estimate
     """
-    parameters, count = result.parameters, len(result.parameters.earlier.values)
-    before = parameters.prior_mean()
-    before[:count] = parameters.earlier.values
+    parameters, earlier = result.parameters, result.parameters.earlier
+    if earlier is None:
+        return []
+    count, before = len(earlier.values), parameters.prior_mean()
+    before[:count] = earlier.values
     covariance = np.diag(parameters.prior_std() ** 2)
     covariance[:count] = 0.0
-    covariance[:count, :count] = parameters.earlier.covariance
+    covariance[:count, :count] = earlier.covariance
     std_before, std = np.sqrt(np.diag(covariance)), result.std()
     seen = {region.view.medium: region for region in regions(calibration)}
     found = []
