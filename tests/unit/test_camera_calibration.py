@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.unit.calibration_views import Lens, built_sensor, inside, lattice, lens_of, stage_images, turn
-from uwlts.calibration.bordered import Observation, fit_bordered
 from uwlts.calibration.camera_poses import solve_camera, stage_direction
 from uwlts.calibration.circle_bias import solve_without_bias
 from uwlts.calibration.direct_linear import direct_linear
 from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
+from uwlts.calibration.schur_least_squares import Observation, schur_least_squares
 from uwlts.calibration.target_image import TargetImage, z_away
 from uwlts.calibration.target_placement import observe, placements
 from uwlts.errors import CalibrationError
@@ -115,16 +115,16 @@ def test_chosen_parameters_only():
             CameraOptions(**wrong)
 
 
-@pytest.mark.parametrize("own", [6, 8])
-def test_derivatives_agree_with_differences(own):
+@pytest.mark.parametrize("local", [6, 8])
+def test_derivatives_agree_with_differences(local):
     images, poses, _ = stage_images(SENSOR, positions=FEW, stage_tilt=(0.03, 0.02), points=lattice(7, 7))
     view = placements(images, approaching=True)[0]
     intrinsics = Intrinsics(CameraOptions(distortion=("k1", "k2", "p1", "p2", "k3")), **SIZE)
-    shared = np.array([LENS.f, LENS.cx, LENS.cy, -0.09, 0.1, 1e-3, -2e-3, 0.05])
-    pose = np.r_[cv2.Rodrigues(poses[0][:3, :3])[0].ravel(), poses[0][:3, 3], 0.03, 0.02][:own]
-    at = observe(view, intrinsics, shared, pose)
-    derivatives, start = np.hstack([at.by_shared, at.by_own]), np.r_[shared, pose]
-    assert derivatives.shape == (2 * len(view.points_mm), 8 + own)
+    global_values = np.array([LENS.f, LENS.cx, LENS.cy, -0.09, 0.1, 1e-3, -2e-3, 0.05])
+    pose = np.r_[cv2.Rodrigues(poses[0][:3, :3])[0].ravel(), poses[0][:3, 3], 0.03, 0.02][:local]
+    at = observe(view, intrinsics, global_values, pose)
+    derivatives, start = np.hstack([at.by_global, at.by_local]), np.r_[global_values, pose]
+    assert derivatives.shape == (2 * len(view.points_mm), 8 + local)
     for column in range(len(start)):
         step = np.zeros(len(start))
         step[column] = 1e-5 * max(1.0, abs(start[column]))
@@ -340,19 +340,21 @@ def test_grouped_least_squares_against_one_big_system():
     designs = [(rng.normal(size=(20, 3)), rng.normal(size=(20, 2))) for _ in range(4)]
     values = [rng.normal(size=20) for _ in designs]
 
-    def model(group, shared, own):
-        by_shared, by_own = designs[group]
-        return Observation((values[group] - by_shared @ shared - by_own @ own).reshape(-1, 2), -by_shared, -by_own)
+    def model(group, global_values, local):
+        by_global, by_local = designs[group]
+        return Observation(
+            (values[group] - by_global @ global_values - by_local @ local).reshape(-1, 2), -by_global, -by_local
+        )
 
-    fit = fit_bordered(model, np.zeros(3), [np.zeros(2)] * 4)
+    fit = schur_least_squares(model, np.zeros(3), [np.zeros(2)] * 4)
     whole = np.zeros((80, 11))
-    for group, (by_shared, by_own) in enumerate(designs):
+    for group, (by_global, by_local) in enumerate(designs):
         rows = slice(20 * group, 20 * group + 20)
-        whole[rows, :3], whole[rows, 3 + 2 * group : 5 + 2 * group] = by_shared, by_own
+        whole[rows, :3], whole[rows, 3 + 2 * group : 5 + 2 * group] = by_global, by_local
     solution, squares, _, _ = np.linalg.lstsq(whole, np.concatenate(values))
-    np.testing.assert_allclose(np.r_[fit.shared, np.concatenate(fit.own)], solution, atol=1e-7)
+    np.testing.assert_allclose(np.r_[fit.global_values, np.concatenate(fit.local)], solution, atol=1e-7)
     covariance = squares[0] / (80 - 11) * np.linalg.inv(whole.T @ whole)
     np.testing.assert_allclose(fit.covariance, covariance[:3, :3], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(fit.own_covariances[2], covariance[7:9, 7:9], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(fit.local_covariances[2], covariance[7:9, 7:9], rtol=1e-6, atol=1e-9)
     with pytest.raises(CalibrationError, match="behind"):
-        fit_bordered(lambda *_: None, np.zeros(3), [np.zeros(2)])
+        schur_least_squares(lambda *_: None, np.zeros(3), [np.zeros(2)])

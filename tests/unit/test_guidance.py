@@ -10,6 +10,16 @@ from tests.unit.calibration_views import STEP_MM, WATER, inside, lens_of, step_p
 from tests.unit.drawn_target import drawn_lamp, drawn_laser, target_pose
 from uwlts.calibration.guidance.candidates import candidates, working_range_mm
 from uwlts.calibration.guidance.coverage import coverage_of, empty_coverage, place_words, spread_of, tilts_rad
+from uwlts.calibration.guidance.pose_advice import (
+    State,
+    Wanted,
+    best_pose,
+    format_pose_advice,
+    gain_of,
+    missing,
+    missing_sheet,
+    state_of,
+)
 from uwlts.calibration.guidance.quality import (
     QualityLimits,
     judge_motion,
@@ -21,16 +31,6 @@ from uwlts.calibration.guidance.quality import (
 )
 from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual, nominal_camera, pose_of
 from uwlts.calibration.guidance.step import apart_mm, is_new, judge_step, next_depth_mm
-from uwlts.calibration.guidance.wishes import (
-    State,
-    Wanted,
-    best_wish,
-    gain_of,
-    missing,
-    missing_sheet,
-    state_of,
-    wish_words,
-)
 from uwlts.calibration.nominal import nominal_calibration
 from uwlts.calibration.procedure import nominal_window
 from uwlts.errors import TargetError
@@ -200,9 +200,9 @@ def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int
     poses: list[np.ndarray] = []
     state = state_of([], setting, wanted)
     while not state.enough and len(poses) < most:
-        wish = best_wish(state)
+        wish = best_pose(state)
         # What is held as it was wished is what is wanted, and there is nothing more to say.
-        assert wish_words(wish, state, wish.candidate.pose) == "hold it still, just like this"
+        assert format_pose_advice(wish, state, wish.candidate.pose) == "hold it still, just like this"
         pose = wish.candidate.pose.copy()
         pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] @ pose[:3, :3]
         pose[:3, 3] += rng.normal(0, 5.0, 3)
@@ -253,7 +253,7 @@ def test_what_is_expected_of_an_image_comes_true(setting):
 
 def test_an_image_seen_again_gains_little(setting):
     state = led(setting, Wanted(), np.random.default_rng(3), most=1)
-    wish = best_wish(state)
+    wish = best_pose(state)
     again = seen(setting, state.poses[-1], np.random.default_rng(1))
     other = seen(setting, wish.candidate.pose, np.random.default_rng(1))
     assert gain_of(state, other, wish.candidate.pose) == pytest.approx(wish.gain, rel=0.2)
@@ -263,16 +263,16 @@ def test_an_image_seen_again_gains_little(setting):
 
 def test_wishes_are_said_in_plain_words(setting):
     state = state_of(recorded(setting, [target_pose(middle_mm=(-60, -40, 330.0))], np.random.default_rng(0)), setting)
-    wish = best_wish(state)
+    wish = best_pose(state)
     far = replace(wish, distance_mm=450.0, place=(0.8, 0.8))
     far.candidate.pose[:3, :3] = target_pose(tilt_deg=(25, 0))[:3, :3]
-    words = wish_words(far, state, target_pose(middle_mm=(-60, -40, 330.0)))
+    words = format_pose_advice(far, state, target_pose(middle_mm=(-60, -40, 330.0)))
     assert "right side is farther, 25 deg (now it is tilted by 0 deg)" in words
     assert "bring its middle to the lower right of the image" in words
     assert "farther, to about 450 mm from the camera (now 330 mm)" in words
     for tilt, side in (((-25, 0), "left side"), ((0, 25), "lower side"), ((18, -18), "upper right corner")):
         far.candidate.pose[:3, :3] = target_pose(tilt_deg=tilt)[:3, :3]
-        assert f"tilt the target so that its {side} is farther" in wish_words(far, state, None)
+        assert f"tilt the target so that its {side} is farther" in format_pose_advice(far, state, None)
 
 
 def test_what_is_missing_is_said(setting):
@@ -292,7 +292,7 @@ def test_a_sheet_without_stripes_is_missing(setting):
 def test_an_image_that_contradicts_the_others_is_refused_with_its_residual(setting):
     state = led(setting, Wanted(), np.random.default_rng(3), most=6)
     rng = np.random.default_rng(2)
-    wish = best_wish(state)
+    wish = best_pose(state)
     right = RecordedPose(seen(setting, wish.candidate.pose, rng), NO_STRIPE, 9.0)
     assert judge_residual(state.solution, state_of([*state.recorded, right], setting).solution) == ()
     # A plate that is bent by 1 mm over its width.

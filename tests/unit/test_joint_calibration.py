@@ -11,7 +11,7 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.observations import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.joint.sheet_jets import DescribedSheet
+from uwlts.calibration.joint.sheet_derivatives import DescribedSheet
 from uwlts.calibration.joint.start import series_start
 from uwlts.calibration.model import FanModel, SheetModel
 from uwlts.calibration.nominal import nominal_calibration
@@ -114,11 +114,11 @@ def test_every_derivative_is_what_differences_say(view, kind):
     Where a residual is r, its scale's change adds r times a relative change: the pixels are therefore moved to where
     the residuals vanish. Then central differences are exact to the square of the step and to rounding over it.
     """
-    parameters, shared, start = at_truth(view)
+    parameters, global_values, start = at_truth(view)
     rng = np.random.default_rng(0)
     if kind is TargetEvidence:
-        evidence, own = start.evidence[0], start.own[0].copy()
-        own[6:] = rng.normal(0, 1e-3, len(own) - 6)
+        evidence, local = start.evidence[0], start.local[0].copy()
+        local[6:] = rng.normal(0, 1e-3, len(local) - 6)
         keep = np.arange(0, len(evidence.stripe_pixels), 40)
         evidence = replace(
             evidence, stripe_pixels=evidence.stripe_pixels[keep], stripe_image=evidence.stripe_image[keep],
@@ -131,22 +131,24 @@ def test_every_derivative_is_what_differences_say(view, kind):
             view=view, pixels=pixels, upper=np.arange(30) % 2 == 0, upward=-frame[:3, 2], along=frame[:3, 1], across=1,
             height=StepHeight(23.0), image=0,
         )  # fmt: skip
-        own = np.array([0.02, -390.0])
+        local = np.array([0.02, -390.0])
     for _ in range(8):
-        evidence = _without_residuals(evidence, evidence.residuals(parameters, shared, own))
-    found = evidence.residuals(parameters, shared, own)
+        evidence = _without_residuals(evidence, evidence.residuals(parameters, global_values, local))
+    found = evidence.residuals(parameters, global_values, local)
     assert sum(len(part.values) for part in found) >= 30
     assert max(np.abs(part.values).max() for part in found) < 1e-8
-    vector = np.concatenate([shared, own])
+    vector = np.concatenate([global_values, local])
 
     def residuals(values):
-        parts = evidence.residuals(parameters, values[: len(shared)], values[len(shared) :])
+        parts = evidence.residuals(parameters, values[: len(global_values)], values[len(global_values) :])
         return np.concatenate([part.values for part in parts])
 
     analytic = np.zeros((sum(len(part.values) for part in found), len(vector)))
     rows = np.split(np.arange(len(analytic)), np.cumsum([len(part.values) for part in found])[:-1])
     for place, part in zip(rows, found, strict=True):
-        analytic[np.ix_(place, np.r_[: len(shared), len(shared) + part.own])] = np.hstack([part.by_shared, part.by_own])
+        analytic[np.ix_(place, np.r_[: len(global_values), len(global_values) + part.local_columns])] = np.hstack(
+            [part.by_global, part.by_local]
+        )
     for place, column in enumerate(analytic.T):
         reach = 1e-6 * max(1.0, abs(vector[place]))
         ahead, behind = vector.copy(), vector.copy()
@@ -251,7 +253,7 @@ def test_strays_do_not_count(in_water, thesis):
     spoilt = replace(in_water, found=replace(in_water.found, images=images))
     result = solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
     moved = np.abs(result.estimate.values - clean.estimate.values) / np.sqrt(np.diag(clean.estimate.covariance))
-    assert result.estimate.strays >= 50
+    assert result.estimate.outliers >= 50
     assert moved.max() < 1.0
 
 

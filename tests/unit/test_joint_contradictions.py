@@ -7,8 +7,8 @@ import pytest
 
 from tests.unit.calibration_views import built_sensor
 from tests.unit.joint_views import Noise, gathered, target_series
+from uwlts.calibration.joint.deviation_messages import format_deviation
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.prior_words import format_deviation
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.parameter_keys import parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
@@ -146,7 +146,7 @@ def test_reflections_on_a_third_of_the_lines_are_left_out_with_a_word(views, the
 
     clean = solve_jointly(gathered(thesis, views), options=OPTIONS).estimate
     result = solve_jointly(gathered(thesis, [stripes_edited(part, spoilt) for part in views]), options=OPTIONS)
-    assert [doubt for doubt in result.warnings if "% of the stripe on the target was left out as strays" in doubt]
+    assert [doubt for doubt in result.warnings if "% of the stripe on the target was left out as outliers" in doubt]
     moved = np.abs(result.estimate.values - clean.values) / np.sqrt(np.diag(result.estimate.covariance))
     assert moved.max() < 2.0
 

@@ -102,11 +102,11 @@ def test_misses_on_the_object_are_those_in_the_image_times_its_distance(plain):
     """In air without a window a pixel at an angle a to the axis spans z / f, or that times cos a: up to 20 deg, 6 %."""
     split = Split(INSIDE, frozenset({(0, 4)}))
     (misses,) = [m for m in predict(plain, Candidate(), split).misses if m.kind == TARGET]
-    piece, own = plain.evidence[0], plain.own[0]
-    pose = piece.pose(plain.parameters, plain.shared, own, 4)
+    piece, local = plain.evidence[0], plain.local[0]
+    pose = piece.pose(plain.parameters, plain.global_values, local, 4)
     here = piece.placement.image == 4
     depth = (piece.placement.points_mm[here] @ pose[:3, :3].T + pose[:3, 3])[:, 2]
-    share = misses.mm / (misses.px * depth / plain.shared[0])
+    share = misses.mm / (misses.px * depth / plain.global_values[0])
     assert len(share) > 50
     assert share.min() > 0.85 and share.max() < 1.05
 

@@ -153,17 +153,17 @@ def test_a_prior_with_correlations_counts_as_its_covariance():
     root = scale[:, None] * rng.normal(size=(4, 4))
     values = scale * rng.normal(size=4)
     earlier = EarlierEstimate(values, root @ root.T)
-    shared = np.append(values + scale * rng.normal(size=4), (7.0, 8.0))
-    off, by_shared = earlier.residuals(shared)
-    assert by_shared.shape == (4, 6)
-    expected = np.linalg.solve(root, shared[:4] - values)
+    global_values = np.append(values + scale * rng.normal(size=4), (7.0, 8.0))
+    off, by_global = earlier.residuals(global_values)
+    assert by_global.shape == (4, 6)
+    expected = np.linalg.solve(root, global_values[:4] - values)
     assert off @ off == pytest.approx(expected @ expected, rel=1e-8)
     for place in range(6):
         reach = scale[place] if place < 4 else 1.0
-        ahead, behind = (shared + sign * reach * np.eye(6)[place] for sign in (1, -1))
+        ahead, behind = (global_values + sign * reach * np.eye(6)[place] for sign in (1, -1))
         numeric = (earlier.residuals(ahead)[0] - earlier.residuals(behind)[0]) / (2 * reach)
         # Linear, so that differences are exact but for rounding.
-        assert by_shared[:, place] == pytest.approx(numeric, rel=1e-8, abs=1e-8 * np.abs(off).max() / reach)
+        assert by_global[:, place] == pytest.approx(numeric, rel=1e-8, abs=1e-8 * np.abs(off).max() / reach)
 
 
 @pytest.mark.parametrize("covariance", [np.zeros((2, 2)), np.array([[1.0, 2.0], [2.0, 1.0]])])

@@ -14,7 +14,7 @@ from uwlts.calibration.joint.observations import STEP, Residuals
 from uwlts.calibration.joint.parameters import Parameters, Prior
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.scan_start import scan_stripes, surface_scan, surface_scans
-from uwlts.calibration.joint.sheet_jets import DescribedSheet
+from uwlts.calibration.joint.sheet_derivatives import DescribedSheet
 from uwlts.calibration.joint.surface_scans import SLOPES
 from uwlts.calibration.joint.surfaces import Cylinder, Plane, Spheres
 from uwlts.calibration.nominal import nominal_calibration
@@ -71,24 +71,26 @@ def evidence_of(kind, *, stage_mm=STAGE, sizes_known=True, artefact=None, noise=
 
 
 def true_own(kind, evidence):
-    """The surface's own parameters and the positions' errors as the scan was made."""
+    """The surface's local parameters and the positions' errors as the scan was made."""
     frame, surface = camera_from_object(SENSOR), evidence.surface
     points = np.array([body.point for body in KINDS[kind][0]]) @ frame[:3, :3].T + frame[:3, 3]
     body = KINDS[kind][0][0]
     match surface:
         case Spheres():
-            own = np.append(points.ravel(), np.zeros(surface.count))
+            local = np.append(points.ravel(), np.zeros(surface.count))
         case Plane():
             normal = frame[:3, :3] @ body.axis
             normal /= surface.normal @ normal
             distance = normal @ (points[0] - surface.point_mm) / np.linalg.norm(normal)
-            own = np.append(surface.across @ normal, distance)
+            local = np.append(surface.across @ normal, distance)
         case Cylinder():
             axis = frame[:3, :3] @ body.axis
             axis /= surface.axis @ axis
             away = points[0] - surface.point_mm
-            own = np.concatenate([surface.across @ (away - axis * (surface.axis @ away)), surface.across @ axis, [0.0]])
-    return np.append(own, np.zeros(len(evidence.stage_mm)))
+            local = np.concatenate(
+                [surface.across @ (away - axis * (surface.axis @ away)), surface.across @ axis, [0.0]]
+            )
+    return np.append(local, np.zeros(len(evidence.stage_mm)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -97,24 +99,26 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
 
     Crossings by Fermat are exact to 1e-9 mm, a hundred-millionth of a pixel's 0.2 mm.
     """
-    model, shared = parameters()
+    model, global_values = parameters()
     evidence, _ = evidence_of(kind, stage_mm=STAGE[::4])
-    own = true_own(kind, evidence)
+    local = true_own(kind, evidence)
     for key, slope in zip(SLOPES, SLOPE, strict=True):
-        shared[model.keys.index(key)] = slope
-    found = evidence.residuals(model, shared, own)
+        global_values[model.keys.index(key)] = slope
+    found = evidence.residuals(model, global_values, local)
     assert sum(len(part.values) for part in found) > 300
     assert max(np.abs(part.values).max() for part in found) < 1e-6
-    vector = np.concatenate([shared, own])
+    vector = np.concatenate([global_values, local])
 
     def residuals(values):
-        parts = evidence.residuals(model, values[: len(shared)], values[len(shared) :])
+        parts = evidence.residuals(model, values[: len(global_values)], values[len(global_values) :])
         return np.concatenate([part.values for part in parts])
 
     analytic, row = np.zeros((len(evidence.pixels), len(vector))), 0
     for part in found:
         here = np.arange(row, row := row + len(part.values))
-        analytic[np.ix_(here, np.r_[: len(shared), len(shared) + part.own])] = np.hstack([part.by_shared, part.by_own])
+        analytic[np.ix_(here, np.r_[: len(global_values), len(global_values) + part.local_columns])] = np.hstack(
+            [part.by_global, part.by_local]
+        )
     for place, column in enumerate(analytic.T):
         reach = 1e-6 * max(1.0, abs(vector[place]))
         ahead, behind = vector.copy(), vector.copy()
@@ -125,14 +129,14 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
 
 
 def test_known_lengths_are_off_by_their_standard_uncertainties():
-    evidence, own = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
-    own = true_own("spheres", evidence)
-    assert evidence.known_lengths(own)[0] == pytest.approx([0.0], abs=1e-9)
-    own[3:6] += 0.03 * (own[3:6] - own[:3]) / SPACING
-    off, by_own = evidence.known_lengths(own)
+    evidence, local = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
+    local = true_own("spheres", evidence)
+    assert evidence.known_lengths(local)[0] == pytest.approx([0.0], abs=1e-9)
+    local[3:6] += 0.03 * (local[3:6] - local[:3]) / SPACING
+    off, by_local = evidence.known_lengths(local)
     assert off == pytest.approx([3.0])
-    for place, column in enumerate(by_own.T):
-        moved = own.copy()
+    for place, column in enumerate(by_local.T):
+        moved = local.copy()
         moved[place] += 1e-4
         assert evidence.known_lengths(moved)[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
 
@@ -143,16 +147,18 @@ class _Held:
     def __init__(self, lens):
         self._lens = lens
 
-    def own_std(self, *, alignment, position_mm):
+    def local_std(self, *, alignment, position_mm):
         return np.empty(0)
 
-    def residuals(self, parameters, shared, own):
+    def residuals(self, parameters, global_values, local):
         count = len(self._lens)
-        by_shared = np.zeros((count, len(shared)))
+        by_global = np.zeros((count, len(global_values)))
         scale = 1e-6 * np.maximum(1e-3, np.abs(self._lens))
-        by_shared[:, :count] = np.diag(1.0 / scale)
+        by_global[:, :count] = np.diag(1.0 / scale)
         return [
-            Residuals(STEP, (shared[:count] - self._lens) / scale, by_shared, np.empty((count, 0)), np.arange(0), 0)
+            Residuals(
+                STEP, (global_values[:count] - self._lens) / scale, by_global, np.empty((count, 0)), np.arange(0), 0
+            )
         ]
 
     def linearised(self, residuals, used):
@@ -161,13 +167,17 @@ class _Held:
 
 def asked(found, **std):
     """What scans alone say of the parameters that have a standard uncertainty: errors and stated uncertainties."""
-    model, shared = parameters(**std)
+    model, global_values = parameters(**std)
     lens = len(model.intrinsics.names)
-    evidence, own = zip(*found, strict=True)
+    evidence, local = zip(*found, strict=True)
     result = estimate(
-        model, [*evidence, _Held(shared[:lens].copy())], shared, [*own, np.empty(0)], uncertainty=SENSOR.uncertainty
+        model,
+        [*evidence, _Held(global_values[:lens].copy())],
+        global_values,
+        [*local, np.empty(0)],
+        uncertainty=SENSOR.uncertainty,
     )
-    true = dict(zip(model.keys, shared, strict=True)) | dict(zip(SLOPES, SLOPE, strict=True))
+    true = dict(zip(model.keys, global_values, strict=True)) | dict(zip(SLOPES, SLOPE, strict=True))
     values = dict(zip(model.keys, result.values, strict=True))
     keys = {text: parameter_of(text) for text in (name.replace("_of_", " of ") for name in std)}
     errors = {text: values[key] - true[key] for text, key in keys.items()}
@@ -187,7 +197,7 @@ def test_round_spheres_tell_the_stage_and_the_water(known):
         assert abs(error) < 4 * std[name], name
         # That points on a sphere err together is stated, so that the uncertainty is far from what 0.02 px alone leave.
         assert std[name] < 3e-3, name
-    assert np.abs(result.own[0][6:8]).max() < (0.01 if known else 0.1)
+    assert np.abs(result.local[0][6:8]).max() < (0.01 if known else 0.1)
     assert result.noise[Spheres.kind].besides > 10
 
 
@@ -200,7 +210,7 @@ def test_a_known_spacing_is_a_length_in_water():
         scan = evidence_of("spheres", artefact=standard, sizes_known=known, noise=noise())
         errors, told[known], result = asked([scan], **std)
         assert abs(errors["index of water"]) < 4 * told[known]["index of water"]
-        apart = np.linalg.norm(np.diff(result.own[0][:6].reshape(2, 3), axis=0)) - SPACING
+        apart = np.linalg.norm(np.diff(result.local[0][:6].reshape(2, 3), axis=0)) - SPACING
         assert abs(apart) < (0.02 if known else 0.2)
     assert told[True]["index of water"] < 0.95 * told[False]["index of water"]
 

@@ -13,7 +13,7 @@ from uwlts.calibration.joint.next_shot import next_shots
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.joint.volume import Lengths, estimate_in, lengths_over, regions
-from uwlts.calibration.joint.weakness import told, weaknesses
+from uwlts.calibration.joint.weakness import format_weaknesses, weaknesses
 from uwlts.calibration.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
 from uwlts.calibration.procedure import CalibrationOptions
 from uwlts.calibration.target_image import TargetImage
@@ -98,7 +98,7 @@ def test_independent_ones_are_not_called_confused():
 
 def test_less_than_a_micrometre_is_said_to_be_nothing():
     assert weaknesses(lengths([[0.0009, 0.0]]), keys("window_distance", "f"), np.eye(2)) == []
-    assert "nothing" in told([])[0]
+    assert "nothing" in format_weaknesses([])[0]
 
 
 def test_a_height_that_is_the_cause_is_named_though_it_moves_no_point():

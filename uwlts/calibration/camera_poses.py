@@ -7,10 +7,10 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from uwlts.calibration.bordered import BorderedFit, Observation, fit_bordered
 from uwlts.calibration.camera_start import linear_start, planar_start
 from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
 from uwlts.calibration.model import CameraModel
+from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
 from uwlts.calibration.target_image import TargetImage
 from uwlts.calibration.target_placement import Placement, observe, placements, single_images
 from uwlts.errors import CalibrationError
@@ -112,15 +112,15 @@ def solve_camera(
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
     views = _accepted(images, poses, approaching, options)
     if start is None:
-        shared, own = planar_start(views, intrinsics) if poses == "free" else linear_start(views, intrinsics)
-        own = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in own]
+        global_values, local = planar_start(views, intrinsics) if poses == "free" else linear_start(views, intrinsics)
+        local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
     else:
-        shared, own = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
+        global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
 
-    def model(group: int, shared: np.ndarray, own: np.ndarray) -> Observation | None:
-        return observe(views[group], intrinsics, shared, own)
+    def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
+        return observe(views[group], intrinsics, global_values, local)
 
-    fit = fit_bordered(model, shared, own, soft_limit=options.soft_limit_px)
+    fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
     _refuse_undetermined(fit, intrinsics)
     return _solution(images, views, fit, intrinsics, poses)
 
@@ -148,15 +148,15 @@ def _accepted(
 
 def _restart(view: Placement, start: CameraSolution, poses: Poses) -> np.ndarray:
     pose = start.target_poses[view.image[0]]
-    own = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
+    local = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
     if poses != "stage":
-        return own
+        return local
     direction = pose[:3, :3].T @ start.stage_direction
-    return np.r_[own, direction[:2] / abs(direction[2])]
+    return np.r_[local, direction[:2] / abs(direction[2])]
 
 
-def _refuse_undetermined(fit: BorderedFit, intrinsics: Intrinsics) -> None:
-    values = dict(zip(intrinsics.names, fit.shared, strict=True))
+def _refuse_undetermined(fit: SchurFit, intrinsics: Intrinsics) -> None:
+    values = dict(zip(intrinsics.names, fit.global_values, strict=True))
     limits = {name: _LARGEST_FOCAL_STD * values[name] for name in ("f", "fx", "fy") if name in values}
     limits |= {"cx": _LARGEST_CENTRE_STD * intrinsics.width_px, "cy": _LARGEST_CENTRE_STD * intrinsics.height_px}
     for name, std in zip(intrinsics.names, np.sqrt(np.diag(fit.covariance)), strict=True):
@@ -168,24 +168,24 @@ def _refuse_undetermined(fit: BorderedFit, intrinsics: Intrinsics) -> None:
 
 
 def _solution(
-    images: Sequence[TargetImage], views: list[Placement], fit: BorderedFit, intrinsics: Intrinsics, poses: Poses
+    images: Sequence[TargetImage], views: list[Placement], fit: SchurFit, intrinsics: Intrinsics, poses: Poses
 ) -> CameraSolution:
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
     residuals = [np.empty((0, 2))] * len(images)
-    for view, own, covariance, misses in zip(views, fit.own, fit.own_covariances, fit.residuals, strict=True):
-        rotation = cv2.Rodrigues(own[:3])[0]
-        directions.append(rotation @ view.direction(own[6:]))
+    for view, local, covariance, misses in zip(views, fit.local, fit.local_covariances, fit.residuals, strict=True):
+        rotation = cv2.Rodrigues(local[:3])[0]
+        directions.append(rotation @ view.direction(local[6:]))
         for index in np.unique(view.image):
             here = view.image == index
             target_poses[index, :3, :3] = rotation
-            target_poses[index, :3, 3] = own[3:6] - view.shifts_mm[here][0] * directions[-1]
+            target_poses[index, :3, 3] = local[3:6] - view.shifts_mm[here][0] * directions[-1]
             residuals[index] = misses[here]
         if poses == "stage":
-            tilts.append(_tilt(own[6:], covariance[6:, 6:]))
+            tilts.append(_tilt(local[6:], covariance[6:, 6:]))
     mean = np.mean(directions, axis=0)
     stage = stage_direction(target_poses, np.array([i.stage_mm for i in images])) if poses == "free" else None
     return CameraSolution(
-        model=intrinsics.model(fit.shared),
+        model=intrinsics.model(fit.global_values),
         target_poses=target_poses,
         residuals_px=residuals,
         parameters=intrinsics.names,

@@ -17,10 +17,10 @@ def linear_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[n
     farthest = int(np.argmax([np.ptp(placement.shifts_mm) for placement in placements]))
     points = placements[farthest].displaced(placements[farthest].direction(np.empty(0)))
     start = direct_linear(points, placements[farthest].pixels)
-    shared = intrinsics.from_matrix(start.matrix)
-    poses = [placement_pose(placement, intrinsics.matrix(shared)) for placement in placements]
+    global_values = intrinsics.from_matrix(start.matrix)
+    poses = [placement_pose(placement, intrinsics.matrix(global_values)) for placement in placements]
     poses[farthest] = np.r_[cv2.Rodrigues(start.rotation)[0].ravel(), start.translation_mm]
-    return shared, poses
+    return global_values, poses
 
 
 def planar_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -37,8 +37,8 @@ def planar_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[n
             "the target images do not show the focal length: tilt the target against the camera's axis, differently "
             "from image to image"
         )
-    shared = intrinsics.from_matrix(matrix)
-    return shared, [placement_pose(placement, intrinsics.matrix(shared)) for placement in placements]
+    global_values = intrinsics.from_matrix(matrix)
+    return global_values, [placement_pose(placement, intrinsics.matrix(global_values)) for placement in placements]
 
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:

@@ -32,9 +32,9 @@ class LinePolynomials:
     coefficients : (L, degree + 1)
         Legendre coefficients of each line.
     residuals : (N,)
-        Data less polynomial, strays included.
+        Data less polynomial, outliers included.
     used : (N,) bool
-        The data that were not left out as strays.
+        The data that were not left out as outliers.
     """
 
     first_line: int
@@ -95,7 +95,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
             )
         residuals = y - design @ solution
         spread = MAD_TO_STD * np.median(np.abs(residuals[used]))
-        # Rounding alone must not make strays of exact data.
+        # Rounding alone must not make outliers of exact data.
         within = np.abs(residuals) <= max(_STRAYS * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:
             within &= used

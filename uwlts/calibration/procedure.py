@@ -192,7 +192,7 @@ def gather(
         if not on_steps:
             raise CalibrationError(no_stripe_in(steps))
     return Evidence(
-        sensor=sensor, medium_kind=media.pop(), stage_direction=np.array(air[0].header.stage_direction),
+        sensor=sensor, medium_kind=air[0].header.medium.kind, stage_direction=np.array(air[0].header.stage_direction),
         approaching=None if options.poses == "free" else _approaching(air), air=found,
         plate=steps[0].header.sensor.camera.window if steps else None, steps=on_steps,
         sources=sources_of(air, steps), warnings=warnings,

@@ -43,7 +43,7 @@ class SheetSolution:
     residuals_mm : (N,)
         Signed distances of all points from the plane.
     used : (N,) bool
-        The points that were not left out as strays.
+        The points that were not left out as outliers.
     rms_mm, max_mm : float
         Over the points used.
     rejected_share : float

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.calibration.bordered import Observation
 from uwlts.calibration.intrinsics import Intrinsics
+from uwlts.calibration.schur_least_squares import Observation
 from uwlts.calibration.target_image import TargetImage, z_away
 from uwlts.errors import CalibrationError
 
@@ -72,32 +72,34 @@ def _joined(images: Sequence[TargetImage], group: list[int], *, approaching: boo
     )
 
 
-def observe(placement: Placement, intrinsics: Intrinsics, shared: np.ndarray, own: np.ndarray) -> Observation | None:
+def observe(
+    placement: Placement, intrinsics: Intrinsics, global_values: np.ndarray, local: np.ndarray
+) -> Observation | None:
     """Residuals (found minus calculated) of a placement and their derivatives; None with points behind the camera.
 
     Parameters
     ----------
-    shared : (P,)
+    global_values : (P,)
         Camera parameters, as `Intrinsics` names them.
-    own : (6,) or (8,)
+    local : (6,) or (8,)
         Rotation vector, translation in mm and, where the stage's direction is free, its tilt (a, b).
     """
-    direction = placement.direction(own[6:])
+    direction = placement.direction(local[6:])
     points = placement.displaced(direction)
-    rotation = cv2.Rodrigues(own[:3])[0]
-    if np.min(points @ rotation[2] + own[5]) <= 0:
+    rotation = cv2.Rodrigues(local[:3])[0]
+    if np.min(points @ rotation[2] + local[5]) <= 0:
         return None
     projected, jacobian = cv2.projectPoints(
-        points, own[:3], own[3:6], intrinsics.matrix(shared), intrinsics.coefficients(shared)
+        points, local[:3], local[3:6], intrinsics.matrix(global_values), intrinsics.coefficients(global_values)
     )
-    by_own = jacobian[:, :6]
-    if len(own) > 6:
+    by_local = jacobian[:, :6]
+    if len(local) > 6:
         # Moving a point along a vector acts like translating the target by the rotated vector.
         turning = (np.eye(3) - np.outer(direction, direction))[:, :2] * abs(direction[2])
         by_tilt = -np.repeat(placement.shifts_mm, 2)[:, None] * (jacobian[:, 3:6] @ (rotation @ turning))
-        by_own = np.hstack([by_own, by_tilt])
+        by_local = np.hstack([by_local, by_tilt])
     return Observation(
         residuals=placement.pixels - projected.reshape(-1, 2),
-        by_shared=-jacobian[:, 6:15] @ intrinsics.map,
-        by_own=-by_own,
+        by_global=-jacobian[:, 6:15] @ intrinsics.map,
+        by_local=-by_local,
     )

@@ -13,7 +13,7 @@ from uwlts.calibration.any_calibration import calibration_digest
 from uwlts.calibration.joint.next_shot import Outlook, next_shots
 from uwlts.calibration.joint.stored import require_joint
 from uwlts.calibration.joint.volume import lengths_over, regions
-from uwlts.calibration.joint.weakness import told, weaknesses
+from uwlts.calibration.joint.weakness import format_weaknesses, weaknesses
 from uwlts.calibration.joint_estimate import ImageFit
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.parameter_keys import ParameterKey, WindowParameter, parameter_of
@@ -294,7 +294,7 @@ def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
         update={
             "lengths": tuple(length_uncertainties(use)),
             "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
-            "cannot_tell": tuple(told(weak)),
+            "cannot_tell": tuple(format_weaknesses(weak)),
             "weaknesses": tuple(
                 WeaknessRow.model_validate(asdict(each) | {"parameters": tuple(key.text for key in each.parameters)})
                 for each in weak

@@ -129,10 +129,10 @@ def _derivatives(
     points = known.parameters.on_sheet(known.values, known.view, pixels)
     if points is None:
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
-    by_shared = np.stack(
-        [known.parameters.by_shared(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) for axis in range(3)]
+    by_global = np.stack(
+        [known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) for axis in range(3)]
     )
-    return points.by_rays[column].T, np.einsum("anp,pr->rna", by_shared, root, optimize=True)
+    return points.by_rays[column].T, np.einsum("anp,pr->rna", by_global, root, optimize=True)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

@@ -54,12 +54,12 @@ def information_of(
     """
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
     placement = Placement(points_mm, np.zeros(len(points_mm)), pixels, np.zeros(len(points_mm), dtype=int), 1.0)
-    own = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
-    seen = observe(placement, intrinsics, intrinsics.from_model(camera), own)
+    local = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
+    seen = observe(placement, intrinsics, intrinsics.from_model(camera), local)
     if seen is None:
         return np.zeros((len(intrinsics.names),) * 2)
-    shared, basis = seen.by_shared, np.linalg.qr(seen.by_own / np.linalg.norm(seen.by_own, axis=0))[0]
-    left = shared - basis @ (basis.T @ shared)
+    by_global, basis = seen.by_global, np.linalg.qr(seen.by_local / np.linalg.norm(seen.by_local, axis=0))[0]
+    left = by_global - basis @ (basis.T @ by_global)
     return left.T @ left
 
 
@@ -85,9 +85,8 @@ def candidates(
         pose[:3, :3] = rotation
         pose[:3, 3] = ray / ray[2] * distance - rotation @ middle
         pixels = _seen(points, pose, camera)
-        inside = ((pixels > _MARGIN_PX) & (pixels < [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX])).all(
-            axis=1
-        )
+        largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
+        inside = np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
         if not target.findable(inside):
             continue
         sample = np.flatnonzero(inside)[::step]

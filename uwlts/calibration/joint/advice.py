@@ -2,7 +2,7 @@
 
 from uwlts.calibration.joint.next_shot import next_shots
 from uwlts.calibration.joint.volume import estimate_in, lengths_over, regions
-from uwlts.calibration.joint.weakness import told, weaknesses
+from uwlts.calibration.joint.weakness import format_weaknesses, weaknesses
 from uwlts.calibration.model import Calibration
 
 
@@ -13,5 +13,5 @@ def advice_lines(calibration: Calibration) -> list[str]:
         return ["the stripes of the evidence cover no area: what lengths measured by it are worth is not known"]
     known = estimate_in(calibration, region)
     lengths = lengths_over(calibration, known, region)
-    lines = told(weaknesses(lengths, known.parameters.keys, known.covariance))
+    lines = format_weaknesses(weaknesses(lengths, known.parameters.keys, known.covariance))
     return [*lines, *(f"next: {outlook.advice()}" for outlook in next_shots(calibration)[:1])]

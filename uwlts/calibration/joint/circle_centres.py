@@ -13,25 +13,25 @@ from uwlts.targets import circle_centre_bias
 
 
 def centred(
-    parameters: Parameters, diameter_mm: float, found: Sequence[Evidence], shared: np.ndarray,
-    own: Sequence[np.ndarray],
+    parameters: Parameters, diameter_mm: float, found: Sequence[Evidence], global_values: np.ndarray,
+    local: Sequence[np.ndarray],
 ) -> list[Evidence]:  # fmt: skip
     """The evidence with the images of the circles' centres instead of the centres of the circles' images."""
     return [
-        _with_centres(e, parameters, shared, o, diameter_mm) if isinstance(e, TargetEvidence) else e
-        for e, o in zip(found, own, strict=True)
+        _with_centres(e, parameters, global_values, o, diameter_mm) if isinstance(e, TargetEvidence) else e
+        for e, o in zip(found, local, strict=True)
     ]
 
 
 def _with_centres(
-    evidence: TargetEvidence, parameters: Parameters, shared: np.ndarray, own: np.ndarray, diameter_mm: float
+    evidence: TargetEvidence, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
 ) -> TargetEvidence:
     view, placement = evidence.view, evidence.placement
-    camera, index = parameters.camera(shared), parameters.medium_index(shared, view)
-    window = parameters.window_model(shared) if view.window else None
+    camera, index = parameters.camera(global_values), parameters.medium_index(global_values, view)
+    window = parameters.window_model(global_values) if view.window else None
     pixels = placement.pixels.copy()
     for image in np.unique(placement.image):
-        pose, here = evidence.pose(parameters, shared, own, image), placement.image == image
+        pose, here = evidence.pose(parameters, global_values, local, image), placement.image == image
 
         def project(points: np.ndarray, pose: np.ndarray = pose) -> np.ndarray:
             seen = points @ pose[:3, :3].T + pose[:3, 3]

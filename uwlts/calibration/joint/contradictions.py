@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwlts.calibration.joint.deviation_messages import format_deviation
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
-from uwlts.calibration.joint.noise import strays
+from uwlts.calibration.joint.noise import outliers
 from uwlts.calibration.joint.observations import TARGET, Residuals, TargetEvidence
-from uwlts.calibration.joint.prior_words import format_deviation
 from uwlts.metrology.robust_fit import MAD_TO_STD
 from uwlts.sensor import Sensor, Uncertainty
 
@@ -26,7 +26,7 @@ _OVER_NOISE = 2.5
 _WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
 """Lines that err together; the filter that finds the stripe, and speckle, join two to four."""
 
-_STRAY_SHARE = 0.2
+_OUTLIER_SHARE = 0.2
 _DOUBTFUL, _WRONG = 4.0, 6.0
 """Standard uncertainties from what was known before. Those of drawings are guesses, so few are but doubtful."""
 
@@ -102,7 +102,7 @@ def findings(
     contradictions += waves
     doubts += unusual + doubtful + slight_waves
     doubts += [
-        f"{100 * share:.0f} % of the {kind} was left out as strays: look at the images"
+        f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
         for kind, share in much_left_out(result).items()
     ]
     if result.stopped == UNSETTLED:
@@ -179,16 +179,16 @@ def _of_stage(
     """Directions and positions of the stage far from what its description says."""
     found = []
     std = uncertainty.stage_position_mm
-    for piece, own, names in zip(evidence, result.own, sources, strict=True):
+    for piece, local, names in zip(evidence, result.local, sources, strict=True):
         if not (isinstance(piece, TargetEvidence) and piece.staged):
             continue
-        tilt = float(np.degrees(np.arctan(np.hypot(*own[6:8]))))
+        tilt = float(np.degrees(np.arctan(np.hypot(*local[6:8]))))
         if tilt > _WRONG * uncertainty.stage_alignment_deg:
             found.append(
                 f"{_capture(names)}: the stage moves {tilt:.2g} deg off the target's normal, described as within "
                 f"{uncertainty.stage_alignment_deg:g} deg (uncertainty.stage_alignment_deg)"
             )
-        errors, images = own[8:], piece.images()
+        errors, images = local[8:], piece.images()
         # The first position has no error of its own, so all others share its.
         errors = errors - np.median(np.append(errors, 0.0))
         # One that is far off bends the camera and so moves the others too.
@@ -256,12 +256,12 @@ def _of_shapes(result: Estimate) -> tuple[list[str], list[str]]:
 
 
 def much_left_out(result: Estimate) -> dict[str, float]:
-    """The share that was left out as strays, of the kinds of residuals of which that is much."""
+    """The share that was left out as outliers, of the kinds of residuals of which that is much."""
     found = {}
     for kind, noise in result.noise.items():
         parts = [part for parts in result.residuals for part in parts if part.kind == kind]
-        share = float(np.concatenate([strays(part, noise) for part in parts]).mean())
-        if share > _STRAY_SHARE:
+        share = float(np.concatenate([outliers(part, noise) for part in parts]).mean())
+        if share > _OUTLIER_SHARE:
             found[kind] = share
     return found
 

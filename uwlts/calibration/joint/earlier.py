@@ -46,9 +46,9 @@ class EarlierEstimate:
         """Standard uncertainty (K,) of each parameter."""
         return np.sqrt(np.diag(self.covariance))
 
-    def residuals(self, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def residuals(self, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (K,) of variance one of a vector (P,) that begins with these parameters, and derivatives (K, P)."""
         count = len(self.values)
-        by_shared = np.zeros((count, len(shared)))
-        by_shared[:, :count] = self.whitening
-        return self.whitening @ (shared[:count] - self.values), by_shared
+        by_global = np.zeros((count, len(global_values)))
+        by_global[:, :count] = self.whitening
+        return self.whitening @ (global_values[:count] - self.values), by_global

@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.bordered import BorderedFit, Observation, fit_bordered
-from uwlts.calibration.joint.noise import Noise, judged, strays, with_slope_bias
+from uwlts.calibration.joint.noise import Noise, judged, outliers, with_slope_bias
 from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
 from uwlts.calibration.joint.surfaces import SCANNED
 from uwlts.calibration.parameter_keys import ParameterKey
+from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
 from uwlts.errors import CalibrationError
 from uwlts.sensor import Uncertainty
 
@@ -35,20 +35,20 @@ _FIRST_ROUNDS = 30
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The shared parameters and what the evidence says of them.
+    """The global parameters and what the evidence says of them.
 
     Attributes
     ----------
     parameters : Parameters
     values : (P,)
     covariance : (P, P)
-    own : list of (b,)
+    local : list of (b,)
         Of every piece of evidence.
     noise : dict
         Of every kind of residual.
     residuals : list of list of Residuals
-        Of every piece of evidence, strays included.
-    strays : int
+        Of every piece of evidence, outliers included.
+    outliers : int
         Residuals left out.
     rounds : int
         Of the least squares, summed over all weightings.
@@ -58,10 +58,10 @@ class Estimate:
     parameters: Parameters
     values: np.ndarray
     covariance: np.ndarray
-    own: list[np.ndarray]
+    local: list[np.ndarray]
     noise: dict[str, Noise]
     residuals: list[list[Residuals]]
-    strays: int
+    outliers: int
     rounds: int
     stopped: str
 
@@ -73,24 +73,24 @@ class Estimate:
 def estimate(
     parameters: Parameters,
     evidence: Sequence[Evidence],
-    shared: np.ndarray,
-    own: Sequence[np.ndarray],
+    global_values: np.ndarray,
+    local: Sequence[np.ndarray],
     *,
     uncertainty: Uncertainty,
     correct: Correct | None = None,
 ) -> Estimate:
     """Least squares over all evidence, repeated until weights and corrections agree with the solution.
 
-    At first large residuals count linearly; then strays, beyond five standard deviations, are left out.
+    At first large residuals count linearly; then outliers, beyond five standard deviations, are left out.
 
     Parameters
     ----------
-    shared : (P,)
+    global_values : (P,)
         Start.
-    own : sequence of (b,)
-        Starts of the evidence's own parameters.
+    local : sequence of (b,)
+        Starts of the evidence's local parameters.
     correct : callable, optional
-        Evidence as found, shared and own parameters to the evidence without what is known to bias it there.
+        Evidence as found, global and local parameters to the evidence without what is known to bias it there.
 
     Raises
     ------
@@ -98,18 +98,18 @@ def estimate(
         The start has no meaning, the evidence does not determine the parameters, or corrections do not settle.
     """
     problem = _Problem(parameters, uncertainty)
-    found, own, rounds = list(evidence), list(own), 0
+    found, local, rounds = list(evidence), list(local), 0
     known = dict(_FIRST)
     left_out: list[list[np.ndarray]] | None = None
     moved = np.inf
     for number in range(_ROUNDS):
         first, last = number == 0, number == _ROUNDS - 1
-        fit = problem.fit([_thinned(e) for e in evidence] if first else evidence, shared, own, known, left_out)
-        shared, own, rounds = fit.shared, fit.own[:-1], rounds + fit.rounds
-        residuals = problem.residuals(evidence, shared, own)
+        fit = problem.fit([_thinned(e) for e in evidence] if first else evidence, global_values, local, known, left_out)
+        global_values, local, rounds = fit.global_values, fit.local[:-1], rounds + fit.rounds
+        residuals = problem.residuals(evidence, global_values, local)
         before, known = known, problem.noise(evidence, residuals)
-        left_out = [[strays(r, known[r.kind]) for r in parts] for parts in residuals]
-        used, corrected = evidence, found if correct is None else correct(found, shared, own)
+        left_out = [[outliers(r, known[r.kind]) for r in parts] for parts in residuals]
+        used, corrected = evidence, found if correct is None else correct(found, global_values, local)
         evidence = [
             e.linearised(parts, [~mask for mask in masks])
             for e, parts, masks in zip(corrected, residuals, left_out, strict=True)
@@ -121,8 +121,8 @@ def estimate(
         steady = all(abs(known[k].effective_px() / before[k].effective_px() - 1) < _SETTLED for k in known)
         if moved <= _SETTLED_PX and not first and (steady or last):
             return Estimate(
-                parameters=parameters, values=shared, covariance=fit.covariance / fit.sigma**2, own=own, noise=known,
-                residuals=residuals, strays=sum(int(mask.sum()) for parts in left_out for mask in parts),
+                parameters=parameters, values=global_values, covariance=fit.covariance / fit.sigma**2, local=local,
+                noise=known, residuals=residuals, outliers=sum(int(mask.sum()) for parts in left_out for mask in parts),
                 rounds=rounds, stopped=fit.stopped if steady else UNSETTLED,
             )  # fmt: skip
     raise CalibrationError(
@@ -132,7 +132,7 @@ def estimate(
 
 
 class _Problem:
-    """The evidence as groups of a bordered least squares; the last group is what is known before."""
+    """The evidence as groups of a least squares with local parameters; the last group is what is known before."""
 
     def __init__(self, parameters: Parameters, uncertainty: Uncertainty):
         self._parameters = parameters
@@ -140,51 +140,51 @@ class _Problem:
         self._position_mm = uncertainty.stage_position_mm
 
     def fit(
-        self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray], noise: dict[str, Noise],
-        left_out: list[list[np.ndarray]] | None,
-    ) -> BorderedFit:  # fmt: skip
-        def model(group: int, shared: np.ndarray, own: np.ndarray) -> list[Observation] | None:
+        self, evidence: Sequence[Evidence], global_values: np.ndarray, local: Sequence[np.ndarray],
+        noise: dict[str, Noise], left_out: list[list[np.ndarray]] | None,
+    ) -> SchurFit:  # fmt: skip
+        def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
             if group == len(evidence):
-                return self._before(shared)
+                return self._before(global_values)
             piece = evidence[group]
-            parts = piece.residuals(self._parameters, shared, own)
+            parts = piece.residuals(self._parameters, global_values, local)
             if parts is None:
                 return None
             masks = [np.zeros(len(r.values), dtype=bool) for r in parts] if left_out is None else left_out[group]
             rows = [_weighted(r, ~mask, noise[r.kind]) for r, mask in zip(parts, masks, strict=True)]
-            std = piece.own_std(alignment=self._alignment, position_mm=self._position_mm)
+            std = piece.local_std(alignment=self._alignment, position_mm=self._position_mm)
             known = np.flatnonzero(np.isfinite(std))
-            rows.append(_of_own(own[known] / std[known], np.diag(1.0 / std[known]), known, len(shared)))
+            rows.append(_of_local(local[known] / std[known], np.diag(1.0 / std[known]), known, len(global_values)))
             if isinstance(piece, SurfaceScanEvidence):
-                off, by_own = piece.known_lengths(own)
-                rows.append(_of_own(off, by_own, np.arange(by_own.shape[1]), len(shared)))
+                off, by_local = piece.known_lengths(local)
+                rows.append(_of_local(off, by_local, np.arange(by_local.shape[1]), len(global_values)))
             return rows
 
-        starts = [*own, np.empty(0)]
+        starts = [*local, np.empty(0)]
         if left_out is not None:
-            return fit_bordered(model, shared, starts, smallest_gain=_SMALLEST_GAIN, damping=_DAMPING)
-        return fit_bordered(
-            model, shared, starts, smallest_gain=_FIRST_GAIN, damping=_FIRST_DAMPING, soft_limit=_SOFT_LIMIT,
+            return schur_least_squares(model, global_values, starts, smallest_gain=_SMALLEST_GAIN, damping=_DAMPING)
+        return schur_least_squares(
+            model, global_values, starts, smallest_gain=_FIRST_GAIN, damping=_FIRST_DAMPING, soft_limit=_SOFT_LIMIT,
             enough_rounds=_FIRST_ROUNDS,
         )  # fmt: skip
 
-    def _before(self, shared: np.ndarray) -> list[Observation]:
+    def _before(self, global_values: np.ndarray) -> list[Observation]:
         """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
         std = self._parameters.prior_std()
         known = np.isfinite(std)
-        off = (shared - self._parameters.prior_mean())[known] / std[known]
+        off = (global_values - self._parameters.prior_mean())[known] / std[known]
         found = [Observation(off[:, None], np.diag(1.0 / std)[known], np.empty((len(off), 0)))]
         if self._parameters.earlier is not None:
-            off, by_shared = self._parameters.earlier.residuals(shared)
-            found.append(Observation(off[:, None], by_shared, np.empty((len(off), 0))))
+            off, by_global = self._parameters.earlier.residuals(global_values)
+            found.append(Observation(off[:, None], by_global, np.empty((len(off), 0))))
         return found
 
     def residuals(
-        self, evidence: Sequence[Evidence], shared: np.ndarray, own: Sequence[np.ndarray]
+        self, evidence: Sequence[Evidence], global_values: np.ndarray, local: Sequence[np.ndarray]
     ) -> list[list[Residuals]]:
         found = []
-        for piece, values in zip(evidence, own, strict=True):
-            parts = piece.residuals(self._parameters, shared, values)
+        for piece, values in zip(evidence, local, strict=True):
+            parts = piece.residuals(self._parameters, global_values, values)
             if parts is None:
                 raise CalibrationError("the joint calibration diverged: a ray that was seen meets no sheet or target")
             found.append(parts)
@@ -214,12 +214,14 @@ def _thinned(evidence: Evidence) -> Evidence:
     )  # fmt: skip
 
 
-def _of_own(off: np.ndarray, by_own: np.ndarray, own: np.ndarray, shared: int) -> Observation:
-    """What is known of own parameters, in standard uncertainties."""
-    return Observation(off[:, None], np.zeros((len(off), shared)), by_own, own)
+def _of_local(off: np.ndarray, by_local: np.ndarray, local: np.ndarray, global_values: int) -> Observation:
+    """What is known of local parameters, in standard uncertainties."""
+    return Observation(off[:, None], np.zeros((len(off), global_values)), by_local, local)
 
 
 def _weighted(residuals: Residuals, used: np.ndarray, noise: Noise) -> Observation:
     scale = noise.effective_px()
     values = residuals.values[used, None] / scale
-    return Observation(values, residuals.by_shared[used] / scale, residuals.by_own[used] / scale, residuals.own)
+    return Observation(
+        values, residuals.by_global[used] / scale, residuals.by_local[used] / scale, residuals.local_columns
+    )

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import strays
+from uwlts.calibration.joint.noise import outliers
 from uwlts.calibration.joint.observations import TARGET, StepProfileEvidence
 from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
@@ -35,7 +35,7 @@ def joint_estimate(
     lit: dict[View, list[np.ndarray]] = {}
     for piece, parts, names in zip(evidence, result.residuals, sources, strict=True):
         for part in parts:
-            left_out = strays(part, result.noise[part.kind])
+            left_out = outliers(part, result.noise[part.kind])
             used = part.values[~left_out]
             images.append(
                 ImageFit(
@@ -58,7 +58,7 @@ def joint_estimate(
         scatter_px={kind: noise.sigma_px for kind, noise in result.noise.items()},
         shared_variance={kind: noise.together for kind, noise in result.noise.items()},
         residual_count=sum(len(r.values) for parts in result.residuals for r in parts),
-        outlier_count=result.strays,
+        outlier_count=result.outliers,
         rounds=result.rounds,
         stopped=result.stopped,
         images=tuple(images),

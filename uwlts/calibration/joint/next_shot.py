@@ -93,14 +93,14 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
 
 def information(calibration: Calibration, shot: Shot) -> np.ndarray:
     """What a shot adds (P, P) to the inverse of the covariance."""
-    count, own, noise = len(shot.known.values), len(shot.own_std), _noise_of(calibration, shot)
-    total = np.zeros((count + own,) * 2)
+    count, local, noise = len(shot.known.values), len(shot.local_std), _noise_of(calibration, shot)
+    total = np.zeros((count + local,) * 2)
     for part in shot.residuals:
         weight = noise[part.kind].effective_px() ** -2
-        rows = np.hstack([part.by_shared, part.by_own])
-        at = np.r_[0:count, count + part.own]
+        rows = np.hstack([part.by_global, part.by_local])
+        at = np.r_[0:count, count + part.local_columns]
         total[np.ix_(at, at)] += weight * np.einsum("ni,nj->ij", rows, rows)
-    border, block = total[:count, count:], total[count:, count:] + np.diag(shot.own_std**-2.0)
+    border, block = total[:count, count:], total[count:, count:] + np.diag(shot.local_std**-2.0)
     scale = 1.0 / np.sqrt(np.diag(block))
     border, block = border * scale, block * np.outer(scale, scale)
     return total[:count, :count] - border @ np.linalg.solve(block, border.T)

@@ -1,4 +1,4 @@
-"""How much the residuals scatter, which of them are strays, and how much of the scatter they share."""
+"""How much the residuals scatter, which of them are outliers, and how much of the scatter they share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from uwlts.calibration.joint.observations import TARGET, Residuals
 from uwlts.metrology.robust_fit import MAD_TO_STD
 
-_STRAY = 5.0
+_OUTLIER = 5.0
 _LAGS = 100
 _SHARED_LAG = 0.05
 _SLOPE_BIAS_PX = 0.01
@@ -26,7 +26,7 @@ class Noise:
     Attributes
     ----------
     sigma_px : float
-        Standard deviation of one residual, without strays.
+        Standard deviation of one residual, without outliers.
     together : float
         Variance of a mean of many over that of as many independent ones: neighbours along a stripe, or images of the
         same point of the target, err together.
@@ -43,25 +43,25 @@ class Noise:
         return self.sigma_px * float(np.sqrt(self.together + self.besides))
 
 
-def strays(residuals: Residuals, noise: Noise) -> np.ndarray:
+def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
     """Which residuals (n,) are too large to be noise; of the target's points both coordinates."""
-    large = np.asarray(np.abs(residuals.values) > _STRAY * noise.sigma_px)
+    large = np.asarray(np.abs(residuals.values) > _OUTLIER * noise.sigma_px)
     if residuals.kind == TARGET:
         large = np.repeat(np.any(large.reshape(-1, 2), axis=1), 2)
     return large
 
 
-def stray_limit(values: np.ndarray) -> float:
-    """Size beyond which values are strays, five of their standard deviations; half of them would have to be strays."""
-    return _STRAY * MAD_TO_STD * float(np.median(np.abs(values)))
+def outlier_limit(values: np.ndarray) -> float:
+    """Size beyond which values are outliers: five standard deviations, by a median that half of them leave as it is."""
+    return _OUTLIER * MAD_TO_STD * float(np.median(np.abs(values)))
 
 
 def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
     """Scatter of all residuals of a kind; ``points`` (N, 3) are the target's, for residuals of that kind."""
     values = np.concatenate([r.values for r in residuals])
-    limit = stray_limit(values)
+    limit = outlier_limit(values)
     kept = np.abs(values) <= limit
-    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / _STRAY
+    sigma = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else limit / _OUTLIER
     if sigma < _FINEST_PX:
         return Noise(_FINEST_PX)
     if kind == TARGET:
@@ -79,7 +79,7 @@ def with_slope_bias(noise: Noise, *, points_per_body: float) -> Noise:
 def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:
     """By how much residuals of the same point in several images share their error."""
     _, point = np.unique(np.round(points[:, :2], 6), axis=0, return_inverse=True)
-    pairs, kept = values.reshape(-1, 2), kept.reshape(-1, 2).all(axis=1)
+    pairs, kept = values.reshape(-1, 2), np.all(kept.reshape(-1, 2), axis=1)
     number = np.bincount(point[kept], minlength=point.max() + 1)
     often = number >= 3
     if not often.any():
@@ -93,7 +93,7 @@ def _of_neighbours(residuals: Sequence[Residuals], sigma: float) -> float:
     """1 + 2 sum of the autocorrelation along the stripe, up to where it fades, over all images."""
     products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for part in residuals:
-        kept = (np.abs(part.values) <= _STRAY * sigma).astype(np.float64)
+        kept = (np.abs(part.values) <= _OUTLIER * sigma).astype(np.float64)
         values = kept * part.values
         for lag in range(1, min(_LAGS, len(values) // 4)):
             products[lag] += values[lag:] @ values[:-lag]

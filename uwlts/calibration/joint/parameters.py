@@ -6,9 +6,9 @@ import numpy as np
 
 from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.joint.earlier import EarlierEstimate
-from uwlts.calibration.joint.rays import COLUMNS, LENS, WINDOW, RayJets, ray_jets
-from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
-from uwlts.calibration.joint.sheet_jets import DescribedSheet, PointJets, points_on_sheet
+from uwlts.calibration.joint.rays import COLUMNS, LENS, WINDOW, RayDerivatives, ray_derivatives
+from uwlts.calibration.joint.sheet_derivatives import PARAMETERS as SHEET
+from uwlts.calibration.joint.sheet_derivatives import DescribedSheet, PointDerivatives, points_on_sheet
 from uwlts.calibration.model import CameraModel, SheetModel, WindowModel
 from uwlts.calibration.parameter_keys import MediumIndex, ParameterKey, parameter_of
 
@@ -34,7 +34,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Keys and places of the shared parameters in one vector (P,).
+    """Keys and places of the global parameters in one vector (P,).
 
     Attributes
     ----------
@@ -101,20 +101,20 @@ class Parameters:
         """Index of a view's medium relative to air."""
         return 1.0 if view.medium is None else self.value(values, self.index_key(view.medium))
 
-    def rays(self, values: np.ndarray, view: View, pixels: np.ndarray) -> RayJets | None:
+    def rays(self, values: np.ndarray, view: View, pixels: np.ndarray) -> RayDerivatives | None:
         """Rays of pixels (N, 2) in the medium of a view."""
         window = self.window_model(values) if view.window else None
-        return ray_jets(self.camera(values), window, pixels, medium_index=self.medium_index(values, view))
+        return ray_derivatives(self.camera(values), window, pixels, medium_index=self.medium_index(values, view))
 
-    def on_sheet(self, values: np.ndarray, view: View, pixels: np.ndarray) -> PointJets | None:
+    def on_sheet(self, values: np.ndarray, view: View, pixels: np.ndarray) -> PointDerivatives | None:
         """Points of the sheet in the medium of a view that pixels (N, 2) show."""
         rays = self.rays(values, view, pixels)
         if rays is None:
             return None
         return points_on_sheet(self.sheet, self._sheet_values(values), rays, self.medium_index(values, view))
 
-    def by_shared(self, by_rays: np.ndarray, view: View, by_sheet: np.ndarray | None = None) -> np.ndarray:
-        """Derivatives (N, P) by the shared parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
+    def by_global(self, by_rays: np.ndarray, view: View, by_sheet: np.ndarray | None = None) -> np.ndarray:
+        """Derivatives (N, P) by the global parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
         result = np.zeros((by_rays.shape[1], len(self.keys)))
         lens = by_rays[2 : 2 + len(LENS)]
         result[:, : len(self.intrinsics.names)] = lens.T @ self.intrinsics.map
@@ -136,10 +136,10 @@ class Parameters:
             return float(values[self.keys.index(key)])
         return self.priors[key].mean if key in self.priors else 0.0
 
-    def add(self, by_shared: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
+    def add(self, by_global: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
         """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
         if key in self.keys:
-            by_shared[:, self.keys.index(key)] += column
+            by_global[:, self.keys.index(key)] += column
 
     def index_key(self, medium: int) -> MediumIndex:
         """The index of a medium by its number."""

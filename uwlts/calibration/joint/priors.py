@@ -4,7 +4,7 @@ import numpy as np
 
 from uwlts.calibration.joint.gathering import Gathered
 from uwlts.calibration.joint.parameters import Prior
-from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
+from uwlts.calibration.joint.sheet_derivatives import PARAMETERS as SHEET
 from uwlts.calibration.joint.surface_scans import SLOPES
 from uwlts.calibration.model import WindowModel
 from uwlts.calibration.parameter_keys import (
@@ -23,7 +23,7 @@ def priors_of(
     gathered: Gathered, window: WindowModel | None, indices: list[float], turns: np.ndarray,
     heights: dict[StepHeight, Prior], options: CalibrationOptions,
 ) -> dict[ParameterKey, Prior]:  # fmt: skip
-    """What is known of all shared parameters but the lens's.
+    """What is known of all global parameters but the lens's.
 
     Parameters
     ----------

@@ -38,10 +38,10 @@ class JointProblem:
     ----------
     parameters : Parameters
     evidence : list
-    shared : (P,)
+    global_values : (P,)
         Start.
-    own : list of (b,)
-        Starts of the evidence's own parameters.
+    local : list of (b,)
+        Starts of the evidence's local parameters.
     uncertainty : Uncertainty
     diameter_mm : float or None
         Of the target's circles, whose images are to be corrected; None where nothing is.
@@ -52,8 +52,8 @@ class JointProblem:
 
     parameters: Parameters
     evidence: list[Evidence]
-    shared: np.ndarray
-    own: list[np.ndarray]
+    global_values: np.ndarray
+    local: list[np.ndarray]
     uncertainty: Uncertainty
     diameter_mm: float | None
     sources: list[dict[int, str]]
@@ -62,7 +62,7 @@ class JointProblem:
     def solve(self) -> Estimate:
         """The estimate, not judged yet; errors as `estimate`."""
         return estimate(
-            self.parameters, self.evidence, self.shared, self.own, uncertainty=self.uncertainty,
+            self.parameters, self.evidence, self.global_values, self.local, uncertainty=self.uncertainty,
             correct=None if self.diameter_mm is None else partial(centred, self.parameters, self.diameter_mm),
         )  # fmt: skip
 
@@ -149,15 +149,19 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     priors = priors_of(gathered, window, indices, turns, {e.height: known for e, known in steps}, options)
     parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors)
     evidence: list[Evidence] = [*start.evidence, *(e for e, _ in steps), *(e for e, _ in scans)]
-    shared = parameters.start(start.lens)
-    own = [*start.own, *(line_start(e, parameters, shared) for e, _ in steps), *(own for _, own in scans)]
+    global_values = parameters.start(start.lens)
+    local = [
+        *start.local,
+        *(line_start(e, parameters, global_values) for e, _ in steps),
+        *(local for _, local in scans),
+    ]
     target = gathered.series[0].found.target
     diameter_mm = target.circle_diameter_mm if options.correct_circles else None
     sources = gathered.sources(free=free)
     sources += [{e.image: gathered.steps[e.image][0].source} for e, _ in steps]
     sources += [e.sources() for e, _ in scans]
     return JointProblem(
-        parameters, evidence, shared, own, sensor.uncertainty, diameter_mm, sources,
+        parameters, evidence, global_values, local, sensor.uncertainty, diameter_mm, sources,
         warnings,
     )  # fmt: skip
 

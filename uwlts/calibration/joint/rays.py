@@ -22,7 +22,7 @@ _INNER = 8
 
 
 @dataclass(frozen=True, eq=False)
-class RayJets:
+class RayDerivatives:
     """Rays in the medium, camera frame, mm, and their derivatives.
 
     Attributes
@@ -39,9 +39,9 @@ class RayJets:
     directions_by: np.ndarray
 
 
-def ray_jets(
+def ray_derivatives(
     camera: CameraModel, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
-) -> RayJets | None:
+) -> RayDerivatives | None:
     """Rays of pixels (N, 2) with their derivatives; None where a pixel has no ray in the medium."""
     seen = directions(camera, pixels).T
     if not np.isfinite(seen).all():
@@ -59,7 +59,7 @@ def ray_jets(
             return None
         origin, origin_by, ray, by = traced
     image_by = _ideal_image_by(camera, pixels, x, y)
-    return RayJets(origin, ray, _by_columns(origin_by, image_by), _by_columns(by, image_by))
+    return RayDerivatives(origin, ray, _by_columns(origin_by, image_by), _by_columns(by, image_by))
 
 
 def _by_columns(by_inner: np.ndarray, image_by: np.ndarray) -> np.ndarray:

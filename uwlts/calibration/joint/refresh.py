@@ -15,7 +15,7 @@ from uwlts.calibration.joint.observations import StepProfileEvidence
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.priors import priors_of
 from uwlts.calibration.joint.refreshed_calibration import refreshed_calibration
-from uwlts.calibration.joint.sheet_jets import PARAMETERS as SHEET
+from uwlts.calibration.joint.sheet_derivatives import PARAMETERS as SHEET
 from uwlts.calibration.joint.step_start import line_start, step_profiles
 from uwlts.calibration.joint.stored import StoredEstimate, found_estimate
 from uwlts.calibration.joint.water_change import WaterChange, water_changes
@@ -141,9 +141,9 @@ def _judged(
     sources: Sequence[Mapping[int, str]],
     sensor: Sensor,
 ) -> tuple[Estimate, Findings]:
-    shared = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
-    own = [line_start(profile, parameters, shared) for profile in evidence]
-    result = estimate(parameters, evidence, shared, own, uncertainty=sensor.uncertainty)
+    global_values = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
+    local = [line_start(profile, parameters, global_values) for profile in evidence]
+    result = estimate(parameters, evidence, global_values, local, uncertainty=sensor.uncertainty)
     return result, findings(result, evidence, sources, sensor=sensor)
 
 

@@ -88,7 +88,7 @@ def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> Scan
 def surface_scan(
     stripes: ScanStripes, start: Calibration, sensor: Sensor, *, medium_index: float, sizes_known: bool, image: int
 ) -> tuple[SurfaceScanEvidence, np.ndarray]:
-    """Evidence and the start of its own parameters, by a calibration nearly as sought.
+    """Evidence and the start of its local parameters, by a calibration nearly as sought.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def surface_scan(
     there = np.flatnonzero(good)
     there = there[:: -(-len(there) // _MOST_POINTS)]
     transform = start.object_transform()
-    used, surface, own = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
+    used, surface, local = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
     kept = there[used]
     frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
     rotation, direction = transform[:3, :3], stripes.stage_direction
@@ -124,13 +124,13 @@ def surface_scan(
         across_stage=across_of(direction) @ rotation.T, across=1 if along_width else 0, image=image,
         source=stripes.source,
     )  # fmt: skip
-    return evidence, np.append(own, np.zeros(len(frames)))
+    return evidence, np.append(local, np.zeros(len(frames)))
 
 
 def surface_scans(
     scans: Sequence[ScanStripes], start: Calibration, sensor: Sensor, indices: Sequence[float], *, sizes_known: bool
 ) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
-    """Evidence of every scan with the start of its own parameters, and warnings about scans left out.
+    """Evidence of every scan with the start of its local parameters, and warnings about scans left out.
 
     Raises
     ------
@@ -144,13 +144,13 @@ def surface_scans(
         index = 1.0 if stripes.view.medium is None else indices[stripes.view.medium]
         through = start if stripes.view.window else start.model_copy(update={"window": None})
         try:
-            evidence, own = surface_scan(
+            evidence, local = surface_scan(
                 stripes, through, sensor, medium_index=index, sizes_known=sizes_known, image=image
             )
         except EvaluationError as error:
             warnings.append(f"{stripes.source}: left out, {error}")
             continue
-        found.append((evidence, own))
+        found.append((evidence, local))
         image += len(evidence.stage_mm)
     return found, warnings
 
@@ -165,8 +165,8 @@ def _surface(
     used : (N,) bool
         Points that lie on it.
     surface : Surface
-    own : (k,)
-        Start of its own parameters.
+    local : (k,)
+        Start of its local parameters.
 
     Raises
     ------

@@ -32,12 +32,12 @@ _SEEN = np.radians(60)
 class Shot:
     """What a shot would say: the estimate, perhaps with parameters that it adds, residuals, and priors of its own.
 
-    ``own_std`` (b,) is what is known before of the shot's own parameters, infinite for those that it has to find.
+    ``local_std`` (b,) is what is known before of the shot's local parameters, infinite for those that it has to find.
     """
 
     known: StoredEstimate
     residuals: list[Residuals]
-    own_std: np.ndarray
+    local_std: np.ndarray
 
 
 def target_shot(calibration: Calibration, known: StoredEstimate, target: Target, pose: np.ndarray) -> Shot | None:
@@ -58,8 +58,8 @@ def target_shot(calibration: Calibration, known: StoredEstimate, target: Target,
         across=_across(calibration), staged=False, radius_mm=float(np.linalg.norm(extent - middle, axis=1).max()),
         middle_mm=middle,
     )  # fmt: skip
-    own = np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])
-    parts = evidence.residuals(known.parameters, known.values, own)
+    local = np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])
+    parts = evidence.residuals(known.parameters, known.values, local)
     return None if parts is None else Shot(known, parts, np.full(6, np.inf))
 
 
@@ -89,8 +89,8 @@ def step_shot(
         view=known.view, pixels=np.vstack(kept), upper=np.concatenate(labels), upward=-frame[:3, 2],
         along=frame[:3, 1], across=_across(calibration), height=height, image=0,
     )  # fmt: skip
-    own = np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
-    parts = evidence.residuals(known.parameters, known.values, own)
+    local = np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
+    parts = evidence.residuals(known.parameters, known.values, local)
     return None if parts is None else Shot(known, parts, np.full(2, np.inf))
 
 
@@ -99,17 +99,18 @@ def sphere_shot(
 ) -> Shot | None:
     """A scan along X of two spheres of unknown size, their centres at a depth Z; None where they are not in view."""
     lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
-    known = extended(
-        known,
-        dict.fromkeys((StageParameter.SLOPE_1, StageParameter.SLOPE_2), Prior(0.0, lean))
-        | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)},
-    )
+    stage: dict[ParameterKey, Prior] = {
+        StageParameter.SLOPE_1: Prior(0.0, lean),
+        StageParameter.SLOPE_2: Prior(0.0, lean),
+        StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale),
+    }
+    known = extended(known, stage)
     frame, radius = calibration.object_transform(), SPHERE_MM / 2
-    stage = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
+    positions = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
     centres = np.array([(0.0, side * _SPHERES_APART_MM / 2, depth_mm) for side in (-1, 1)])
     turn = np.linspace(-_SEEN, _SEEN, _SAMPLES)
     pixels, sphere, image = [], [], []
-    for number, at in enumerate(stage):
+    for number, at in enumerate(positions):
         chord = np.sqrt(radius**2 - at**2)
         for which, centre in enumerate(centres):
             found = _on_lines(calibration, known, centre[1:] + chord * np.column_stack([np.sin(turn), -np.cos(turn)]))
@@ -126,12 +127,12 @@ def sphere_shot(
     stripes = np.vstack(pixels)
     evidence = SurfaceScanEvidence(
         view=known.view, pixels=stripes, beside_mm=np.zeros((3, len(stripes))), surface=surface,
-        frame=np.concatenate(image), stage_mm=stage, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T,
+        frame=np.concatenate(image), stage_mm=positions, direction=frame[:3, 0], across_stage=frame[:3, 1:3].T,
         across=_across(calibration), image=0, source="",
     )  # fmt: skip
-    own = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(SPHERES + len(stage))])
-    parts = evidence.residuals(known.parameters, known.values, own)
-    std = evidence.own_std(alignment=lean, position_mm=uncertainty.stage_position_mm)
+    local = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(SPHERES + len(positions))])
+    parts = evidence.residuals(known.parameters, known.values, local)
+    std = evidence.local_std(alignment=lean, position_mm=uncertainty.stage_position_mm)
     return None if parts is None else Shot(known, parts, std)
 
 

@@ -13,7 +13,7 @@ from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.joint.observations import TargetEvidence
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.sheet_jets import DescribedSheet
+from uwlts.calibration.joint.sheet_derivatives import DescribedSheet
 from uwlts.calibration.model import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.calibration.sheet import fit_sheet, object_frame
 from uwlts.calibration.target_placement import Placement, placements, single_images
@@ -58,12 +58,12 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class SeriesStart:
-    """Start of lens (L,) and of all placements' own parameters, with the stripes that lie on the target."""
+    """Start of lens (L,) and of all placements' local parameters, with the stripes that lie on the target."""
 
     intrinsics: Intrinsics
     lens: np.ndarray
     evidence: list[TargetEvidence]
-    own: list[np.ndarray]
+    local: list[np.ndarray]
 
     def calibration(self, sensor: Sensor, window: WindowModel | None, model: SheetModel) -> Calibration:
         """A calibration of the start, good enough to tell the treads of a step apart."""
@@ -98,7 +98,7 @@ def series_start(
     index = _index(base.view, indices)
     for place, name in enumerate(intrinsics.names):
         lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
-    camera, evidence, own = intrinsics.model(lens), [], []
+    camera, evidence, local = intrinsics.model(lens), [], []
     for part in series:
         index, through = _index(part.view, indices), window if part.view.window else None
         alone = free or part.approaching is None
@@ -106,8 +106,8 @@ def series_start(
             pose = _pose(camera, placement, through, index)
             piece = _evidence(part, placement, camera, through, pose, sensor, index, margin_mm, staged=not alone)
             evidence.append(piece)
-            own.append(pose if alone else np.concatenate([pose, np.zeros(2 + len(piece.images()))]))
-    return SeriesStart(intrinsics, lens, evidence, own)
+            local.append(pose if alone else np.concatenate([pose, np.zeros(2 + len(piece.images()))]))
+    return SeriesStart(intrinsics, lens, evidence, local)
 
 
 def sheet_start(
@@ -128,15 +128,15 @@ def sheet_start(
     view = min(views, key=lambda v: (v.medium is not None, v.window))
     camera, through = start.intrinsics.model(start.lens), window if view.window else None
     points = []
-    for piece, own in zip(start.evidence, start.own, strict=True):
+    for piece, local in zip(start.evidence, start.local, strict=True):
         if piece.view == view and len(piece.stripe_pixels):
             at = _on_target(
-                camera, through, _index(view, indices), piece.stripe_pixels, own, piece.stripe_shifts_mm,
+                camera, through, _index(view, indices), piece.stripe_pixels, local, piece.stripe_shifts_mm,
                 piece.placement.direction(np.empty(0)),
             )  # fmt: skip
-            rotation = cv2.Rodrigues(own[:3])[0]
+            rotation = cv2.Rodrigues(local[:3])[0]
             points.append((at - piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))) @ rotation.T
-                          + own[3:6])  # fmt: skip
+                          + local[3:6])  # fmt: skip
     pose, plate = laser_pose(sensor), sensor.laser.window
     sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
     normal, along = np.array(sheet.normal), sheet.normal @ pose.normal

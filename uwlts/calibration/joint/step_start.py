@@ -37,12 +37,12 @@ def step_profiles(
     return found, warnings
 
 
-def line_start(evidence: StepProfileEvidence, parameters: Parameters, shared: np.ndarray) -> np.ndarray:
+def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
     """The lower tread's line (2,) at the parameters' start."""
-    points = parameters.on_sheet(shared, evidence.view, evidence.pixels)
+    points = parameters.on_sheet(global_values, evidence.view, evidence.pixels)
     if points is None:
         raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
-    up = evidence.upward @ points.points - evidence.upper * parameters.value(shared, evidence.height)
+    up = evidence.upward @ points.points - evidence.upper * parameters.value(global_values, evidence.height)
     along = evidence.along @ points.points
     slope, offset = np.polyfit(along, up, 1)
     return np.array([-slope, offset / np.hypot(1.0, slope)])

@@ -7,7 +7,7 @@ import numpy as np
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
 from uwlts.calibration.joint.rays import WINDOW
-from uwlts.calibration.joint.sheet_jets import DescribedSheet
+from uwlts.calibration.joint.sheet_derivatives import DescribedSheet
 from uwlts.calibration.joint_estimate import JointEstimate
 from uwlts.calibration.model import Calibration
 from uwlts.calibration.parameter_keys import LensParameter, MediumIndex, ParameterKey, SheetParameter, parameter_of

@@ -27,7 +27,7 @@ _LEAST_SHARE = 0.4
 class SurfaceScanEvidence:
     """Stripe pixels on something that stands still while the stage moves the sensor.
 
-    The own parameters are those of the surface, camera frame at the stage position 0, and an error of each of the F
+    The local parameters are those of the surface, camera frame at the stage position 0, and an error of each of the F
     stage positions.
 
     Attributes
@@ -71,32 +71,32 @@ class SurfaceScanEvidence:
         """Where each image comes from."""
         return {self.image + n: f"{self.source}, at {position:g} mm" for n, position in enumerate(self.stage_mm)}
 
-    def own_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
-        """Standard uncertainty (k + F,) of the own parameters before; infinite where nothing is known."""
-        return np.concatenate([self.surface.own_std(), np.full(len(self.stage_mm), position_mm)])
+    def local_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
+        """Standard uncertainty (k + F,) of the local parameters before; infinite where nothing is known."""
+        return np.concatenate([self.surface.local_std(), np.full(len(self.stage_mm), position_mm)])
 
-    def residuals(self, parameters: Parameters, shared: np.ndarray, own: np.ndarray) -> list[Residuals] | None:
+    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
         """Those of each image; None where a ray misses the sheet."""
         at_px = self.pixels if self.predicted is None else self.predicted
-        points = parameters.on_sheet(shared, self.view, at_px)
+        points = parameters.on_sheet(global_values, self.view, at_px)
         if points is None:
             return None
-        count = len(own) - len(self.stage_mm)
-        direction, by_slopes = self._direction(parameters, shared)
+        count = len(local) - len(self.stage_mm)
+        direction, by_slopes = self._direction(parameters, global_values)
         nominal = self.stage_mm[self.frame]
-        travel = nominal * (1.0 + parameters.value(shared, StageParameter.SCALE)) + own[count:][self.frame]
-        off = self.surface.distances(points.points + self.beside_mm + direction[:, None] * travel, own[:count])
+        travel = nominal * (1.0 + parameters.value(global_values, StageParameter.SCALE)) + local[count:][self.frame]
+        off = self.surface.distances(points.points + self.beside_mm + direction[:, None] * travel, local[:count])
         by_rays = np.einsum("in,cin->cn", off.outward, points.by_rays)
-        by_shared = parameters.by_shared(by_rays, self.view, np.einsum("in,cin->cn", off.outward, points.by_sheet))
+        by_global = parameters.by_global(by_rays, self.view, np.einsum("in,cin->cn", off.outward, points.by_sheet))
         by_position = direction @ off.outward
-        parameters.add(by_shared, StageParameter.SCALE, by_position * nominal)
+        parameters.add(by_global, StageParameter.SCALE, by_position * nominal)
         for key, by in zip(SLOPES, by_slopes, strict=True):
-            parameters.add(by_shared, key, (by @ off.outward) * travel)
+            parameters.add(by_global, key, (by @ off.outward) * travel)
         column = COLUMNS.index("uv"[self.across])
         least = _LEAST_SHARE * np.linalg.norm(points.by_rays[column], axis=0)
         per_px = np.copysign(np.maximum(np.abs(by_rays[column]), least), by_rays[column])
         values = (self.pixels - at_px)[:, self.across] * (by_rays[column] / per_px) + off.values_mm / per_px
-        by_own = np.column_stack([off.by_own, by_position])
+        by_local = np.column_stack([off.by_local, by_position])
         found = []
         for number in np.unique(self.frame):
             here = self.frame == number
@@ -104,17 +104,17 @@ class SurfaceScanEvidence:
                 Residuals(
                     kind=self.surface.kind,
                     values=values[here],
-                    by_shared=by_shared[here] / per_px[here, None],
-                    by_own=by_own[here] / per_px[here, None],
-                    own=np.append(np.arange(count), count + number),
+                    by_global=by_global[here] / per_px[here, None],
+                    by_local=by_local[here] / per_px[here, None],
+                    local_columns=np.append(np.arange(count), count + number),
                     image=self.image + int(number),
                 )
             )
         return found
 
-    def known_lengths(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What calibrated lengths are off (c,), in standard uncertainties, and derivatives (c, k) by the surface's."""
-        return self.surface.known_lengths(own[: len(own) - len(self.stage_mm)])
+        return self.surface.known_lengths(local[: len(local) - len(self.stage_mm)])
 
     def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> "SurfaceScanEvidence":
         """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
@@ -123,13 +123,13 @@ class SurfaceScanEvidence:
             predicted[self.frame == part.image - self.image, self.across] -= np.where(kept, part.values, 0.0)
         return replace(self, predicted=predicted)
 
-    def moved_direction(self, parameters: Parameters, shared: np.ndarray) -> np.ndarray:
+    def moved_direction(self, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
         """The stage's direction (3,), camera frame."""
-        return self._direction(parameters, shared)[0]
+        return self._direction(parameters, global_values)[0]
 
-    def _direction(self, parameters: Parameters, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The stage's direction (3,) and its derivatives (2, 3) by the slopes."""
-        slopes = np.array([parameters.value(shared, key) for key in SLOPES])
+        slopes = np.array([parameters.value(global_values, key) for key in SLOPES])
         return leaning(self.direction, self.across_stage, slopes)
 
 

@@ -17,20 +17,20 @@ class Distances:
         Signed, positive on the side of the normals.
     outward : (3, N)
         Unit normals, the derivatives by the points.
-    by_own : (N, k)
-        Derivatives by the surface's own parameters.
+    by_local : (N, k)
+        Derivatives by the surface's local parameters.
     """
 
     values_mm: np.ndarray
     outward: np.ndarray
-    by_own: np.ndarray
+    by_local: np.ndarray
 
 
 class Surface(ABC):
     """One surface, or several of a kind, all in the camera frame at the stage position 0.
 
-    ``kind`` names what a stripe on it gives; ``own_std`` (k,) is the standard uncertainty of its own parameters before,
-    infinite where nothing is known.
+    ``kind`` names what a stripe on it gives; ``local_std`` (k,) is the standard uncertainty of its local parameters
+    before, infinite where nothing is known.
     """
 
     kind: ClassVar[str]
@@ -41,15 +41,15 @@ class Surface(ABC):
         return 1
 
     @abstractmethod
-    def own_std(self) -> np.ndarray: ...
+    def local_std(self) -> np.ndarray: ...
 
     @abstractmethod
-    def distances(self, points: np.ndarray, own: np.ndarray) -> Distances:
+    def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         """Of points (3, N) of the scan's pixels, in their order."""
 
-    def known_lengths(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What calibrated lengths between its parts are off (c,), in standard uncertainties, and derivatives (c, k)."""
-        return np.empty(0), np.empty((0, len(own)))
+        return np.empty(0), np.empty((0, len(local)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,32 +78,32 @@ class Spheres(Surface):
     def count(self) -> int:
         return len(self.diameters_mm)
 
-    def own_std(self) -> np.ndarray:
+    def local_std(self) -> np.ndarray:
         return np.concatenate([np.full(3 * self.count, np.inf), self.diameter_std_mm])
 
-    def distances(self, points: np.ndarray, own: np.ndarray) -> Distances:
-        away = points - self._centres(own)[self.sphere].T
+    def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
+        away = points - self._centres(local)[self.sphere].T
         distance = np.linalg.norm(away, axis=0)
         outward = away / distance
-        radius = 0.5 * (self.diameters_mm + own[3 * self.count :])[self.sphere]
-        by_own, rows = np.zeros((len(distance), len(own))), np.arange(len(distance))
+        radius = 0.5 * (self.diameters_mm + local[3 * self.count :])[self.sphere]
+        by_local, rows = np.zeros((len(distance), len(local))), np.arange(len(distance))
         for axis in range(3):
-            by_own[rows, 3 * self.sphere + axis] = -outward[axis]
-        by_own[rows, 3 * self.count + self.sphere] = -0.5
-        return Distances(distance - radius, outward, by_own)
+            by_local[rows, 3 * self.sphere + axis] = -outward[axis]
+        by_local[rows, 3 * self.count + self.sphere] = -0.5
+        return Distances(distance - radius, outward, by_local)
 
-    def known_lengths(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        apart = np.diff(self._centres(own), axis=0)
+    def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        apart = np.diff(self._centres(local), axis=0)
         length = np.linalg.norm(apart, axis=1)
-        by_own = np.zeros((len(length), len(own)))
+        by_local = np.zeros((len(length), len(local)))
         for number, unit in enumerate(apart / length[:, None]):
-            by_own[number, 3 * number : 3 * number + 6] = np.concatenate([-unit, unit])
+            by_local[number, 3 * number : 3 * number + 6] = np.concatenate([-unit, unit])
         known = np.isfinite(self.spacing_std_mm)
         std = self.spacing_std_mm[known]
-        return (length - self.spacings_mm)[known] / std, by_own[known] / std[:, None]
+        return (length - self.spacings_mm)[known] / std, by_local[known] / std[:, None]
 
-    def _centres(self, own: np.ndarray) -> np.ndarray:
-        return own[: 3 * self.count].reshape(-1, 3)
+    def _centres(self, local: np.ndarray) -> np.ndarray:
+        return local[: 3 * self.count].reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,14 +124,14 @@ class Plane(Surface):
     normal: np.ndarray
     across: np.ndarray
 
-    def own_std(self) -> np.ndarray:
+    def local_std(self) -> np.ndarray:
         return np.full(3, np.inf)
 
-    def distances(self, points: np.ndarray, own: np.ndarray) -> Distances:
-        normal, by_slopes = leaning(self.normal, self.across, own[:2])
+    def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
+        normal, by_slopes = leaning(self.normal, self.across, local[:2])
         away = points - self.point_mm[:, None]
-        by_own = np.column_stack([(by_slopes @ away).T, np.full(points.shape[1], -1.0)])
-        return Distances(normal @ away - own[2], np.broadcast_to(normal[:, None], points.shape), by_own)
+        by_local = np.column_stack([(by_slopes @ away).T, np.full(points.shape[1], -1.0)])
+        return Distances(normal @ away - local[2], np.broadcast_to(normal[:, None], points.shape), by_local)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,20 +159,20 @@ class Cylinder(Surface):
     diameter_mm: float
     diameter_std_mm: float
 
-    def own_std(self) -> np.ndarray:
+    def local_std(self) -> np.ndarray:
         return np.array([*[np.inf] * 4, self.diameter_std_mm])
 
-    def distances(self, points: np.ndarray, own: np.ndarray) -> Distances:
-        axis, by_slopes = leaning(self.axis, self.across, own[2:4])
-        away = points - (self.point_mm + own[:2] @ self.across)[:, None]
+    def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
+        axis, by_slopes = leaning(self.axis, self.across, local[2:4])
+        away = points - (self.point_mm + local[:2] @ self.across)[:, None]
         along = axis @ away
         radial = away - axis[:, None] * along
         distance = np.linalg.norm(radial, axis=0)
         outward = radial / distance
-        by_own = np.column_stack(
+        by_local = np.column_stack(
             [-(self.across @ outward).T, -(along * (by_slopes @ outward)).T, np.full(len(distance), -0.5)]
         )
-        return Distances(distance - 0.5 * (self.diameter_mm + own[4]), outward, by_own)
+        return Distances(distance - 0.5 * (self.diameter_mm + local[4]), outward, by_local)
 
 
 SCANNED = (Spheres.kind, Plane.kind, Cylinder.kind)

@@ -156,7 +156,7 @@ def points_at(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray
         raise CalibrationError("the calibration's covered volume lies outside the camera's view: calibrate again")
     by = np.stack(
         [
-            known.parameters.by_shared(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
+            known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
             for axis in range(3)
         ],
         axis=1,

@@ -102,7 +102,7 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
     return found
 
 
-def told(found: Sequence[Weakness]) -> list[str]:
+def format_weaknesses(found: Sequence[Weakness]) -> list[str]:
     """Weaknesses as sentences; that there are none is one."""
     if not found:
         return ["nothing that these images leave open changes a length over the volume by more than 0.001 mm"]

@@ -104,6 +104,6 @@ def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
         }
     priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in priors.items()}
     parameters = replace(known, intrinsics=intrinsics, window=window, priors=priors)
-    start = dict(zip(known.keys, problem.shared, strict=True))
-    shared = np.array([start.get(key, 0.0) for key in parameters.keys])
-    return replace(problem, parameters=parameters, shared=shared)
+    start = dict(zip(known.keys, problem.global_values, strict=True))
+    global_values = np.array([start.get(key, 0.0) for key in parameters.keys])
+    return replace(problem, parameters=parameters, global_values=global_values)

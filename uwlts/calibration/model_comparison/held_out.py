@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from uwlts.calibration.joint.circle_centres import centred
 from uwlts.calibration.joint.contradictions import much_left_out
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import stray_limit
+from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.observations import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.procedure import JointProblem
@@ -84,7 +84,7 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
     """The problem without the images held out, and which pieces of its evidence are left."""
     evidence: list[Evidence] = []
     own, numbers = [], []
-    for number, (piece, start) in enumerate(zip(problem.evidence, problem.own, strict=True)):
+    for number, (piece, start) in enumerate(zip(problem.evidence, problem.local, strict=True)):
         if not isinstance(piece, TargetEvidence):
             if (number, piece.image) in held:
                 continue
@@ -98,7 +98,7 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
         evidence.append(piece)
         own.append(start)
         numbers.append(number)
-    return replace(problem, evidence=evidence, own=own), numbers
+    return replace(problem, evidence=evidence, local=own), numbers
 
 
 def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
@@ -133,7 +133,7 @@ class Misses:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Misses in all images held out, and what the model estimated: shared parameters (P,) and covariance (P, P)."""
+    """Misses in all images held out, and what the model estimated: global parameters (P,) and covariance (P, P)."""
 
     misses: list[Misses]
     parameters: Parameters
@@ -173,12 +173,14 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
     if misfits := much_left_out(estimate):
         kind, share = next(iter(misfits.items()))
         raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
-    own = dict(zip(numbers, estimate.own, strict=True))
+    local = dict(zip(numbers, estimate.local, strict=True))
     kept = dict(zip(numbers, training.evidence, strict=True))
     found = []
     for number in sorted({number for number, _ in split.held}):
         piece, images = whole.evidence[number], sorted(image for held, image in split.held if held == number)
-        for evidence, pose, fitted in _posed(whole, estimate, piece, number, images, kept.get(number), own.get(number)):
+        for evidence, pose, fitted in _posed(
+            whole, estimate, piece, number, images, kept.get(number), local.get(number)
+        ):
             parts = _residuals(whole, estimate, evidence, pose, fitted=fitted)
             found += [_misses(number, part) for part in parts if part.image in images]
     return Prediction(found, estimate.parameters, estimate.values, estimate.covariance)
@@ -186,47 +188,47 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
 
 def _posed(
     problem: JointProblem, estimate: Estimate, piece: Evidence, number: int, images: list[int],
-    kept: TargetEvidence | None, own: np.ndarray | None,
+    kept: TargetEvidence | None, local: np.ndarray | None,
 ) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:  # fmt: skip
-    """Evidence held out with its own parameters, and the kinds of residuals to which these are yet to be fitted."""
+    """Evidence held out with its local parameters, and the kinds of residuals to which these are yet to be fitted."""
     if isinstance(piece, StepProfileEvidence):
-        return [(piece, problem.own[number], (STEP,))]
+        return [(piece, problem.local[number], (STEP,))]
     if kept is not None and piece.staged and len(kept.images()):
-        rotation, direction = cv2.Rodrigues(own[:3])[0], piece.placement.direction(own[6:8])
+        rotation, direction = cv2.Rodrigues(local[:3])[0], piece.placement.direction(local[6:8])
         held = of_images(piece, images)
-        shift = own[3:6] - rotation @ direction * np.append(own[8:], 0.0).mean()
-        return [(held, np.concatenate([own[:3], shift, own[6:8], np.zeros(len(held.images()))]), ())]
+        shift = local[3:6] - rotation @ direction * np.append(local[8:], 0.0).mean()
+        return [(held, np.concatenate([local[:3], shift, local[6:8], np.zeros(len(held.images()))]), ())]
     found = []
     for image in images:
-        at = piece.pose(problem.parameters, problem.shared, problem.own[number], image)
+        at = piece.pose(problem.parameters, problem.global_values, problem.local[number], image)
         start = np.concatenate([cv2.Rodrigues(at[:3, :3])[0].ravel(), at[:3, 3]])
         found.append((replace(of_images(piece, [image]), staged=False), start, (TARGET,)))
     return found
 
 
 def _residuals(
-    problem: JointProblem, estimate: Estimate, evidence: Evidence, own: np.ndarray, *, fitted: tuple[str, ...]
+    problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray, *, fitted: tuple[str, ...]
 ) -> list[Residuals]:
-    """Residuals of the evidence with its own parameters, fitted to those of some kinds."""
+    """Residuals of the evidence with its local parameters, fitted to those of some kinds."""
     for _ in range(_ROUNDS):
-        parts = _seen(problem, estimate, evidence, own)
+        parts = _seen(problem, estimate, evidence, local)
         chosen = [part for part in parts if part.kind in fitted]
         if not chosen:
             return parts
-        values, by_own = np.concatenate([p.values for p in chosen]), np.vstack([p.by_own for p in chosen])
-        near = np.abs(values) <= max(stray_limit(values), _SETTLED_PX)
-        step = -np.linalg.lstsq(by_own[near], values[near], rcond=None)[0]
-        own = own + step
-        if np.abs(by_own @ step).max() < _SETTLED_PX:
-            return _seen(problem, estimate, evidence, own)
+        values, by_local = np.concatenate([p.values for p in chosen]), np.vstack([p.by_local for p in chosen])
+        near = np.abs(values) <= max(outlier_limit(values), _SETTLED_PX)
+        step = -np.linalg.lstsq(by_local[near], values[near], rcond=None)[0]
+        local = local + step
+        if np.abs(by_local @ step).max() < _SETTLED_PX:
+            return _seen(problem, estimate, evidence, local)
     raise CalibrationError("the place of what an image shows could not be found by the model")
 
 
-def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, own: np.ndarray) -> list[Residuals]:
+def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray) -> list[Residuals]:
     parameters, values = estimate.parameters, estimate.values
     if problem.diameter_mm is not None:
-        evidence = centred(parameters, problem.diameter_mm, [evidence], values, [own])[0]
-    parts = evidence.residuals(parameters, values, own)
+        evidence = centred(parameters, problem.diameter_mm, [evidence], values, [local])[0]
+    parts = evidence.residuals(parameters, values, local)
     if parts is None:
         raise CalibrationError("by this model a ray that was seen meets no sheet or target")
     return parts
@@ -236,14 +238,14 @@ def _misses(number: int, part: Residuals) -> Misses:
     """Misses of a part: of the target's points the distance, on the object that of the point from its ray.
 
     Moving the target by a vector m moves the residuals r by J m; the shortest m that takes r away is J^T (J J^T)^-1 r.
-    On a step the own parameter 1 is how far the tread moves.
+    On a step the local parameter 1 is how far the tread moves.
     """
     where = (number, part.image)
     if part.kind == TARGET:
-        px, by = part.values.reshape(-1, 2), part.by_own.reshape(len(part.values) // 2, 2, -1)[:, :, 3:6]
+        px, by = part.values.reshape(-1, 2), part.by_local.reshape(len(part.values) // 2, 2, -1)[:, :, 3:6]
         across = by.transpose(0, 2, 1)
         mm = (across @ np.linalg.solve(by @ across, px[:, :, None]))[:, :, 0]
         return Misses(where, part.kind, np.linalg.norm(px, axis=1), np.linalg.norm(mm, axis=1))
-    moved = part.by_own[:, 3:6] if part.by_own.shape[1] > 2 else part.by_own[:, 1:]
+    moved = part.by_local[:, 3:6] if part.by_local.shape[1] > 2 else part.by_local[:, 1:]
     px = np.abs(part.values)
     return Misses(where, part.kind, px, px / np.linalg.norm(moved, axis=1))

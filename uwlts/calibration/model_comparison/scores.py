@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
-from uwlts.calibration.joint.noise import stray_limit
+from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.observations import STRIPE, TARGET
 from uwlts.calibration.joint.start import Series
 from uwlts.calibration.line_polynomials import fit_line_polynomials
@@ -44,7 +44,7 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """Sums over the points of each image held out, for C models and I images; strays do not count.
+    """Sums over the points of each image held out, for C models and I images; outliers do not count.
 
     Attributes
     ----------
@@ -107,7 +107,9 @@ def _used(predictions: Sequence[Prediction]) -> list[np.ndarray]:
     """Which points (n,) of each of the misses count: not those that all models miss by far."""
     limits: dict[str, float] = {}
     for kind in {miss.kind for miss in predictions[0].misses}:
-        limits[kind] = min(stray_limit(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions)
+        limits[kind] = min(
+            outlier_limit(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions
+        )
 
     def near(same: Sequence[Misses]) -> np.ndarray:
         return np.min([miss.px for miss in same], axis=0) <= limits[same[0].kind]
@@ -186,8 +188,8 @@ def polynomial_score(
 
 
 def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Root mean square of the misses in several images, without strays, and its standard error."""
-    limit = stray_limit(np.concatenate(misses))
+    """Root mean square of the misses in several images, without outliers, and its standard error."""
+    limit = outlier_limit(np.concatenate(misses))
     kept = [off[np.abs(off) <= limit] for off in misses]
     squares, counts = np.array([np.sum(off**2) for off in kept]), np.array([len(off) for off in kept])
     return rms_of_images(squares, counts)

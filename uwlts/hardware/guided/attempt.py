@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from uwlts.calibration.camera_poses import CameraSolution
+from uwlts.calibration.guidance.pose_advice import State, Wanted, state_of
 from uwlts.calibration.guidance.quality import (
     QualityLimits,
     StripeQuality,
@@ -18,7 +19,6 @@ from uwlts.calibration.guidance.quality import (
     why_not_found,
 )
 from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual
-from uwlts.calibration.guidance.wishes import State, Wanted, state_of
 from uwlts.errors import CalibrationError, TargetError
 from uwlts.hardware.rig import START_MS, Rig, settled_exposure
 from uwlts.hardware.scan_plan import Light, ScanPlan

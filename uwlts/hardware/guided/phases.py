@@ -5,10 +5,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from uwlts.calibration.guidance.pose_advice import (
+    PoseAdvice,
+    State,
+    best_pose,
+    format_pose_advice,
+    gain_of,
+    missing,
+    missing_sheet,
+)
 from uwlts.calibration.guidance.quality import judge_novelty, way_px
 from uwlts.calibration.guidance.solution import RecordedPose, Setting, pose_of
 from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
-from uwlts.calibration.guidance.wishes import State, Wish, best_wish, gain_of, missing, missing_sheet, wish_words
 from uwlts.calibration.model import Calibration, WindowModel
 from uwlts.capture import Capture, CaptureWriter, Frame
 from uwlts.hardware.guided.attempt import Accepted, Attempt, Attempts, Found, GuidedImages, PoseJudge, Refused
@@ -113,11 +121,11 @@ class TargetPhase:
 
     def _free(self, state: State) -> State:
         watch = _Watch(self._plan.still_s, self._clock)
-        wish: Wish | None = None
+        wish: PoseAdvice | None = None
         refused: list[TargetView] = []
         while still_missing(state) and len(state.recorded) < self._plan.most_images:
             found = self._attempts.look()
-            wish = wish or best_wish(state, spin_rad=_spin(found.usable, state))
+            wish = wish or best_pose(state, spin_rad=_spin(found.usable, state))
             answer = self._operator.answer()
             if answer == "done":
                 break
@@ -139,7 +147,9 @@ class TargetPhase:
     def _next_number(self, state: State) -> int:
         return 1 + max((round(pose.stage_mm / _NUMBER_MM) for pose in state.recorded), default=0)
 
-    def _why_wait(self, found: Found, state: State, wish: Wish | None, known: list[TargetView]) -> tuple[str, ...]:
+    def _why_wait(
+        self, found: Found, state: State, wish: PoseAdvice | None, known: list[TargetView]
+    ) -> tuple[str, ...]:
         """Why the target as it stands need not be taken."""
         view = found.usable
         if view is None:
@@ -150,15 +160,15 @@ class TargetPhase:
         gain = gain_of(state, view, pose_of(view, state.camera))
         return () if gain >= _USEFUL * wish.gain else ("adds little to what there is",)
 
-    def _lead(self, found: Found, state: State, wish: Wish | None, reasons: tuple[str, ...]) -> None:
+    def _lead(self, found: Found, state: State, wish: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
         """Show the image, and say what to do next."""
         pose = None if found.usable is None else pose_of(found.usable, state.camera)
         sheet = missing_sheet(state)
-        request = "move the target" if wish is None else wish_words(wish, state, pose)
+        request = "move the target" if wish is None else format_pose_advice(wish, state, pose)
         if sheet and not missing(state):
             request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
         self._page.request(request if reasons else "hold it still")
-        self._operator.hint(f"next: {request if wish is None or sheet else wish_words(wish, state, None)}")
+        self._operator.hint(f"next: {request if wish is None or sheet else format_pose_advice(wish, state, None)}")
         points = None if found.view is None else found.view.pixels
         self._page.live(
             found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=None,

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from uwlts.calibration.camera_poses import Poses
+from uwlts.calibration.guidance.pose_advice import Wanted
 from uwlts.calibration.guidance.solution import Setting, without_window
-from uwlts.calibration.guidance.wishes import Wanted
 from uwlts.capture import CaptureHeader
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, plan_table

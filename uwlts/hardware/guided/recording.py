@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 
 import uwlts
+from uwlts.calibration.guidance.pose_advice import State
 from uwlts.calibration.guidance.solution import RecordedPose, Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
-from uwlts.calibration.guidance.wishes import State
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially, nominal_window
 from uwlts.capture import Capture, CaptureHeader, CaptureWriter, part_path

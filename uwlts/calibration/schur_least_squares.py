@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for observations in groups: parameters shared by all groups, and some of each group's own."""
+"""Levenberg-Marquardt for observations in groups, with global parameters and local ones of each group."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,38 +9,38 @@ from uwlts.errors import CalibrationError
 
 _ROUNDS = 60
 _SMALLEST_STEP = 1e-11
-# Columns are scaled to length one: a smaller eigenvalue of the shared parameters' normal matrix is rounding.
+# Columns are scaled to length one: a smaller eigenvalue of the global parameters' normal matrix is rounding.
 _SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Residuals (n, c) of one group and their derivatives by shared (c n, k) and own (c n, b) parameters.
+    """Residuals (n, c) of one group and their derivatives by global (c n, k) and local (c n, b) parameters.
 
-    Derivatives by but some of the group's own parameters may be given, the others' being zero: ``own`` tells which.
+    Derivatives by only some of the group's local parameters, ``local_columns``, may be given; the others are zero.
     """
 
     residuals: np.ndarray
-    by_shared: np.ndarray
-    by_own: np.ndarray
-    own: np.ndarray | None = None
+    by_global: np.ndarray
+    by_local: np.ndarray
+    local_columns: np.ndarray | None = None
 
 
 Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observation] | None]
 
 
 @dataclass(frozen=True, eq=False)
-class BorderedFit:
+class SchurFit:
     """Solution of a grouped least-squares problem.
 
     Attributes
     ----------
-    shared : (k,)
-    own : list of (b,)
+    global_values : (k,)
+    local : list of (b,)
     residuals : list of (n, c)
     covariance : (k, k)
-        Of the shared parameters, scaled by the residuals' variance.
-    own_covariances : list of (b, b)
+        Of the global parameters, scaled by the residuals' variance.
+    local_covariances : list of (b, b)
     sigma : float
         Standard deviation of one coordinate of a residual, with the degrees of freedom counted.
     rounds : int
@@ -48,11 +48,11 @@ class BorderedFit:
         Why the iteration ended.
     """
 
-    shared: np.ndarray
-    own: list[np.ndarray]
+    global_values: np.ndarray
+    local: list[np.ndarray]
     residuals: list[np.ndarray]
     covariance: np.ndarray
-    own_covariances: list[np.ndarray]
+    local_covariances: list[np.ndarray]
     sigma: float
     rounds: int
     stopped: str
@@ -64,35 +64,35 @@ class _Normal:
 
     cost: float
     residuals: list[np.ndarray]
-    shared: np.ndarray
+    global_block: np.ndarray
     border: list[np.ndarray]
-    own: list[np.ndarray]
-    shared_gradient: np.ndarray
-    own_gradients: list[np.ndarray]
-    shared_scale: np.ndarray
-    own_scales: list[np.ndarray]
+    local_blocks: list[np.ndarray]
+    global_gradient: np.ndarray
+    local_gradients: list[np.ndarray]
+    global_scale: np.ndarray
+    local_scales: list[np.ndarray]
 
 
-def fit_bordered(
+def schur_least_squares(
     model: Model,
-    shared: np.ndarray,
-    own: Sequence[np.ndarray],
+    global_values: np.ndarray,
+    local: Sequence[np.ndarray],
     *,
     soft_limit: float | None = None,
     smallest_gain: float = 1e-13,
     damping: float = 1e-4,
     enough_rounds: int | None = None,
-) -> BorderedFit:
-    """Least squares over all groups; each step eliminates the groups' own parameters (Schur complement).
+) -> SchurFit:
+    """Least squares over all groups; each step eliminates the groups' local parameters (Schur complement).
 
     Parameters
     ----------
     model : callable
         (group, shared, own of the group) to its `Observation`, or several that make it up, or None where the
         parameters have no meaning.
-    shared : (k,)
+    global_values : (k,)
         Start.
-    own : sequence of (b,)
+    local : sequence of (b,)
         Starts of the groups.
     soft_limit : float, optional
         Residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s; quadratic
@@ -109,43 +109,49 @@ def fit_bordered(
     CalibrationError
         The start has no meaning, the observations do not determine the parameters, or no end within 60 rounds.
     """
-    shared, own = np.array(shared, dtype=np.float64), [np.array(o, dtype=np.float64) for o in own]
-    normal = _assembled(model, shared, own, soft_limit)
+    global_values, local = np.array(global_values, dtype=np.float64), [np.array(o, dtype=np.float64) for o in local]
+    normal = _assembled(model, global_values, local, soft_limit)
     if normal is None:
         raise CalibrationError("the calibration's start puts what was seen behind the camera: check points and poses")
     for rounds in range(1, _ROUNDS + 1):
-        shared_step, own_steps = _step(normal, damping)
-        tried_shared = shared + shared_step
-        tried_own = [value + step for value, step in zip(own, own_steps, strict=True)]
+        global_step, local_steps = _step(normal, damping)
+        tried_global = global_values + global_step
+        tried_local = [value + step for value, step in zip(local, local_steps, strict=True)]
         size = max(
             float(np.max(np.abs(step * scale))) if len(step) else 0.0
-            for step, scale in zip((shared_step, *own_steps), (normal.shared_scale, *normal.own_scales), strict=True)
+            for step, scale in zip(
+                (global_step, *local_steps), (normal.global_scale, *normal.local_scales), strict=True
+            )
         )
         # Scaled steps are in the unit of the residuals, summed over all of them.
         small = size <= _SMALLEST_STEP * np.sqrt(sum(r.size for r in normal.residuals))
-        tried = _assembled(model, tried_shared, tried_own, soft_limit)
+        tried = _assembled(model, tried_global, tried_local, soft_limit)
         if tried is not None and tried.cost <= normal.cost:
             gain = normal.cost - tried.cost
             finished = small or gain <= smallest_gain * normal.cost
-            shared, own, normal, damping = tried_shared, tried_own, tried, max(damping / 10, 1e-12)
+            global_values, local, normal, damping = tried_global, tried_local, tried, max(damping / 10, 1e-12)
             if finished:
-                return _account(shared, own, normal, rounds, "step below rounding" if small else "cost settled")
+                return _solution(
+                    global_values, local, normal, rounds, "step below rounding" if small else "cost settled"
+                )
         elif small or damping > 1e8 or (tried is not None and tried.cost - normal.cost <= smallest_gain * normal.cost):
-            return _account(shared, own, normal, rounds, "no step lowers the cost further")
+            return _solution(global_values, local, normal, rounds, "no step lowers the cost further")
         else:
             damping *= 10
         if rounds == enough_rounds:
-            return _account(shared, own, normal, rounds, "enough rounds")
+            return _solution(global_values, local, normal, rounds, "enough rounds")
     raise CalibrationError(
         f"the camera calibration did not settle in {_ROUNDS} rounds: either the target images do not determine the "
         f"camera (tilt the target, or fix some parameters), or they contradict each other"
     )
 
 
-def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_limit: float | None) -> _Normal | None:
-    count, cost, residuals, products = len(shared), 0.0, [], []
-    for group, values in enumerate(own):
-        found = model(group, shared, values)
+def _assembled(
+    model: Model, global_values: np.ndarray, local: list[np.ndarray], soft_limit: float | None
+) -> _Normal | None:
+    count, cost, residuals, products = len(global_values), 0.0, [], []
+    for group, values in enumerate(local):
+        found = model(group, global_values, values)
         if found is None:
             return None
         parts = [found] if isinstance(found, Observation) else found
@@ -153,7 +159,7 @@ def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_lim
         for part in parts:
             if not np.isfinite(part.residuals).all():
                 return None
-            columns = np.hstack([part.by_shared, part.by_own, part.residuals.reshape(-1, 1)])
+            columns = np.hstack([part.by_global, part.by_local, part.residuals.reshape(-1, 1)])
             squares = np.sum(part.residuals**2, axis=1)
             if soft_limit is None:
                 cost += float(squares.sum())
@@ -161,24 +167,24 @@ def _assembled(model: Model, shared: np.ndarray, own: list[np.ndarray], soft_lim
                 root = np.sqrt(1 + squares / soft_limit**2)
                 cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
                 columns /= np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
-            places = np.arange(len(values)) if part.own is None else part.own
+            places = np.arange(len(values)) if part.local_columns is None else part.local_columns
             at = np.r_[0:count, count + places, count + len(values)]
             product[np.ix_(at, at)] += columns.T @ columns
         residuals.append(np.vstack([part.residuals for part in parts]))
         products.append(product)
-    shared_scale = _lengths(sum((np.diag(product)[:count] for product in products), np.zeros(count)))
+    global_scale = _lengths(sum((np.diag(product)[:count] for product in products), np.zeros(count)))
     matrix, gradient = np.zeros((count, count)), np.zeros(count)
     border, blocks, gradients, scales = [], [], [], []
     for product in products:
         scale = _lengths(np.diag(product)[count:-1])
-        scaled = product / np.outer(both := np.r_[shared_scale, scale, 1.0], both)
+        scaled = product / np.outer(both := np.r_[global_scale, scale, 1.0], both)
         matrix += scaled[:count, :count]
         gradient += scaled[:count, -1]
         border.append(scaled[:count, count:-1])
         blocks.append(scaled[count:-1, count:-1])
         gradients.append(scaled[count:-1, -1])
         scales.append(scale)
-    return _Normal(cost, residuals, matrix, border, blocks, gradient, gradients, shared_scale, scales)
+    return _Normal(cost, residuals, matrix, border, blocks, gradient, gradients, global_scale, scales)
 
 
 def _lengths(squares: np.ndarray) -> np.ndarray:
@@ -187,30 +193,32 @@ def _lengths(squares: np.ndarray) -> np.ndarray:
 
 def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
     """Damped step that lowers the cost; every block is positive definite for positive damping."""
-    reduced = normal.shared + damping * np.eye(len(normal.shared))
-    right = -normal.shared_gradient
-    inverses = [np.linalg.inv(block + damping * np.eye(len(block))) for block in normal.own]
-    for border, inverse, gradient in zip(normal.border, inverses, normal.own_gradients, strict=True):
+    reduced = normal.global_block + damping * np.eye(len(normal.global_block))
+    right = -normal.global_gradient
+    inverses = [np.linalg.inv(block + damping * np.eye(len(block))) for block in normal.local_blocks]
+    for border, inverse, gradient in zip(normal.border, inverses, normal.local_gradients, strict=True):
         reduced = reduced - border @ inverse @ border.T
         right = right + border @ inverse @ gradient
     step = np.linalg.lstsq(reduced, right, rcond=1e-15)[0]
-    own = [
+    local = [
         -inverse @ (gradient + border.T @ step) / scale
         for border, inverse, gradient, scale in zip(
-            normal.border, inverses, normal.own_gradients, normal.own_scales, strict=True
+            normal.border, inverses, normal.local_gradients, normal.local_scales, strict=True
         )
     ]
-    return step / normal.shared_scale, own
+    return step / normal.global_scale, local
 
 
-def _account(shared: np.ndarray, own: list[np.ndarray], normal: _Normal, rounds: int, stopped: str) -> BorderedFit:
+def _solution(
+    global_values: np.ndarray, local: list[np.ndarray], normal: _Normal, rounds: int, stopped: str
+) -> SchurFit:
     undetermined = CalibrationError(
         "the target images do not determine the camera: tilt the target differently between images, cover more of the "
         "image, or fix some parameters (square pixels, principal point, fewer distortion coefficients)"
     )
-    reduced = normal.shared.copy()
+    reduced = normal.global_block.copy()
     inverses = []
-    for border, block in zip(normal.border, normal.own, strict=True):
+    for border, block in zip(normal.border, normal.local_blocks, strict=True):
         if len(block) and np.linalg.eigvalsh(block)[0] < _SINGULAR:
             raise undetermined
         inverses.append(np.linalg.inv(block))
@@ -218,19 +226,19 @@ def _account(shared: np.ndarray, own: list[np.ndarray], normal: _Normal, rounds:
     if np.linalg.eigvalsh(reduced)[0] < _SINGULAR:
         raise undetermined
     count = sum(r.size for r in normal.residuals)
-    freedom = count - len(shared) - sum(map(len, own))
+    freedom = count - len(global_values) - sum(map(len, local))
     sigma = float(np.sqrt(normal.cost / freedom))
     covariance = np.linalg.inv(reduced)
-    own_covariances = []
-    for border, inverse, scale in zip(normal.border, inverses, normal.own_scales, strict=True):
+    local_covariances = []
+    for border, inverse, scale in zip(normal.border, inverses, normal.local_scales, strict=True):
         spread = inverse @ border.T
-        own_covariances.append(sigma**2 * (inverse + spread @ covariance @ spread.T) / np.outer(scale, scale))
-    return BorderedFit(
-        shared=shared,
-        own=own,
+        local_covariances.append(sigma**2 * (inverse + spread @ covariance @ spread.T) / np.outer(scale, scale))
+    return SchurFit(
+        global_values=global_values,
+        local=local,
         residuals=normal.residuals,
-        covariance=sigma**2 * covariance / np.outer(normal.shared_scale, normal.shared_scale),
-        own_covariances=own_covariances,
+        covariance=sigma**2 * covariance / np.outer(normal.global_scale, normal.global_scale),
+        local_covariances=local_covariances,
         sigma=sigma,
         rounds=rounds,
         stopped=stopped,

@@ -117,7 +117,7 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Wish:
+class PoseAdvice:
     """The pose that would help most, by how much, and where the target's middle then lies.
 
     ``gain`` is in the units of `lack`; ``place`` are shares of the image's width and height, ``distance_mm`` runs along
@@ -181,7 +181,7 @@ def _untilted(state: State, poses: Iterable[np.ndarray]) -> np.ndarray:
     return np.maximum(1 - reached / state.wanted.tilt_rad, 0.0)
 
 
-def best_wish(state: State, *, spin_rad: float = 0.0) -> Wish | None:
+def best_pose(state: State, *, spin_rad: float = 0.0) -> PoseAdvice | None:
     """The candidate pose that leaves least missing; None where the target can be found in none."""
     setting = state.setting
     options = candidates(
@@ -200,7 +200,7 @@ def best_wish(state: State, *, spin_rad: float = 0.0) -> Wish | None:
     ]  # fmt: skip
     best = int(np.argmin(after))
     place, distance = middle_of(options[best].pose, state)
-    return Wish(options[best], before - after[best], place, distance)
+    return PoseAdvice(options[best], before - after[best], place, distance)
 
 
 def gain_of(state: State, view: TargetView, pose: np.ndarray) -> float:
@@ -217,21 +217,21 @@ def middle_of(pose: np.ndarray, state: State) -> tuple[tuple[float, float], floa
     return (float(u / state.camera.width_px), float(v / state.camera.height_px)), float(middle[2])
 
 
-def wish_words(wish: Wish, state: State, pose: np.ndarray | None) -> str:
-    """What to do with the target to bring it from its present pose (4, 4), None if unknown, to the wished one."""
+def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None) -> str:
+    """What to do with the target to bring it from its present pose (4, 4), None if unknown, to the advised one."""
     parts = []
-    across, down = tilts_rad(wish.candidate.pose)
-    if pose is None or _angle(pose[:3, 2], wish.candidate.pose[:3, 2]) > _SAME_TILT_RAD:
+    across, down = tilts_rad(advice.candidate.pose)
+    if pose is None or _angle(pose[:3, 2], advice.candidate.pose[:3, 2]) > _SAME_TILT_RAD:
         parts.append(_tilt_words(across, down, pose))
     place, distance = (None, None) if pose is None else middle_of(pose, state)
-    if place is None or not np.linalg.norm(np.subtract(place, wish.place)) <= _SAME_PLACE:
-        there = place_words(*wish.place)
+    if place is None or not np.linalg.norm(np.subtract(place, advice.place)) <= _SAME_PLACE:
+        there = place_words(*advice.place)
         nothing = ": nothing seen there yet" if there == state.coverage.emptiest() else ""
         parts.append(f"bring its middle to the {there} of the image{nothing}")
-    if distance is None or abs(distance / wish.distance_mm - 1) > _SAME_DISTANCE:
-        how = "" if distance is None else "nearer, " if wish.distance_mm < distance else "farther, "
+    if distance is None or abs(distance / advice.distance_mm - 1) > _SAME_DISTANCE:
+        how = "" if distance is None else "nearer, " if advice.distance_mm < distance else "farther, "
         now = "" if distance is None else f" (now {distance:.0f} mm)"
-        parts.append(f"{how}to about {wish.distance_mm:.0f} mm from the camera{now}")
+        parts.append(f"{how}to about {advice.distance_mm:.0f} mm from the camera{now}")
     return "; ".join(parts) or "hold it still, just like this"
 
 

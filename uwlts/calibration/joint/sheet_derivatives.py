@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.joint.rays import RayJets
+from uwlts.calibration.joint.rays import RayDerivatives
 from uwlts.calibration.joint_estimate import NominalSheet
 from uwlts.calibration.model import FanModel, SheetModel
 from uwlts.calibration.parameter_keys import SheetParameter
@@ -104,7 +104,7 @@ class DescribedSheet:
 
 
 @dataclass(frozen=True, eq=False)
-class PointJets:
+class PointDerivatives:
     """Points (3, N) in mm and their derivatives (C, 3, N) by the rays' columns and (6, 3, N) by sheet and index."""
 
     points: np.ndarray
@@ -112,7 +112,9 @@ class PointJets:
     by_sheet: np.ndarray
 
 
-def points_on_sheet(start: DescribedSheet, values: np.ndarray, rays: RayJets, index: float) -> PointJets | None:
+def points_on_sheet(
+    start: DescribedSheet, values: np.ndarray, rays: RayDerivatives, index: float
+) -> PointDerivatives | None:
     """Where rays in a medium meet the sheet; None where one does not."""
     surface = sheet_surface(start.model(values), medium_index=index)
     reach, slope = surface.crossings(rays.origins, rays.directions)
@@ -122,4 +124,4 @@ def points_on_sheet(start: DescribedSheet, values: np.ndarray, rays: RayJets, in
     moved = rays.origins_by + reach * rays.directions_by
     along = -np.einsum("in,cin->cn", surface.gradient(points), moved) / slope
     by_sheet = -start.miss_by(values, points, index) / slope
-    return PointJets(points, moved + along[:, None] * rays.directions, by_sheet[:, None] * rays.directions)
+    return PointDerivatives(points, moved + along[:, None] * rays.directions, by_sheet[:, None] * rays.directions)
