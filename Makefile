@@ -26,7 +26,7 @@ demo: setup
 	@$(PYTHON) -m twin.cli demo
 
 test: check
-	@$(PYTHON) -m twin.hardware.aravis_install
+	@$(PYTHON) -m twin.devices.aravis_install
 	@$(PYTHON) -m pytest -q
 
 check: setup
@@ -44,7 +44,7 @@ docs: setup
 	@echo "documentation: docs/_build/html/index.html"
 
 setup: $(INSTALLED)
-	@$(PYTHON) -m twin.llvm --install
+	@$(PYTHON) -m twin.backend.llvm --install
 
 $(INSTALLED): pyproject.toml
 	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV) && $(create_venv); }

@@ -5,8 +5,8 @@ import signal
 import pytest
 
 from twin.options import use_variant
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
 
 use_variant()
 

@@ -16,9 +16,9 @@ import mitsuba as mi
 import numpy as np
 
 from tests.virtual_sensors import altered, camera_axes, laser_origin
-from twin.finish import finish_bsdf
-from twin.scene import AnyObject, Block, Pipe, Plate, Scene, Sphere
-from uwlts.sensor import Medium, Sensor
+from twin.scene.description import AnyObject, Block, Pipe, Plate, Scene, Sphere
+from twin.scene.finish import finish_bsdf
+from uwlts.model.sensor import Medium, Sensor
 
 MOLECULAR_ANISOTROPY = 0.925
 """k of water's phase function 1 + k cos^2; Mitsuba's Rayleigh scattering has k = 1."""
@@ -34,9 +34,12 @@ def opened_from_its_origin(sensor: Sensor, *, sigma_deg: float, fan_angle_deg: f
     """
     quality = 2 * math.pi * _WAIST_MM * math.radians(sigma_deg) / (1e-6 * sensor.laser.wavelength_nm)
     laser = {
-        "fan_angle_deg": fan_angle_deg, "waist_radius_mm": _WAIST_MM, "waist_distance_mm": 0.01,
-        "beam_quality_m2": quality, "window": {"mounted": False},
-    }  # fmt: skip
+        "fan_angle_deg": fan_angle_deg,
+        "waist_radius_mm": _WAIST_MM,
+        "waist_distance_mm": 0.01,
+        "beam_quality_m2": quality,
+        "window": {"mounted": False},
+    }
     return altered(sensor, {"camera": {"window": {"mounted": False}}, "laser": laser})
 
 
@@ -53,8 +56,10 @@ def stock_scene(
 
     ``pixel_px`` sensor pixels make one film pixel; the sheet's profile is thrown with ``across_texels``.
     """
-    shapes = {f"object_{index}": _shape(thing, pose, sensor, medium)
-              for index, (thing, pose) in enumerate(zip(scene.objects, scene.object_poses(), strict=True))}  # fmt: skip
+    shapes = {
+        f"object_{index}": _shape(thing, pose, sensor, medium)
+        for index, (thing, pose) in enumerate(zip(scene.objects, scene.object_poses(), strict=True))
+    }
     parts = {
         "type": "scene",
         "projector": projector(sensor, across_texels),
@@ -67,9 +72,16 @@ def stock_scene(
 
 
 def stock_irradiance(
-    sensor: Sensor, medium: Medium, scene: Scene, *, integrator: str, max_depth: int, spp: int, runs: int,
+    sensor: Sensor,
+    medium: Medium,
+    scene: Scene,
+    *,
+    integrator: str,
+    max_depth: int,
+    spp: int,
+    runs: int,
     pixel_px: int = 1,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Irradiance (runs, H, W) on the image sensor in W/mm2 from independent runs of a stock integrator.
 
     ``max_depth`` counts as Mitsuba does: 2 is light that met one surface, or was scattered once, between laser and
@@ -117,11 +129,15 @@ def _camera(sensor: Sensor, pixel_px: int) -> dict[str, Any]:
         "far_clip": 1e4,
         "to_world": mi.ScalarTransform4f(object_from_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])),
         "film": {
-            "type": "hdrfilm", "width": camera.width_px // pixel_px, "height": camera.height_px // pixel_px,
-            "rfilter": {"type": "box"}, "pixel_format": "luminance", "component_format": "float32",
+            "type": "hdrfilm",
+            "width": camera.width_px // pixel_px,
+            "height": camera.height_px // pixel_px,
+            "rfilter": {"type": "box"},
+            "pixel_format": "luminance",
+            "component_format": "float32",
         },
         "sampler": {"type": "independent"},
-    }  # fmt: skip
+    }
 
 
 def projector(sensor: Sensor, across_texels: int) -> dict[str, Any]:
@@ -156,10 +172,13 @@ def projector(sensor: Sensor, across_texels: int) -> dict[str, Any]:
         "fov": laser.fan_angle_deg,
         "to_world": mi.ScalarTransform4f(pose),
         "irradiance": {
-            "type": "bitmap", "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp",
+            "type": "bitmap",
+            "raw": True,
+            "filter_type": "bilinear",
+            "wrap_mode": "clamp",
             "bitmap": mi.Bitmap((irradiance / math.pi)[..., None].astype(np.float32)),
         },
-    }  # fmt: skip
+    }
 
 
 def homogeneous(medium: Medium, *, wavelength_nm: float) -> dict[str, Any]:

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from tests.oracles import fermat
 from tests.oracles.fan import Fan
 from tests.oracles.optics import fresnel_transmittance
-from twin.scene import Scene
-from uwlts.library import merged
-from uwlts.sensor import Medium, Sensor, Window
+from twin.scene.description import Scene
+from uwlts.model.library import merged
+from uwlts.model.sensor import Medium, Sensor, Window
 
 _TOWARDS_LASER = {"width": np.array([0.0, -1.0, 0.0]), "height": np.array([1.0, 0.0, 0.0])}
 

@@ -9,18 +9,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from twin.demonstration import demo
-    from twin.recording import Recording, render, simulate
-    from twin.study.sweep import sweep
+    from twin.design.sweep import sweep
+    from twin.recording.demonstration import demo
+    from twin.recording.recording import Recording, render, simulate
 
 __all__ = ["Recording", "demo", "render", "simulate", "sweep"]
 
 _MODULES = {
-    "Recording": "twin.recording",
-    "demo": "twin.demonstration",
-    "render": "twin.recording",
-    "simulate": "twin.recording",
-    "sweep": "twin.study.sweep",
+    "Recording": "twin.recording.recording",
+    "demo": "twin.recording.demonstration",
+    "render": "twin.recording.recording",
+    "simulate": "twin.recording.recording",
+    "sweep": "twin.design.sweep",
 }
 
 

@@ -8,17 +8,17 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 import uwlts
-from twin.campaign import campaign_names, load_campaign
-from twin.demonstration import FOLDER as DEMO_FOLDER
-from twin.demonstration import demo as run_demo
 from twin.options import CPU, use_variant
-from twin.recording import choose_options, choose_scene, choose_sensors
-from twin.recording import simulate as render_to_file
-from twin.scene import load_scene, scene_names
-from uwlts.console import progress_bar, run
-from uwlts.errors import DescriptionError
-from uwlts.library import names
-from uwlts.waters import WATERS
+from twin.recording.demonstration import FOLDER as DEMO_FOLDER
+from twin.recording.demonstration import demo as run_demo
+from twin.recording.recording import choose_options, choose_scene, choose_sensors
+from twin.recording.recording import simulate as render_to_file
+from twin.scene.campaign import campaign_names, load_campaign
+from twin.scene.description import load_scene, scene_names
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import names
+from uwlts.model.waters import WATERS
+from uwlts.runtime.console import progress_bar, run
 
 app = App(
     name="twin",
@@ -171,15 +171,21 @@ def serve(
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
     _, built = choose_sensors(sensor, as_built)
     use_variant(variant)
-    from twin.hardware.bench import parse_fault
-    from twin.hardware.serve import serve as serve_twin
-    from twin.hardware.serve import wait_for_end
+    from twin.devices.bench import parse_fault
+    from twin.devices.serve import serve as serve_twin
+    from twin.devices.serve import wait_for_end
 
     faults = [parse_fault(text) for text in fault]
     with serve_twin(
-        description, built, options=options, stage_start_mm=stage_start, lamp=lamp, faults=faults,
-        speed_up=speed_up, report=lambda line: print(line, flush=True),
-    ) as served:  # fmt: skip
+        description,
+        built,
+        options=options,
+        stage_start_mm=stage_start,
+        lamp=lamp,
+        faults=faults,
+        speed_up=speed_up,
+        report=lambda line: print(line, flush=True),
+    ) as served:
         print("\n".join([*served.lines(), "serving; Ctrl-C ends it"]), flush=True)
         wait_for_end(served)
     print(f"ended after {served.rates()}")
@@ -233,7 +239,7 @@ def reproduce(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    from twin.reproduce import record_campaigns
+    from twin.recording.reproduce import record_campaigns
 
     for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
         if value < 1:
@@ -247,9 +253,16 @@ def reproduce(
     folder = out or Path("runs") / Path(campaign).stem
     with progress_bar(f"rendering {description.title}") as progress:
         record_campaigns(
-            description, folder, seeds=range(first, first + campaigns), every=every, spp=spp, variant=variant,
-            workers=workers, overwrite=overwrite, progress=progress,
-        )  # fmt: skip
+            description,
+            folder,
+            seeds=range(first, first + campaigns),
+            every=every,
+            spp=spp,
+            variant=variant,
+            workers=workers,
+            overwrite=overwrite,
+            progress=progress,
+        )
     # The sensor's software is a program of its own, which knows nothing of the twin.
     command = [sys.executable, "-m", "uwlts.cli", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
     command += ["--joint"] if joint else []
@@ -297,15 +310,20 @@ def sweep(
     variant
         Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    from twin.study.description import load_study
-    from twin.study.sweep import sweep as run_sweep
+    from twin.design.description import load_study
+    from twin.design.sweep import sweep as run_sweep
 
     described = load_study(study, designs=designs, verify=verify)
     with progress_bar(described.title) as progress:
         result = run_sweep(
-            described, out=out or Path("runs") / Path(study).stem, workers=workers, scheduler=scheduler,
-            overwrite=overwrite, variant=variant, progress=lambda what, done, total: progress(done, total),
-        )  # fmt: skip
+            described,
+            out=out or Path("runs") / Path(study).stem,
+            workers=workers,
+            scheduler=scheduler,
+            overwrite=overwrite,
+            variant=variant,
+            progress=lambda what, done, total: progress(done, total),
+        )
     print("\n".join(result.lines()))
     print(f"wrote {result.paths.page}, designs.csv, summary.json and winner.toml")
 

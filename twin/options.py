@@ -6,8 +6,8 @@ are imported.
 
 from dataclasses import dataclass, fields, replace
 
-from twin.llvm import prepare_llvm
-from uwlts.errors import DescriptionError, SetupError
+from twin.backend.llvm import prepare_llvm
+from uwlts.model.errors import DescriptionError, SetupError
 
 CPU = "llvm_ad_mono"
 GPU = "cuda_ad_mono"

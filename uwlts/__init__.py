@@ -7,13 +7,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from uwlts.capture import Capture, Frame, open_capture
-    from uwlts.cloud import PointCloud, read_cloud
-    from uwlts.evaluation import Evaluation, evaluate
-    from uwlts.library import load_sensor
-    from uwlts.scan import reconstruct
-    from uwlts.sensor import Sensor
-    from uwlts.verification import Verification, verify
+    from uwlts.measurement.evaluation import Evaluation, evaluate
+    from uwlts.measurement.reconstruction import reconstruct
+    from uwlts.measurement.verification import Verification, verify
+    from uwlts.model.library import load_sensor
+    from uwlts.model.sensor import Sensor
+    from uwlts.storage.capture import Capture, Frame, open_capture
+    from uwlts.storage.cloud import PointCloud, read_cloud
 
 __version__ = "0.1.0"
 
@@ -33,18 +33,18 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Evaluation": "uwlts.evaluation",
-    "PointCloud": "uwlts.cloud",
-    "Verification": "uwlts.verification",
-    "evaluate": "uwlts.evaluation",
-    "read_cloud": "uwlts.cloud",
-    "reconstruct": "uwlts.scan",
-    "verify": "uwlts.verification",
-    "Capture": "uwlts.capture",
-    "Frame": "uwlts.capture",
-    "Sensor": "uwlts.sensor",
-    "load_sensor": "uwlts.library",
-    "open_capture": "uwlts.capture",
+    "Evaluation": "uwlts.measurement.evaluation",
+    "PointCloud": "uwlts.storage.cloud",
+    "Verification": "uwlts.measurement.verification",
+    "evaluate": "uwlts.measurement.evaluation",
+    "read_cloud": "uwlts.storage.cloud",
+    "reconstruct": "uwlts.measurement.reconstruction",
+    "verify": "uwlts.measurement.verification",
+    "Capture": "uwlts.storage.capture",
+    "Frame": "uwlts.storage.capture",
+    "Sensor": "uwlts.model.sensor",
+    "load_sensor": "uwlts.model.library",
+    "open_capture": "uwlts.storage.capture",
 }
 
 

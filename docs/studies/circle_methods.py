@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 from stripe_tables import table
 
 from twin.options import Options
-from twin.scene import CirclePlate, load_scene
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from twin.scene.description import CirclePlate, load_scene
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
 from uwlts.targets.detection import find_circles
 
 STAGE_MM = {"near": 85.0, "middle": -20.0, "far": -130.0}
@@ -22,7 +22,7 @@ RIM_POINTS, NEAREST_PX = 720, 3.0
 
 def circles_table() -> str:
     """Errors of the centres by place and method, px."""
-    from twin.studio import Studio
+    from twin.recording.studio import Studio
 
     sensor, rows = load_sensor("thesis"), []
     for name, stage in STAGE_MM.items():
@@ -40,10 +40,18 @@ def circles_table() -> str:
             bias, std = error[both].mean(axis=0), error[both].std(axis=0)
             largest = np.linalg.norm(error[both], axis=1).max()
             rms = math.sqrt((error[both] ** 2).sum(axis=1).mean())
-            rows.append([
-                name, method, f"{found} of {len(truth)}", f"{bias[0]:+.3f}, {bias[1]:+.3f}",
-                f"{std[0]:.3f}, {std[1]:.3f}", f"{rms:.3f}", f"{largest:.3f}", f"{apart[both].mean():.3f}",
-            ])  # fmt: skip
+            rows.append(
+                [
+                    name,
+                    method,
+                    f"{found} of {len(truth)}",
+                    f"{bias[0]:+.3f}, {bias[1]:+.3f}",
+                    f"{std[0]:.3f}, {std[1]:.3f}",
+                    f"{rms:.3f}",
+                    f"{largest:.3f}",
+                    f"{apart[both].mean():.3f}",
+                ]
+            )
     head = ["target", "method", "circles found", "bias px (u, v)", "std px (u, v)", "rms px", "largest px"]
     return table([*head, "image of the centre to centre of the image px"], rows)
 

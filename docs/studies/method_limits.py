@@ -6,7 +6,7 @@ import numpy as np
 from method_shots import Rendered
 from scipy.interpolate import CubicSpline
 
-from twin.speckle import pixel_contrast
+from twin.sensor.speckle import pixel_contrast
 
 WINDOW_PX = 16
 """Pixels on either side of the true centre that a method may use, as `StripeOptions.half_window_px`."""

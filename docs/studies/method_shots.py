@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from stripe_cases import FACING, PLATE, Case, step_per_px
 
-from twin.detector import electrons_per_ms, fixed_pattern, grey_values
+from twin.light.renderer import LaserFrame
 from twin.options import ALL, Options
-from twin.renderer import LaserFrame
-from twin.scene import Scene, load_scene
-from twin.speckle import Speckle, coherence
-from uwlts.sensor import Sensor
+from twin.scene.description import Scene, load_scene
+from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
+from twin.sensor.speckle import Speckle, coherence
+from uwlts.model.sensor import Sensor
 
 FINE_SPP = 256
 """Samples of the stripe itself: with 16, the few places in the pupil shift a blurred stripe by up to 0.2 px."""
@@ -54,19 +54,23 @@ class Rendered:
         """Mean electrons (H, W), with the speckle pattern of a number; ``level`` scales the automatic exposure."""
         factors = 1.0 if speckle is None else self._grain(speckle)
         light = electrons_per_ms(
-            self.frame.irradiance(factors), self.sensor.camera, self.sensor.detector,
+            self.frame.irradiance(factors),
+            self.sensor.camera,
+            self.sensor.detector,
             wavelength_nm=self.sensor.laser.wavelength_nm,
-        )  # fmt: skip
+        )
         return light * np.float32(level * self.exposure_ms)
 
     def image(self, number: int, *, level: float = 1.0, speckle: bool = True) -> np.ndarray:
         """Grey values (H, W) of a photograph with its own noise and, if wanted, speckle."""
         camera, detector = self.sensor.camera, self.sensor.detector
         return grey_values(
-            self.electrons(level=level, speckle=number if speckle else None), detector,
-            exposure_ms=level * self.exposure_ms, rng=np.random.default_rng(number),
+            self.electrons(level=level, speckle=number if speckle else None),
+            detector,
+            exposure_ms=level * self.exposure_ms,
+            rng=np.random.default_rng(number),
             pattern=fixed_pattern(detector, height=camera.height_px, width=camera.width_px),
-        )  # fmt: skip
+        )
 
     def contrast(self) -> np.ndarray:
         """Contrast (P,) of the speckle of the stripe's pixels before it is averaged over their areas."""
@@ -75,24 +79,29 @@ class Rendered:
     def _coherence(self) -> np.ndarray:
         laser = self.sensor.laser
         return coherence(
-            self.frame.roughness_um, linewidth_nm=laser.linewidth_nm, wavelength_nm=laser.wavelength_nm,
+            self.frame.roughness_um,
+            linewidth_nm=laser.linewidth_nm,
+            wavelength_nm=laser.wavelength_nm,
             index=self.index,
-        )  # fmt: skip
+        )
 
     def _grain(self, number: int) -> np.ndarray:
         frame = self.frame
         speckle = Speckle(self.sensor.camera, wavelength_nm=self.sensor.laser.wavelength_nm, seed=1)
         return speckle.factors(
-            frame.rows, frame.columns, travel_mm=number * APART * speckle.renewal_mm,
-            polarisation=frame.polarisation, coherence=self._coherence(),
-        )  # fmt: skip
+            frame.rows,
+            frame.columns,
+            travel_mm=number * APART * speckle.renewal_mm,
+            polarisation=frame.polarisation,
+            coherence=self._coherence(),
+        )
 
 
 @cache
 def render(place: Place) -> Rendered:
     """The place's light: the stripe with many samples, the light around it with all effects of the place."""
-    from twin.studio import Studio
-    from twin.truth import true_stripe
+    from twin.recording.studio import Studio
+    from twin.recording.truth import true_stripe
 
     scene, sensor = place.scene(), place.sensor()
     still = place.effects.without("noise", "speckle")
@@ -109,10 +118,13 @@ def render(place: Place) -> Rendered:
     used = np.isfinite(truth.centre_px) & (-truth.normal[:, 2] >= FACING)
     step = step_per_px(place, truth.point_mm[None, :, 2])[0]
     return Rendered(
-        sensor=sensor, index=whole.medium.refractive_index(sensor.laser.wavelength_nm),
-        frame=replace(frame, scattered=around), truth_px=np.where(used, truth.centre_px, np.nan),
-        mm_per_px=(step * truth.normal).sum(axis=-1), exposure_ms=whole.exposure_ms["laser"],
-    )  # fmt: skip
+        sensor=sensor,
+        index=whole.medium.refractive_index(sensor.laser.wavelength_nm),
+        frame=replace(frame, scattered=around),
+        truth_px=np.where(used, truth.centre_px, np.nan),
+        mm_per_px=(step * truth.normal).sum(axis=-1),
+        exposure_ms=whole.exposure_ms["laser"],
+    )
 
 
 def _fixed(sensor: Sensor):
@@ -139,15 +151,21 @@ def places() -> dict[str, Place]:
 def sweeps() -> dict[str, Place]:
     """One thing changed on the plane."""
     turned = {
-        f"turned {angle:+.0f}\N{DEGREE SIGN} about {'XY'[axis]}, {name}":
-            Place(z_mm=PLACES[name], spp=8, turned_deg=(angle, 0.0) if axis == 0 else (0.0, angle))
-        for axis in (0, 1) for name in (("near", "far") if axis == 0 else ("stand-off",)) for angle in (-30.0, 30.0)
-    }  # fmt: skip
+        f"turned {angle:+.0f}\N{DEGREE SIGN} about {'XY'[axis]}, {name}": Place(
+            z_mm=PLACES[name], spp=8, turned_deg=(angle, 0.0) if axis == 0 else (0.0, angle)
+        )
+        for axis in (0, 1)
+        for name in (("near", "far") if axis == 0 else ("stand-off",))
+        for angle in (-30.0, 30.0)
+    }
     optics = {
-        f"waist {waist:g} mm, f/{number:g}, {name}":
-            Place(z_mm=PLACES[name], spp=8, laser=(("waist_radius_mm", waist),), camera=(("f_number", number),))
-        for waist in (0.15, 0.6) for number in (2.8, 11.0) for name in ("near", "far")
-    }  # fmt: skip
+        f"waist {waist:g} mm, f/{number:g}, {name}": Place(
+            z_mm=PLACES[name], spp=8, laser=(("waist_radius_mm", waist),), camera=(("f_number", number),)
+        )
+        for waist in (0.15, 0.6)
+        for number in (2.8, 11.0)
+        for name in ("near", "far")
+    }
     water = {
         f"turbidity {turbidity:g}, stand-off": Place(water=turbidity, spp=8 if turbidity < 2 else 32)
         for turbidity in (0.0, 1.0, 2.0, 3.0)
@@ -182,9 +200,13 @@ class Spread:
         five = error[:, :count].reshape(len(error), -1, 5).mean(axis=2)
         seen = np.isfinite(error_px)
         return cls(
-            float(np.nanmean(error)), float(np.nanstd(error)), float(np.nanstd(five)),
-            float(np.nanstd(error * mm_per_px)), float(seen[:, used].mean()), float((seen & ~near).sum() / seen.sum()),
-        )  # fmt: skip
+            float(np.nanmean(error)),
+            float(np.nanstd(error)),
+            float(np.nanstd(five)),
+            float(np.nanstd(error * mm_per_px)),
+            float(seen[:, used].mean()),
+            float((seen & ~near).sum() / seen.sum()),
+        )
 
 
 def round_to_zero(value: float) -> float:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from twin.options import ALL, NONE, Effects, Options
-from twin.scene import Scene, load_scene
-from uwlts.library import load_sensor
-from uwlts.metrology.robust_fit import MAD_TO_STD
-from uwlts.sensor import Sensor
+from twin.scene.description import Scene, load_scene
+from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
 from uwlts.stripe import StripeOptions, extract_stripe
 
 CROSSING, MASS, FILTERED = "zero crossing", "centre of mass", "5x5 mean, quadratic"
@@ -139,8 +139,8 @@ class Spread:
 def measure(case: Case) -> Frames:
     """Render the case's frames, find the stripe in them, and compare with the truth."""
     # Mitsuba looks for its variant when it is imported.
-    from twin.studio import Studio
-    from twin.truth import true_stripe
+    from twin.recording.studio import Studio
+    from twin.recording.truth import true_stripe
 
     sensor, scene = case.sensor(), case.scene()
     studio = Studio(sensor, scene, Options(spp=case.spp, effects=case.effects))
@@ -168,10 +168,15 @@ def measure(case: Case) -> Frames:
     return Frames(
         error_px={name: np.stack([found[name] for found in centres]) - truth_px for name in centres[0]},
         mm_per_px=(step * normal).sum(axis=-1),
-        step_mm=step, point_mm=point, used=used, truth_px=truth_px,
+        step_mm=step,
+        point_mm=point,
+        used=used,
+        truth_px=truth_px,
         width_px=float(np.nanmedian(np.where(used, widths, np.nan))),
-        exposure_ms=studio.exposure_ms["laser"], crop=crop, crop_at=corner,
-    )  # fmt: skip
+        exposure_ms=studio.exposure_ms["laser"],
+        crop=crop,
+        crop_at=corner,
+    )
 
 
 def _vertex(image: np.ndarray) -> np.ndarray:
@@ -193,8 +198,8 @@ def step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
 @cache
 def _scale(medium: str) -> tuple[np.ndarray, np.ndarray]:
     """Polynomials (degree + 1, L) in Z of every line's row and Y, from the truth of plates all over the volume."""
-    from twin.studio import Studio
-    from twin.truth import true_stripe
+    from twin.recording.studio import Studio
+    from twin.recording.truth import true_stripe
 
     studio = Studio(load_sensor("thesis"), Case(medium=medium).scene(), Options(effects=NONE))
     rows, places = [], []

@@ -14,8 +14,8 @@ from stripe_plan import NAME_CORE, PLACES, Plan
 from stripe_tables import table, write_tables
 
 from twin.options import use_variant
-from uwlts.console import progress_bar
 from uwlts.report.numbers import fixed
+from uwlts.runtime.console import progress_bar
 
 PAGE = Path(__file__).parents[1] / "explanation" / "stripe-errors.md"
 SHOWN = (CROSSING, MASS, "quadratic", FILTERED, VERTEX)
@@ -37,8 +37,9 @@ def effects_table(plan: Plan) -> str:
 def methods_table(plan: Plan) -> str:
     """Spread in mm by method of extraction, with noise, speckle and defocus."""
     cases = {(thing, place): plan.effects(thing)[NAME_CORE, place] for thing in PLACES for place in PLACES[thing]}
-    rows = [[name, *(f"{_spread(measure(case), name, thing):.3f}" for (thing, _), case in cases.items())]
-            for name in SHOWN]  # fmt: skip
+    rows = [
+        [name, *(f"{_spread(measure(case), name, thing):.3f}" for (thing, _), case in cases.items())] for name in SHOWN
+    ]
     return table(["method", *(f"{thing}, {place}" for thing, place in cases)], rows)
 
 

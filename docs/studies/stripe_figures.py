@@ -7,21 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from stripe_cases import CROP_PX, CROSSING, MASS, Frames, measure
-from stripe_plan import (
-    DEPTHS,
-    F_NUMBERS,
-    LEVELS,
-    NAME_ALL,
-    NAME_CORE,
-    PLACES,
-    THESIS_STD,
-    TURBIDITIES,
-    Plan,
-)
+from stripe_plan import DEPTHS, F_NUMBERS, LEVELS, NAME_ALL, NAME_CORE, PLACES, THESIS_STD, TURBIDITIES, Plan
 
-from twin.speckle import pixel_contrast
-from uwlts.library import load_sensor
-from uwlts.placement import camera_from_object, check_design
+from twin.sensor.speckle import pixel_contrast
+from uwlts.model.library import load_sensor
+from uwlts.model.placement import camera_from_object, check_design
 from uwlts.report.canvas import ORANGE, blank, dot, line, write
 from uwlts.report.svg_plot import COLOURS, Band, Curve, Panel, draw
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
@@ -81,10 +71,17 @@ def _depth(plan: Plan, path: Path) -> None:
         if unit == "mm":
             std = [value for thing in PLACES for pair in THESIS_STD[thing, "water"].values() for value in pair[1:]]
             bands = [Band("thesis's STD in water, proposed method", min(std), max(std))]
-        panels.append(Panel(
-            f"Spread of the centre, in {unit}", "distance from the window / mm", f"standard deviation / {unit}",
-            curves, bands, log_y=True, y_range=(low / 4, 1.0 if unit == "px" else 0.3),
-        ))  # fmt: skip
+        panels.append(
+            Panel(
+                f"Spread of the centre, in {unit}",
+                "distance from the window / mm",
+                f"standard deviation / {unit}",
+                curves,
+                bands,
+                log_y=True,
+                y_range=(low / 4, 1.0 if unit == "px" else 0.3),
+            )
+        )
     draw(path, panels)
 
 
@@ -111,10 +108,13 @@ def _f_number(plan: Plan, path: Path) -> None:
         mass = [f.spread(MASS).std_mm for f in frames]
         right.append(Curve(f"{place}, centre of mass", F_NUMBERS, mass, colour, dashed=True))
     shared = {"x_label": "f-number", "log_x": True, "x_ticks": F_NUMBERS}
-    draw(path, [
-        Panel("Stand-off, in px", y_label="standard deviation / px", curves=left, **shared),
-        Panel("In mm", y_label="standard deviation / mm", curves=right, **shared),
-    ])  # fmt: skip
+    draw(
+        path,
+        [
+            Panel("Stand-off, in px", y_label="standard deviation / px", curves=left, **shared),
+            Panel("In mm", y_label="standard deviation / mm", curves=right, **shared),
+        ],
+    )
 
 
 def _turbidity(plan: Plan, path: Path) -> None:
@@ -124,12 +124,24 @@ def _turbidity(plan: Plan, path: Path) -> None:
     frames = {name: [measure(cases[name, water]) for water in TURBIDITIES] for name in names}
     shared = {"x_label": "turbidity: 0 pure, 1 clear, 2 coastal, 3 harbour"}
     scatter = [name for name in names if name not in (NAME_ALL, "all but scatter")]
-    draw(path, [
-        Panel("Bias, no other effect", y_label="median / px", y_range=(-0.02, 0.02), **shared,
-              curves=[_curve(name, TURBIDITIES, frames[name], "bias_px", hues[name]) for name in scatter]),
-        Panel("Spread", y_label="standard deviation / px", **shared,
-              curves=[_curve(name, TURBIDITIES, frames[name], "std_px", hues[name]) for name in names]),
-    ])  # fmt: skip
+    draw(
+        path,
+        [
+            Panel(
+                "Bias, no other effect",
+                y_label="median / px",
+                y_range=(-0.02, 0.02),
+                **shared,
+                curves=[_curve(name, TURBIDITIES, frames[name], "bias_px", hues[name]) for name in scatter],
+            ),
+            Panel(
+                "Spread",
+                y_label="standard deviation / px",
+                **shared,
+                curves=[_curve(name, TURBIDITIES, frames[name], "std_px", hues[name]) for name in names],
+            ),
+        ],
+    )
 
 
 def _gloss(plan: Plan, path: Path) -> None:
@@ -151,12 +163,25 @@ def _exposure(plan: Plan, path: Path) -> None:
     cases = plan.exposure()
     frames = {name: [measure(cases[name, level]) for level in LEVELS] for name in ("only noise", NAME_CORE)}
     shared = {"x_label": "brightest light / full well", "log_x": True, "x_ticks": LEVELS}
-    draw(path, [
-        Panel("Bias", y_label="median / px", y_range=(-0.03, 0.03), **shared,
-              curves=[_curve(name, LEVELS, each, "bias_px", _HUES[name]) for name, each in frames.items()]),
-        Panel("Spread", y_label="standard deviation / px", log_y=True, **shared,
-              curves=[_curve(name, LEVELS, each, "std_px", _HUES[name]) for name, each in frames.items()]),
-    ])  # fmt: skip
+    draw(
+        path,
+        [
+            Panel(
+                "Bias",
+                y_label="median / px",
+                y_range=(-0.03, 0.03),
+                **shared,
+                curves=[_curve(name, LEVELS, each, "bias_px", _HUES[name]) for name, each in frames.items()],
+            ),
+            Panel(
+                "Spread",
+                y_label="standard deviation / px",
+                log_y=True,
+                **shared,
+                curves=[_curve(name, LEVELS, each, "std_px", _HUES[name]) for name, each in frames.items()],
+            ),
+        ],
+    )
 
 
 def _strips(plan: Plan, path: Path) -> None:

@@ -19,7 +19,7 @@ from stripe_cases import FILTERED, MASS, METHODS
 from stripe_tables import table, write_tables
 
 from twin.options import use_variant
-from uwlts.console import progress_bar
+from uwlts.runtime.console import progress_bar
 from uwlts.stripe import StripeOptions, extract_stripe, method_names
 
 PAGE = Path(__file__).parents[1] / "explanation" / "stripe-methods.md"
@@ -37,8 +37,10 @@ TIMED = 40
 def spread(place: Place, method: str, frames: int, level: float = 1.0, speckle: bool = True) -> Spread:
     """Errors of one method over photographs of a place."""
     shot, options = render(place), ALL_METHODS[method]
-    found = [extract_stripe(shot_image(place, n, level, speckle), stripe_along="width", options=options).centre_px
-             for n in range(frames)]  # fmt: skip
+    found = [
+        extract_stripe(shot_image(place, n, level, speckle), stripe_along="width", options=options).centre_px
+        for n in range(frames)
+    ]
     return Spread.of(np.stack(found) - shot.truth_px, shot.mm_per_px, np.isfinite(shot.truth_px))
 
 
@@ -51,8 +53,9 @@ def shot_image(place: Place, number: int, level: float, speckle: bool) -> np.nda
 def spread_table(frames: int) -> str:
     """Standard deviation in mm by method and place, with all effects."""
     head = ["std in mm", *places()]
-    return table(head, [[name, *(f"{spread(p, name, frames).std_mm:.4f}" for p in places().values())]
-                        for name in ALL_METHODS])  # fmt: skip
+    return table(
+        head, [[name, *(f"{spread(p, name, frames).std_mm:.4f}" for p in places().values())] for name in ALL_METHODS]
+    )
 
 
 def bias_table(frames: int) -> str:
@@ -159,10 +162,15 @@ def main() -> None:
             render(place)
             progress(number, len(wanted))
     tables = {
-        "spread": spread_table(frames), "bias": bias_table(frames), "limits": limits_table(frames),
-        "sweeps": sweep_table(frames), "exposure": exposure_table(frames), "lateral": lateral_table(frames),
-        "time": time_table(), "circles": circles_table(),
-    }  # fmt: skip
+        "spread": spread_table(frames),
+        "bias": bias_table(frames),
+        "limits": limits_table(frames),
+        "sweeps": sweep_table(frames),
+        "exposure": exposure_table(frames),
+        "lateral": lateral_table(frames),
+        "time": time_table(),
+        "circles": circles_table(),
+    }
     write_tables(PAGE, tables)
     print(f"{len(wanted)} places, {frames} photographs each, in {time.perf_counter() - start:.0f} s")
 

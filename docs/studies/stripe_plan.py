@@ -3,7 +3,7 @@
 from stripe_cases import Case
 
 from twin.options import ALL, NONE, Effects
-from uwlts.library import load_sensor
+from uwlts.model.library import load_sensor
 
 PLACES = {
     "plane": {"near": -60.0, "stand-off": 0.0, "far": 90.0},
@@ -38,9 +38,12 @@ def exactly(*names: str) -> Effects:
 
 NAME_ALL, NAME_CORE = "all", "noise + speckle + defocus"
 ROWS = {
-    "none": NONE, **{f"only {group}": exactly(*names) for group, names in GROUPS.items()}, NAME_CORE: exactly(*CORE),
-    NAME_ALL: ALL, **{f"all but {group}": ALL.without(*names) for group, names in GROUPS.items()},
-}  # fmt: skip
+    "none": NONE,
+    **{f"only {group}": exactly(*names) for group, names in GROUPS.items()},
+    NAME_CORE: exactly(*CORE),
+    NAME_ALL: ALL,
+    **{f"all but {group}": ALL.without(*names) for group, names in GROUPS.items()},
+}
 
 
 class Plan:
@@ -58,8 +61,9 @@ class Plan:
         rows = {name: effects for name, effects in ROWS.items() if thing == "plane" or not name.startswith("all but")}
         return {
             (name, place): self.case(effects, thing=thing, z_mm=z)
-            for name, effects in rows.items() for place, z in PLACES[thing].items()
-        }  # fmt: skip
+            for name, effects in rows.items()
+            for place, z in PLACES[thing].items()
+        }
 
     def depth(self) -> dict[tuple[str, float], Case]:
         rows = ("only noise", "only speckle", "only defocus", NAME_CORE)
@@ -70,32 +74,37 @@ class Plan:
         wanted = [(NAME_CORE, place) for place in PLACES["plane"]]
         wanted += [("only speckle", "stand-off"), ("only defocus", "near")]
         return {
-            (name, place, number): self.case(
-                ROWS[name], z_mm=PLACES["plane"][place], camera=(("f_number", number),)
-            )
-            for name, place in wanted for number in F_NUMBERS
-        }  # fmt: skip
+            (name, place, number): self.case(ROWS[name], z_mm=PLACES["plane"][place], camera=(("f_number", number),))
+            for name, place in wanted
+            for number in F_NUMBERS
+        }
 
     def turbidity(self) -> dict[tuple[str, float], Case]:
         """Few frames and samples, for random walks take long in turbid water."""
         rows = {
-            "scattered once": exactly("haze"), "scattered once or more often": ROWS["only scatter"], NAME_ALL: ALL,
+            "scattered once": exactly("haze"),
+            "scattered once or more often": ROWS["only scatter"],
+            NAME_ALL: ALL,
             "all but scatter": ROWS["all but scatter"],
-        }  # fmt: skip
+        }
         return {
             (name, water): self.case(effects, water=water, frames=2, spp=16)
-            for name, effects in rows.items() for water in TURBIDITIES
-        }  # fmt: skip
+            for name, effects in rows.items()
+            for water in TURBIDITIES
+        }
 
     def gloss(self) -> dict[tuple[str, str], Case]:
         rows = {
-            "diffuse": NONE, "glossy": exactly("gloss"), "diffuse, light between surfaces": exactly("secondary-light"),
+            "diffuse": NONE,
+            "glossy": exactly("gloss"),
+            "diffuse, light between surfaces": exactly("secondary-light"),
             "glossy, light between surfaces": ROWS["only gloss and light between surfaces"],
-        }  # fmt: skip
+        }
         return {
             (thing, name): self.case(effects, thing=thing, frames=3)
-            for thing in ("step", "pipe") for name, effects in rows.items()
-        }  # fmt: skip
+            for thing in ("step", "pipe")
+            for name, effects in rows.items()
+        }
 
     def exposure(self) -> dict[tuple[str, float], Case]:
         return {
@@ -110,17 +119,20 @@ class Plan:
         in_water = (focus - window.distance_mm - window.thickness_mm) / sensor.media["water"].refractive_index(635.0)
         sharp = window.distance_mm + window.thickness_mm / window.glass + in_water
         changes = {
-            "as described": {}, "f/8 instead of f/4": {"camera": (("f_number", 8.0),)},
-            f"lens focused for the stand-off in water (at {sharp:.0f} mm instead of {focus:.0f} mm in air)":
-                {"camera": (("focus_distance_mm", sharp),)},
+            "as described": {},
+            "f/8 instead of f/4": {"camera": (("f_number", 8.0),)},
+            f"lens focused for the stand-off in water (at {sharp:.0f} mm instead of {focus:.0f} mm in air)": {
+                "camera": (("focus_distance_mm", sharp),)
+            },
             "sheet's waist radius 0.15 mm instead of 0.3 mm": {"laser": (("waist_radius_mm", 0.15),)},
             "sheet's waist radius 0.6 mm": {"laser": (("waist_radius_mm", 0.6),)},
             "laser's spectrum 1 nm wide instead of 0": {"laser": (("linewidth_nm", 1.0),)},
-        }  # fmt: skip
+        }
         return {
             (name, place): self.case(ROWS[NAME_CORE], z_mm=z, **change)
-            for name, change in changes.items() for place, z in PLACES["plane"].items()
-        }  # fmt: skip
+            for name, change in changes.items()
+            for place, z in PLACES["plane"].items()
+        }
 
     def pictures(self) -> dict[tuple[str, str], Case]:
         """One frame each, by water and row."""
@@ -131,7 +143,14 @@ class Plan:
     def every_case(self) -> list[Case]:
         """All cases, each once."""
         studies = (
-            self.effects("plane"), self.effects("spheres"), self.depth(), self.f_number(), self.turbidity(),
-            self.gloss(), self.exposure(), self.unknown(), self.pictures(),
-        )  # fmt: skip
+            self.effects("plane"),
+            self.effects("spheres"),
+            self.depth(),
+            self.f_number(),
+            self.turbidity(),
+            self.gloss(),
+            self.exposure(),
+            self.unknown(),
+            self.pictures(),
+        )
         return list(dict.fromkeys(case for study in studies for case in study.values()))

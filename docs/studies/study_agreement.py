@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from twin.design.description import Study
+from twin.design.parameters import followed, parameters_of
+from twin.design.verification import Candidate, Verification, verified
 from twin.options import CPU
-from twin.study.description import Study
-from twin.study.parameters import followed, parameters_of
-from twin.study.verification import Candidate, Verification, verified
-from uwlts.library import load_sensor, merged, validated
-from uwlts.sensor import Sensor
+from uwlts.model.library import load_sensor, merged, validated
+from uwlts.model.sensor import Sensor
 
 FOLLOW = ("focus", "waist", "volume")
 CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -35,8 +35,10 @@ CASES: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 def main() -> None:
     """Render and print."""
-    print("| design | formulas, µm | rendered, µm | rendered / formulas | exposure, formulas / rendered, ms | "
-          "largest systematic error, µm |")  # fmt: skip
+    print(
+        "| design | formulas, µm | rendered, µm | rendered / formulas | exposure, formulas / rendered, ms | "
+        "largest systematic error, µm |"
+    )
     print("| --- | --- | --- | --- | --- | --- |")
     for number, (name, medium, changes) in enumerate(CASES):
         sensor = validated(Sensor, merged(load_sensor("thesis").model_dump(), changes), name)
@@ -54,13 +56,16 @@ def main() -> None:
         if found.failure:
             print(f"| {name} | | | | | {found.failure} |", flush=True)
             continue
-        foretold, measured = ([f"{1e3 * scatter[k]:.0f}" for k in (0, len(scatter) // 2, -1)]
-                              for scatter in (found.predicted_mm, found.rendered_mm))  # fmt: skip
+        foretold, measured = (
+            [f"{1e3 * scatter[k]:.0f}" for k in (0, len(scatter) // 2, -1)]
+            for scatter in (found.predicted_mm, found.rendered_mm)
+        )
         print(
             f"| {name} | {' / '.join(foretold)} | {' / '.join(measured)} | {found.rendered_over_predicted:.2f} | "
             f"{found.predicted_exposure_ms:.2f} / {found.exposure_ms:.2f} | "
-            f"{1e3 * np.nanmax(np.abs(found.error_mm)):.0f} |", flush=True,
-        )  # fmt: skip
+            f"{1e3 * np.nanmax(np.abs(found.error_mm)):.0f} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ from io import StringIO
 
 import pytest
 
-from uwlts import cli, console
+from uwlts import cli
+from uwlts.runtime import console
 
 
 def uwlts(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered
-from twin.options import CPU
-from twin.study.description import Study
-from twin.study.designs import Design, built
-from twin.study.figures import scatter_at
-from twin.study.parameters import parameters_of
-from twin.study.verification import (
+from twin.design.description import Study
+from twin.design.designs import Design, built
+from twin.design.figures import scatter_at
+from twin.design.parameters import parameters_of
+from twin.design.verification import (
     Agreement,
     CalibrationFigures,
     Candidate,
@@ -21,7 +20,8 @@ from twin.study.verification import (
     render,
     verified,
 )
-from uwlts.workers import open_workers
+from twin.options import CPU
+from uwlts.runtime.workers import open_workers
 
 CALIBRATION = CalibrationFigures(None, None, None, 0.1, 5000.0, 9, 0.01, [])
 
@@ -55,9 +55,15 @@ def test_a_disagreement_is_reported(study, thesis):
 
     def measured(factor: float) -> Agreement:
         rendered = Rendered(
-            z_mm=z, points=np.full(5, 1000), scatter_mm=factor * foretold, error_mm=np.zeros(5),
-            line_mm=np.full(5, 120.0), exposure_ms=1.0, calibration=CALIBRATION, seconds={"render": 1.0},
-        )  # fmt: skip
+            z_mm=z,
+            points=np.full(5, 1000),
+            scatter_mm=factor * foretold,
+            error_mm=np.zeros(5),
+            line_mm=np.full(5, 120.0),
+            exposure_ms=1.0,
+            calibration=CALIBRATION,
+            seconds={"render": 1.0},
+        )
         return compared(study, Candidate("thesis", -1, thesis), rendered)
 
     for factor, agrees in ((1.0, True), (1.45, True), (1 / 1.45, True), (1.55, False), (1 / 1.55, False)):
@@ -83,7 +89,7 @@ def test_a_candidate_that_fails_is_kept_with_its_reason_and_tried_again(study, t
 def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkeypatch):
     folder: Path = tmp_path / "verified"
     candidates = [Candidate("thesis", -1, thesis)]
-    monkeypatch.setattr("twin.study.verification.verified", _counted)
+    monkeypatch.setattr("twin.design.verification.verified", _counted)
     with open_workers(workers=1) as pool:
         for label in ("thesis", "renamed"):
             candidates = [Candidate(label, -1, thesis)]
@@ -92,15 +98,26 @@ def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkey
     assert len(list(folder.iterdir())) == 1
     # The worker would have said another ratio the second time.
     with open_workers(workers=1) as pool:
-        (other,) = render(study, folder, [Candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool,
-                          variant=CPU)  # fmt: skip
+        (other,) = render(
+            study, folder, [Candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool, variant=CPU
+        )
     assert other.ratio == 1.25 and len(list(folder.iterdir())) == 2
 
 
 def _counted(job: Verification) -> Agreement:
     first = job.candidate.label != "renamed"
     return Agreement(
-        job.candidate.label, -1, z_mm=[1.0], predicted_mm=[1.0], rendered_mm=[1.0], error_mm=[1.0], line_mm=[1.0],
-        ratio=1.25 if first else 9.0, rendered_over_predicted=1.25, agrees=True, exposure_ms=1.25,
-        predicted_exposure_ms=1.25, seconds=1.25,
-    )  # fmt: skip
+        job.candidate.label,
+        -1,
+        z_mm=[1.0],
+        predicted_mm=[1.0],
+        rendered_mm=[1.0],
+        error_mm=[1.0],
+        line_mm=[1.0],
+        ratio=1.25 if first else 9.0,
+        rendered_over_predicted=1.25,
+        agrees=True,
+        exposure_ms=1.25,
+        predicted_exposure_ms=1.25,
+        seconds=1.25,
+    )

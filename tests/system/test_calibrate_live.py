@@ -14,20 +14,20 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.unit.drawn_target import drawn_lamp, drawn_laser, target_pose
-from twin.hardware.gige_camera import GigeCamera
-from twin.hardware.grbl_controller import GrblController
-from twin.hardware.serve import ServedTwin, serve
+from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
+from twin.devices.gige_camera import GigeCamera
+from twin.devices.grbl_controller import GrblController
+from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
-from twin.scene import load_scene
-from uwlts.calibration.model import read_calibration
-from uwlts.calibration.procedure import calibrate_sequentially
-from uwlts.capture import Capture, part_path
-from uwlts.errors import DescriptionError
+from twin.scene.description import load_scene
+from uwlts.calibration.sequential import calibrate_sequentially
 from uwlts.hardware.guided.plan import load_guided_plan
-from uwlts.library import load_sensor
-from uwlts.placement import camera_from_object
-from uwlts.sensor import Sensor
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import load_sensor
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Sensor
+from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.capture import Capture, part_path
 from uwlts.targets import CircleTarget
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -60,9 +60,16 @@ marker_x = [1, 0]
 marker_y = [0, 1]
 """
 PLATE = CircleTarget(
-    spacing_x_mm=12.0, spacing_y_mm=12.0, diameter_mm=7.0, marker_diameter_mm=3.0, columns=15, rows=13, origin=(7, 6),
-    marker_x=(1, 0), marker_y=(0, 1),
-)  # fmt: skip
+    spacing_x_mm=12.0,
+    spacing_y_mm=12.0,
+    diameter_mm=7.0,
+    marker_diameter_mm=3.0,
+    columns=15,
+    rows=13,
+    origin=(7, 6),
+    marker_x=(1, 0),
+    marker_y=(0, 1),
+)
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +115,13 @@ def run(*words: object) -> subprocess.CompletedProcess[str]:
 
 def started(*words: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        command(*words), env=ENVIRONMENT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        command(*words),
+        env=ENVIRONMENT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-    )  # fmt: skip
+    )
 
 
 def dark(controller: GrblController) -> bool:

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from twin.options import ALL, NONE, Options
-from twin.scene import load_scene
-from twin.studio import record_scene
-from uwlts.calibration.model import Calibration
-from uwlts.calibration.nominal import nominal_calibration
-from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, calibrate_sequentially
-from uwlts.capture import Capture
-from uwlts.evaluation import Evaluation, evaluate
-from uwlts.library import load_sensor
-from uwlts.scan import reconstruct
-from uwlts.truth import truth_path
+from twin.recording.studio import record_scene
+from twin.scene.description import load_scene
+from uwlts.calibration.sequential import CalibrationOptions, CalibrationResult, calibrate_sequentially
+from uwlts.measurement.evaluation import Evaluation, evaluate
+from uwlts.measurement.reconstruction import reconstruct
+from uwlts.model.calibration import Calibration
+from uwlts.model.library import load_sensor
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.storage.capture import Capture
+from uwlts.storage.truth import truth_path
 
 PLACEMENTS = ("near", "standoff", "far")
 PROFILES = {"start_mm": -18.0, "step_mm": 3.0, "count": 13}

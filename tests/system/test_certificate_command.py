@@ -10,28 +10,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.unit.calibration_views import built_sensor
-from tests.unit.joint_views import Noise, gathered, target_series
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.model import write_calibration
-from uwlts.calibration.procedure import CalibrationOptions
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.storage.calibration_file import write_calibration
 
 ROOT = Path(__file__).parents[2]
 
 
 def run(*arguments, folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, "-m", "uwlts.cli", *map(str, arguments)], cwd=folder, capture_output=True, text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False, timeout=60,
-    )  # fmt: skip
+        [sys.executable, "-m", "uwlts.cli", *map(str, arguments)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=False,
+        timeout=60,
+    )
 
 
 @pytest.fixture(scope="module")
 def calibration(thesis, tmp_path_factory) -> Path:
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
-    series = target_series(
-        built_sensor(), medium=0, positions=np.arange(5) * 40.0 - 110.0, noise=noise, columns=15
-    )  # fmt: skip
+    series = target_series(built_sensor(), medium=0, positions=np.arange(5) * 40.0 - 110.0, noise=noise, columns=15)
     options = CalibrationOptions(poses="stage", correct_circles=False)
     path = tmp_path_factory.mktemp("certificates") / "calibration.json"
     write_calibration(path, solve_jointly(gathered(thesis, [series]), options=options).calibration)
@@ -82,9 +85,7 @@ def test_nothing_is_replaced_unasked_nor_the_calibration_at_all(folder: Path):
 
 def test_beside_another_calibration_and_without_a_joint_estimate(folder: Path):
     assert run("nominal", "thesis", "--medium", "water", "--out", "nominal.json", folder=folder).returncode == 0
-    done = run(
-        "certificate", "calibration.json", "--before", "nominal.json", "--out", "cert.html", folder=folder
-    )  # fmt: skip
+    done = run("certificate", "calibration.json", "--before", "nominal.json", "--out", "cert.html", folder=folder)
     assert done.returncode == 0, done.stderr
     assert "Against nominal.json" in (folder / "cert.html").read_text(encoding="utf-8")
     plain = run("certificate", "nominal.json", folder=folder)

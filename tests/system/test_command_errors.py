@@ -20,11 +20,11 @@ import pytest
 
 from twin import cli as twin_cli
 from uwlts import cli as uwlts_cli
-from uwlts.calibration.model import read_calibration, write_calibration
-from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
-from uwlts.cloud import PointCloud, read_cloud, write_cloud
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -40,10 +40,19 @@ pixel_size_um = 42.4
 """
 COMMANDS = {"twin": twin_cli.main, "uwlts": uwlts_cli.main}
 SUBCOMMANDS = [
-    "twin simulate", "twin reproduce", "twin scenes",
-    "uwlts info", "uwlts calibrate", "uwlts polynomials", "uwlts design", "uwlts nominal", "uwlts reconstruct",
-    "uwlts evaluate", "uwlts report", "uwlts thesis",
-]  # fmt: skip
+    "twin simulate",
+    "twin reproduce",
+    "twin scenes",
+    "uwlts info",
+    "uwlts calibrate",
+    "uwlts polynomials",
+    "uwlts design",
+    "uwlts nominal",
+    "uwlts reconstruct",
+    "uwlts evaluate",
+    "uwlts report",
+    "uwlts thesis",
+]
 
 
 @dataclass(frozen=True)
@@ -99,9 +108,14 @@ def stripe_images(count: int, *, row: float = 70.0, peak: float = 150.0) -> list
 
 def write_capture(path: Path, sensor: Sensor, images: list[np.ndarray], *, laser: bool = True, **changes) -> Path:
     known = {
-        "name": path.stem, "sensor": sensor, "medium_name": "water", "medium": sensor.media["water"],
-        "stage_direction": (1.0, 0.0, 0.0), "saturation_dn": 255, "artefact": {"kind": "plane"},
-    }  # fmt: skip
+        "name": path.stem,
+        "sensor": sensor,
+        "medium_name": "water",
+        "medium": sensor.media["water"],
+        "stage_direction": (1.0, 0.0, 0.0),
+        "saturation_dn": 255,
+        "artefact": {"kind": "plane"},
+    }
     with CaptureWriter(path, CaptureHeader(**(known | changes)), dtype=np.uint8) as writer:
         for number, image in enumerate(images):
             writer.append(Frame(image, float(number), laser, 1.0, float(number)))
@@ -250,9 +264,13 @@ def test_wrong_command_line(fails, folder: Path, monkeypatch, line: str, says: s
 def test_as_a_process_of_its_own(tmp_path: Path, line: str):
     program, *arguments = line.split()
     ended = subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False,
+        [sys.executable, "-m", f"{program}.cli", *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
         env=ENVIRONMENT,
-    )  # fmt: skip
+    )
     assert ended.returncode == 2
     assert ended.stdout == ""
     assert ended.stderr
@@ -294,9 +312,21 @@ PLACES = {
     "simulate, as built": ("twin simulate scene.toml --sensor sensor.toml --as-built {} --out x.h5", {"sensor.toml"}),
 }
 KINDS = [
-    "scan.h5", "rendered.truth.h5", "calibration.json", "scan.ply", "scan.evaluation.json", "sensor.toml", "scene.toml",
-    "artefact.toml", "notes.txt", "empty", "truncated.h5", "missing.h5", "missing.toml", ".",
-]  # fmt: skip
+    "scan.h5",
+    "rendered.truth.h5",
+    "calibration.json",
+    "scan.ply",
+    "scan.evaluation.json",
+    "sensor.toml",
+    "scene.toml",
+    "artefact.toml",
+    "notes.txt",
+    "empty",
+    "truncated.h5",
+    "missing.h5",
+    "missing.toml",
+    ".",
+]
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -654,8 +684,12 @@ def test_interrupted_simulation_is_kept_and_resumed(command, folder: Path, tmp_p
     path = tmp_path / "a.h5"
     process = subprocess.Popen(
         [sys.executable, "-m", "twin.cli", "simulate", str(scene), *options, str(path)],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT,
-    )  # fmt: skip
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ENVIRONMENT,
+    )
     part, frames = part_path(path), 0
     while frames < 3 and process.poll() is None:
         time.sleep(0.01)

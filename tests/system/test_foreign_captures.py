@@ -10,21 +10,19 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.unit.calibration_views import lattice, stage_images
-from tests.unit.drawn_stripes import SPHERES, STAGE_MM, coarse_sensor, sphere_profiles, step_image, stripe_image, write
-from tests.unit.drawn_target import drawn_lamp, drawn_laser
+from tests.uwlts.calibration_views import lattice, stage_images
+from tests.uwlts.drawn_stripes import SPHERES, STAGE_MM, coarse_sensor, sphere_profiles, step_image, stripe_image, write
+from tests.uwlts.drawn_target import drawn_lamp, drawn_laser
 from uwlts import cli
-from uwlts.calibration.model import write_calibration
-from uwlts.calibration.nominal import nominal_calibration
-from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
-from uwlts.sensor import Medium
+from uwlts.model.sensor import Medium
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.storage.calibration_file import write_calibration
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.targets import CircleTarget
 
 SENSOR = coarse_sensor(window_mounted=False)
 WET = coarse_sensor(window_mounted=True)
-PLATE = {
-    "kind": "circles", "diameter_mm": 6.0, "marker_diameter_mm": 2.5, "columns": 17, "rows": 13, "origin": (8, 6),
-}  # fmt: skip
+PLATE = {"kind": "circles", "diameter_mm": 6.0, "marker_diameter_mm": 2.5, "columns": 17, "rows": 13, "origin": (8, 6)}
 POSITIONS = np.arange(5) * 40.0
 STEP = {"kind": "step", "height_mm": 23.17}
 TOLD = """
@@ -105,9 +103,14 @@ def captured(path: Path, frames: list[Frame], **rest: object) -> Path:
     camera = SENSOR.camera.model_copy(update={"width_px": width, "height_px": height, "principal_point_px": None})
     sensor = SENSOR if (width, height) == (640, 512) else SENSOR.model_copy(update={"camera": camera})
     header = CaptureHeader(
-        name=path.stem, sensor=sensor, medium_name="air", medium=Medium(kind="air"), stage_direction=(0.0, 0.0, 1.0),
-        saturation_dn=255, **rest,
-    )  # fmt: skip
+        name=path.stem,
+        sensor=sensor,
+        medium_name="air",
+        medium=Medium(kind="air"),
+        stage_direction=(0.0, 0.0, 1.0),
+        saturation_dn=255,
+        **rest,
+    )
     with CaptureWriter(path, header, dtype=np.uint8) as writer:
         for frame in frames:
             writer.append(frame)

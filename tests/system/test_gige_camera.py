@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.hardware.gige_camera import PORT, GigeCamera
-from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
-from uwlts.errors import HardwareError
+from twin.devices.gige_camera import PORT, GigeCamera
 from uwlts.hardware.aravis import list_aravis_cameras
 from uwlts.hardware.camera import FrameStatus, Region
 from uwlts.hardware.camera_addresses import open_camera
-from uwlts.sensor import Sensor
+from uwlts.model.errors import HardwareError
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
 
 WIDTH, HEIGHT = 1280, 1024
 # Well above what a frame takes, about 10 ms, on a machine that is busy with other things.
@@ -271,9 +271,13 @@ def test_ctrl_c_gets_through_while_waiting(camera):
 
 def test_frames_go_into_a_capture(tmp_path, scene, camera, thesis: Sensor):
     header = CaptureHeader(
-        name="grabbed", sensor=thesis, medium_name="water", medium=thesis.medium("water"),
-        stage_direction=(1.0, 0.0, 0.0), saturation_dn=255,
-    )  # fmt: skip
+        name="grabbed",
+        sensor=thesis,
+        medium_name="water",
+        medium=thesis.medium("water"),
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+    )
     camera.configure(exposure_ms=3.0, trigger="software")
     camera.start()
     with CaptureWriter(tmp_path / "grabbed.h5", header, dtype=np.uint8) as writer:

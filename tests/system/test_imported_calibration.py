@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import tomli_w
 
-from tests.unit.calibration_views import turn
-from tests.unit.drawn_stripes import coarse_sensor
+from tests.uwlts.calibration_views import turn
+from tests.uwlts.drawn_stripes import coarse_sensor
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
-from uwlts.capture import Capture
-from uwlts.importing import import_folder
-from uwlts.placement import camera_from_object, laser_pose
+from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.storage.capture import Capture
+from uwlts.storage.import_ import import_folder
 from uwlts.targets import CharucoTarget, ChessboardTarget
 
 SENSOR = coarse_sensor(window_mounted=False)
@@ -47,9 +47,15 @@ def poses(target) -> list[tuple[np.ndarray, np.ndarray]]:
     at = camera_from_object(SENSOR)[:3, 3]
     found = []
     for x, y, z, depth in (
-        (0.35, 0.0, 0.0, 10), (-0.35, 0.1, 0.1, -20), (0.0, 0.4, -0.1, 30), (0.1, -0.4, 0.2, -35),
-        (0.3, 0.3, 0.0, 45), (-0.25, -0.3, -0.2, 0), (0.2, -0.25, 3.0, -10), (-0.3, 0.25, 0.3, 20),
-    ):  # fmt: skip
+        (0.35, 0.0, 0.0, 10),
+        (-0.35, 0.1, 0.1, -20),
+        (0.0, 0.4, -0.1, 30),
+        (0.1, -0.4, 0.2, -35),
+        (0.3, 0.3, 0.0, 45),
+        (-0.25, -0.3, -0.2, 0),
+        (0.2, -0.25, 3.0, -10),
+        (-0.3, 0.25, 0.3, 20),
+    ):
         rotation = turn(x, y, z)
         found.append((rotation, at + [0, 0.15 * depth, depth] - rotation @ middle))
     return found
@@ -89,9 +95,14 @@ def test_a_board_in_free_poses_calibrates_camera_and_sheet(tmp_path: Path, targe
         cv2.imwrite(str(folder / f"board{number}_laser.png"), lasered)
     plain = ["board?.png", "board??.png"]
     told = {
-        "sensor": SENSOR.model_dump(mode="json", exclude_none=True), "medium": "air", "laser": "*_laser.png",
-        "lamp": plain, "background": plain, "stage": {"free": True}, "target": target.model_dump(),
-    }  # fmt: skip
+        "sensor": SENSOR.model_dump(mode="json", exclude_none=True),
+        "medium": "air",
+        "laser": "*_laser.png",
+        "lamp": plain,
+        "background": plain,
+        "stage": {"free": True},
+        "target": target.model_dump(),
+    }
     (folder / "import.toml").write_text(tomli_w.dumps(told))
     imported = import_folder(folder, tmp_path / "board.h5")
     assert (imported.laser, imported.lamp, imported.warnings) == (8, 8, ())

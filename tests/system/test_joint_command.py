@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwlts.calibration.model import read_calibration
-from uwlts.sensor import Sensor
+from uwlts.model.sensor import Sensor
+from uwlts.storage.calibration_file import read_calibration
 
 ROOT = Path(__file__).parents[2]
 QUICK = ("--without", "multiple-scattering", "secondary-light", "haze", "--as-built", "thesis-as-built")
@@ -28,9 +28,13 @@ lights = ["lamp", "laser"]
 
 def run(package: str, *arguments, folder: Path) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", f"{package}.cli", *map(str, arguments)], cwd=folder, capture_output=True, text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
-    )  # fmt: skip
+        [sys.executable, "-m", f"{package}.cli", *map(str, arguments)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -13,19 +13,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwlts.calibration.nominal import nominal_calibration
-from uwlts.capture import Capture, CaptureHeader, CaptureWriter, Frame
-from uwlts.live_view import images_of, look
-from uwlts.sensor import Sensor
+from uwlts.hardware.live_view import images_of, look
+from uwlts.model.sensor import Sensor
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def header(sensor: Sensor) -> CaptureHeader:
     return CaptureHeader(
-        name="live", sensor=sensor, medium_name="water", medium=sensor.medium("water"), stage_direction=(1, 0, 0),
+        name="live",
+        sensor=sensor,
+        medium_name="water",
+        medium=sensor.medium("water"),
+        stage_direction=(1, 0, 0),
         saturation_dn=255,
-    )  # fmt: skip
+    )
 
 
 def stripe_image(sensor: Sensor, *, height_dn: float, row: float = 500.3) -> np.ndarray:
@@ -89,8 +93,11 @@ def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path)
         port = free.getsockname()[1]
     watching = subprocess.Popen(
         [sys.executable, "-m", "uwlts.cli", "watch", str(tmp_path / "live.h5"), "--port", str(port)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         for line in watching.stdout:
             if "is finished with 1 images" in line:

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.calibration.camera_poses import solve_camera
+from uwlts.calibration.camera import solve_camera
 from uwlts.calibration.evidence import air_evidence
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.capture import Capture
-from uwlts.importing import import_folder
+from uwlts.storage.capture import Capture
+from uwlts.storage.import_ import import_folder
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
 from uwlts.targets.detection import detect_lattice
 
@@ -48,9 +48,12 @@ def test_the_chessboard_gives_the_authors_camera(tmp_path: Path):
         found = air_evidence([capture])
     assert len(found.images) == 16
     camera = solve_camera(
-        found.images, width_px=960, height_px=1280, poses="free",
+        found.images,
+        width_px=960,
+        height_px=1280,
+        poses="free",
         options=CameraOptions(square_pixels=False, distortion=("k1", "k2", "p1", "p2", "k3")),
-    )  # fmt: skip
+    )
     # The author's figures, all five coefficients estimated: 1430.39 and 1429.67 px for the image's sides, 0.0272 and
     # -0.231. The least-squares problem has one answer: agreement is to a tenth of its standard deviations, which leaves
     # room for other corner windows. Corners in sharp photographs scatter by less than 0.3 px.

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 
 from twin import cli
-from twin.campaign import load_campaign, takes
 from twin.options import Options
-from twin.reproduce import record_campaigns
-from twin.studio import record_scene
-from uwlts.capture import Capture, part_path
-from uwlts.errors import DescriptionError
-from uwlts.truth import read_truth, truth_path
+from twin.recording.reproduce import record_campaigns
+from twin.recording.studio import record_scene
+from twin.scene.campaign import load_campaign, takes
+from uwlts.model.errors import DescriptionError
+from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.truth import read_truth, truth_path
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -137,8 +137,9 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     """Every file under a folder with its content and time."""
     return {
         str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns)
-        for path in folder.rglob("*") if path.is_file()
-    }  # fmt: skip
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 def assert_same_images(first: Path, second: Path) -> None:
@@ -334,9 +335,14 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     """Ctrl-C on the terminal reaches all processes, a signal from elsewhere the command alone."""
     options = ["--out", tmp_path / "runs", "--campaigns", 1, "--spp", 1, "--workers", 2]
     command = subprocess.Popen(
-        [sys.executable, "-m", "twin.cli", "reproduce", described / "many.toml", *map(str, options)], env=ENVIRONMENT,
-        start_new_session=True, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [sys.executable, "-m", "twin.cli", "reproduce", described / "many.toml", *map(str, options)],
+        env=ENVIRONMENT,
+        start_new_session=True,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     parts = [tmp_path / "runs" / "campaign-0" / f"{name}.h5.part" for name in ("first", "second")]
     while command.poll() is None and not all(part.exists() for part in parts):
         time.sleep(0.01)
@@ -352,9 +358,7 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     assert output == ""
     assert errors.startswith("interrupted; ")
     assert len(errors.splitlines()) == 1
-    assert sorted(contents(tmp_path / "runs")) == [
-        "campaign-0/first.h5.part", "campaign-0/second.h5.part", "plan.json",
-    ]  # fmt: skip
+    assert sorted(contents(tmp_path / "runs")) == ["campaign-0/first.h5.part", "campaign-0/second.h5.part", "plan.json"]
     for part in parts:
         with Capture(part) as capture:
             assert len(capture) < LONG

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.hardware.serve import ServedTwin, serve
+from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
-from twin.scene import Scene, load_scene
-from twin.studio import record_scene
-from uwlts.capture import Capture, part_path
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from twin.recording.studio import record_scene
+from twin.scene.description import Scene, load_scene
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import extract_stripe
 
 ROOT = Path(__file__).resolve().parents[2]

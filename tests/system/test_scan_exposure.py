@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.hardware.serve import ServedTwin, serve
+from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
-from twin.scene import Scene, load_scene
-from uwlts.capture import Capture, part_path
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from twin.scene.description import Scene, load_scene
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, part_path
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -77,9 +77,12 @@ def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:
         encoding="utf-8",
     )
     done = subprocess.run(
-        [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home"], env=ENVIRONMENT,
-        capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+        [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home"],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stderr
     return done.stderr
 
@@ -141,8 +144,10 @@ def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subpr
     )
     return subprocess.Popen(
         [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home", "--watch"],
-        env=ENVIRONMENT, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
 
 
 def refused(address: str) -> bool:

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from tests.system.in_process import uwlts
-from twin.hardware.bench import NAMES, parse_fault
-from twin.hardware.serve import ServedTwin, serve
+from twin.devices.bench import NAMES, parse_fault
+from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
-from twin.scene import Scene, load_scene
-from uwlts.capture import Capture, part_path
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from twin.scene.description import Scene, load_scene
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, part_path
 
 STEP_MM = 2.0
 SENSOR = """
@@ -172,8 +172,9 @@ def test_frames_lost_on_their_way_are_taken_again(board, sensor, folder, tmp_pat
         frame += lost + 1
     count = len(LOST_FRAMES) + 2
     said: list[str] = []
-    with serve(board, sensor, options=Options(spp=4), speed_up=50.0, faults=map(parse_fault, faults),
-               report=said.append) as served:  # fmt: skip
+    with serve(
+        board, sensor, options=Options(spp=4), speed_up=50.0, faults=map(parse_fault, faults), report=said.append
+    ) as served:
         done = scan(written(folder, served, count=count), out)
         assert done.returncode == 0, done.stderr
         assert dark(served)

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.hardware.bench import NAMES, Fault, Track, parse_fault
-from twin.hardware.serve import ServedTwin, serve, wait_for_end
+from twin.devices.bench import NAMES, Fault, Track, parse_fault
+from twin.devices.serve import ServedTwin, serve, wait_for_end
 from twin.options import Options
-from twin.scene import Scene, load_scene
-from twin.studio import record_scene
-from uwlts.capture import Capture
-from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
+from twin.recording.studio import record_scene
+from twin.scene.description import Scene, load_scene
 from uwlts.hardware.camera import Camera
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.library import load_sensor
-from uwlts.sensor import Sensor
+from uwlts.model.errors import DescriptionError, DesignError, HardwareError, ImageError
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture
 from uwlts.stripe import extract_stripe
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -239,11 +239,15 @@ def test_faults_are_read():
     assert parse_fault("stall@3") == Fault("stall", None, 3)
     assert len(NAMES) == 15
     for wrong, message in [
-        ("fire", "'fire' is no fault: .* break-laser"), ("drop@0", "no fault"), ("drop@x", "no fault"),
-        ("stall:2", "stall takes no argument"), ("drop:1.5", "'1.5', not a whole number"),
-        ("delay:soon", "'soon', not a number of seconds"), ("delay:inf", "'inf'; it must be positive"),
+        ("fire", "'fire' is no fault: .* break-laser"),
+        ("drop@0", "no fault"),
+        ("drop@x", "no fault"),
+        ("stall:2", "stall takes no argument"),
+        ("drop:1.5", "'1.5', not a whole number"),
+        ("delay:soon", "'soon', not a number of seconds"),
+        ("delay:inf", "'inf'; it must be positive"),
         ("cut:-1", "'-1'; it must be positive"),
-    ]:  # fmt: skip
+    ]:
         with pytest.raises(DescriptionError, match=message):
             parse_fault(wrong)
 
@@ -287,9 +291,11 @@ def test_the_lamp_is_on_while_the_laser_is_off_and_frames_are_dropped_and_late(l
                 stage.home()
             assert twin.camera.failure is None
         assert said == [
-            "fault: drop:1 at frame 2", "fault: delay:1 at frame 4", "fault: alarm:1 at frame 4",
+            "fault: drop:1 at frame 2",
+            "fault: delay:1 at frame 4",
+            "fault: alarm:1 at frame 4",
             "fault: stage-disconnect at frame 5",
-        ]  # fmt: skip
+        ]
     finally:
         served.camera.connect()
 
@@ -323,9 +329,13 @@ def test_the_command_serves_until_it_is_interrupted(described: Path, served):
     arguments = ["serve", described / "board.toml", "--sensor", described / "sensor.toml", "--ideal", "--spp", 1]
     program = [sys.executable, "-m", "twin.cli", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
     command = subprocess.Popen(
-        program, env=os.environ | {"PYTHONPATH": str(ROOT)}, start_new_session=True, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        program,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         lines = []
         while "Ctrl-C" not in (line := command.stdout.readline()):

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.study.description import load_study
-from twin.study.screening import parts, read_parts, screen
-from uwlts.library import load_sensor
-from uwlts.workers import open_workers
+from twin.design.description import load_study
+from twin.design.screening import parts, read_parts, screen
+from uwlts.model.library import load_sensor
+from uwlts.runtime.workers import open_workers
 
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -67,15 +67,21 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
 def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more],
-        env=ENVIRONMENT, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 def begun(study: Path, out: Path, *more: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more],
-        env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None:
@@ -141,10 +147,24 @@ def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, 
     assert run(study, out).returncode == 0
     assert contents(out) == before
     simulated = subprocess.run(
-        [sys.executable, "-m", "twin.cli", "simulate", str(_scene(tmp_path)), "--sensor", str(out / "winner.toml"),
-         "--out", str(tmp_path / "plane.h5"), "--spp", "1"],
-        env=ENVIRONMENT, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "twin.cli",
+            "simulate",
+            str(_scene(tmp_path)),
+            "--sensor",
+            str(out / "winner.toml"),
+            "--out",
+            str(tmp_path / "plane.h5"),
+            "--spp",
+            "1",
+        ],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert simulated.returncode == 0, simulated.stderr
     assert (tmp_path / "plane.h5").is_file()
 
@@ -220,19 +240,40 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
     module = [sys.executable, "-m"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": ENVIRONMENT, "cwd": folder}
     scheduler = subprocess.Popen(
-        [*module, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
-         "--scheduler-file", str(found)], **quiet,
-    )  # fmt: skip
+        [
+            *module,
+            "distributed.cli.dask_scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--scheduler-file",
+            str(found),
+        ],
+        **quiet,
+    )
     processes: list[subprocess.Popen[bytes]] = []
     try:
         until(found.is_file)
         processes += [
             subprocess.Popen(
-                [*module, "distributed.cli.dask_worker", "--scheduler-file", str(found), "--host", "127.0.0.1",
-                 "--nthreads", "1", "--no-nanny", "--no-dashboard"], **quiet,
+                [
+                    *module,
+                    "distributed.cli.dask_worker",
+                    "--scheduler-file",
+                    str(found),
+                    "--host",
+                    "127.0.0.1",
+                    "--nthreads",
+                    "1",
+                    "--no-nanny",
+                    "--no-dashboard",
+                ],
+                **quiet,
             )
             for _ in range(workers)
-        ]  # fmt: skip
+        ]
         yield json.loads(found.read_text())["address"], processes
     finally:
         for process in (*processes, scheduler):

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.campaign import Campaign, load_campaign
-from twin.reproduce import record_campaigns
-from uwlts.calibration.model import Calibration
-from uwlts.capture import Capture
+from twin.recording.reproduce import record_campaigns
+from twin.scene.campaign import Campaign, load_campaign
+from uwlts.model.calibration import Calibration
+from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import CampaignFolder
 from uwlts.thesis.evaluation import evaluate_campaign
@@ -41,13 +41,15 @@ RECORDINGS = (
     {"name": "target-air", "scene": "target-through-window", "motion": POSES | {"start_mm": -180.0, "step_mm": 32.0}},
     {"name": "target-bare", "scene": "target", "motion": POSES | {"start_mm": -180.0, "step_mm": 32.0}},
     {
-        "name": "target-water", "scene": "target-through-window", "media": ["water"],
+        "name": "target-water",
+        "scene": "target-through-window",
+        "media": ["water"],
         "motion": POSES | {"start_mm": -124.0, "step_mm": 23.0},
     },
     {"scene": "step", "placements": ["near", "standoff", "far"]},
     {"scene": "spheres", "media": ["water"], "placements": ["standoff", "far"]},
     {"scene": "plane", "media": ["water"], "placements": ["standoff"]},
-)  # fmt: skip
+)
 EVERY = 6
 """Every sixth profile of the thesis's: 7 of the spheres, 25 of the plane."""
 
@@ -170,7 +172,7 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     # The stated uncertainty hardly depends on the noise that was drawn: its level follows from some ten thousand stripe
     # centres and circles, to a few percent, and from descriptions. 30 % are far beyond a probability of 1e-4. It may
     # neither shrink to half or a third (too sure) nor grow (an advantage lost); that it is right is shown by the
-    # simulated campaigns of tests/statistical/test_joint_coverage.py.
+    # simulated campaigns of tests/uwlts/calibration/joint/test_coverage.py.
     assert 0.0110 / 1.3 < root_mean_square(stated) < 0.0110 * 1.3
 
     # Factors of 6.5 and 7.6 are expected (ten campaigns: 7 for spacings, 11 for diameters), and 3 is required: a joint

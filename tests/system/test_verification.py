@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, image_of
-from twin.scene import Scene
-from twin.study.verification import _judged, _run, verify
-from twin.study.verification_scenes import STANDARD_DEPTHS, STEP_DEPTHS, TARGET_POSES, measured_range, recordings
-from uwlts.errors import CalibrationError, DescriptionError, DesignError, EvaluationError
-from uwlts.placement import camera_from_object
-from uwlts.sensor import Sensor
+from twin.design.verification import _judged, _run, verify
+from twin.design.verification_scenes import STANDARD_DEPTHS, STEP_DEPTHS, TARGET_POSES, measured_range, recordings
+from twin.scene.description import Scene
+from uwlts.model.errors import CalibrationError, DescriptionError, DesignError, EvaluationError
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Sensor
 
 CLOSE = {
     "camera": {"focal_length_mm": 8.0, "focus_distance_mm": 220.0, "window": {"aperture_diameter_mm": 80.0}},
@@ -33,7 +33,7 @@ DESIGNS = {
         "detector": {"bits": 12},
     },
     "few pixels": {"camera": {"width_px": 640, "height_px": 480, "pixel_size_um": 6.0}},
-}  # fmt: skip
+}
 
 
 @pytest.fixture(params=DESIGNS)

@@ -7,10 +7,10 @@ from typing import Literal, assert_never
 
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.joint.procedure import calibrate_jointly
-from uwlts.calibration.model import Calibration
-from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError
+from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
+from uwlts.storage.capture import Capture
 
 CalibrationMethod = Literal["auto", "sequential", "joint"]
 _Captures = Sequence[Capture | str | Path]

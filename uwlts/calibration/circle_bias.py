@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.camera_poses import CameraSolution
-from uwlts.calibration.target_image import TargetImage
-from uwlts.camera import project
-from uwlts.errors import CalibrationError
-from uwlts.targets import circle_centre_bias
+from uwlts.calibration.camera import CameraSolution
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.errors import CalibrationError
+from uwlts.optics.camera import project
+from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 Solve = Callable[[Sequence[TargetImage], CameraSolution | None], CameraSolution]
 

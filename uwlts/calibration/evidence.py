@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import ValidationError
 
-from uwlts.calibration.guidance.quality import why_not_found
-from uwlts.calibration.target_image import TargetImage
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
-from uwlts.metrology.artefact_descriptions import StepStandard
+from uwlts.calibration.image_quality import why_not_found
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError
+from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
 from uwlts.stripe.recording import has_stripe
 from uwlts.targets import Target, parse_target

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from uwlts.calibration.model import CameraModel
-from uwlts.sensor import Distortion
+from uwlts.model.calibration import CameraModel
+from uwlts.model.sensor import Distortion
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 
@@ -90,6 +90,11 @@ class Intrinsics:
         """The camera model."""
         fx, fy, cx, cy, *coefficients = self._all(estimated).tolist()
         return CameraModel(
-            width_px=self.width_px, height_px=self.height_px, fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy,
+            width_px=self.width_px,
+            height_px=self.height_px,
+            fx_px=fx,
+            fy_px=fy,
+            cx_px=cx,
+            cy_px=cy,
             distortion=Distortion(**dict(zip(DISTORTION, coefficients, strict=True))),
-        )  # fmt: skip
+        )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.errors import CalibrationError
+from uwlts.model.errors import CalibrationError
 
 _ROUNDS = 60
 _SMALLEST_STEP = 1e-11

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from uwlts.calibration.model import CameraModel, SheetModel
-from uwlts.camera import directions
-from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.metrology.flat_fits import fit_plane
-from uwlts.metrology.robust_fit import fit_robustly
+from uwlts.metrology.least_squares import fit_robustly
+from uwlts.model.calibration import CameraModel, SheetModel
+from uwlts.model.errors import CalibrationError, EvaluationError
+from uwlts.optics.camera import directions
 
 # Spread of the points along the shorter direction of the sheet over their scatter across it, and over their spread
 # along the longer one: below, the scatter turns the plane. A single stripe scatters within the target's plane, which

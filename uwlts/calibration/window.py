@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import least_squares, root_scalar
 
-from uwlts.calibration.model import Calibration, WindowModel
-from uwlts.errors import CalibrationError
 from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile
-from uwlts.reconstruction import points_on_sheet
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.errors import CalibrationError
+from uwlts.optics.reconstruction import points_on_sheet
 
 _CURVE_POINTS = 31
 _SEARCHED = (0.2, 2.5)
@@ -168,9 +168,14 @@ def solve_window(
     # The points that can be reconstructed form one range: a window before the nearest point.
     low, high = tried[usable][0], tried[usable][-1]
     best = least_squares(
-        lambda d: heights(d[0]) - true, [np.clip(tried[np.nanargmin(mean_error)], *_inside(low, high))],
-        bounds=(low, high), xtol=1e-12, ftol=1e-12, gtol=1e-14, x_scale=high - low,
-    )  # fmt: skip
+        lambda d: heights(d[0]) - true,
+        [np.clip(tried[np.nanargmin(mean_error)], *_inside(low, high))],
+        bounds=(low, high),
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-14,
+        x_scale=high - low,
+    )
     distance, slopes = float(best.x[0]), best.jac[:, 0]
     measured, height_std = _heights(calibration, window, steps, distance).T
     errors = measured - true
@@ -241,12 +246,7 @@ def _refuse(distance: float, low: float, high: float, changes: np.ndarray, heigh
 
 
 def _own_distance(
-    calibration: Calibration,
-    window: WindowModel,
-    step: StepImage,
-    tried: np.ndarray,
-    scanned: np.ndarray,
-    near: float,
+    calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, scanned: np.ndarray, near: float
 ) -> float:
     """Distance at which one image shows the true height, the one next to ``near``; NaN where there is none."""
     errors = scanned - step.height_mm

@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from uwlts.doctor.machine import Finding
-from uwlts.errors import HardwareError, SetupError, UwltsError
+from uwlts.model.errors import Error, HardwareError, SetupError
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
 # Aravis waits a second for answers; drivers of broken USB devices may take for ever.
@@ -25,8 +25,8 @@ _USUAL_GROUP = "dialout"
 
 def examine_cameras() -> list[Finding]:
     """The library of Aravis, and the cameras that it finds within 2.5 s."""
-    from uwlts.aravis_library import load_aravis
     from uwlts.hardware.aravis import list_aravis_cameras
+    from uwlts.runtime.aravis_library import load_aravis
 
     try:
         library = load_aravis()
@@ -172,7 +172,7 @@ def try_camera(address: str) -> list[Finding]:
             camera.start(faults="skip")
             frames = [camera.grab(_FRAME_S) for _ in range(FRAMES)]
             counts = camera.counts
-    except UwltsError as error:
+    except Error as error:
         reason, _, advice = str(error).partition("\n")
         return [Finding("camera", "missing", f"{address}: {reason}", advice or "check power, cable, and the address")]
     took_s = frames[-1].time_s - frames[0].time_s
@@ -217,17 +217,22 @@ def try_stage(port: str) -> list[Finding]:
             advice = "sudo usermod -aG dialout $USER\nthen log out and in again"
         return [Finding("stage", "missing", str(failed), advice)]
     return [
-        _judge_build(f"{port}: Grbl {version}", built), *judge_settings(settings),
+        _judge_build(f"{port}: Grbl {version}", built),
+        *judge_settings(settings),
         _judge_state(report.state, report.pins, homing=settings.get(22, 0) != 0),
-    ]  # fmt: skip
+    ]
 
 
 def _judge_build(who: str, built: list[str]) -> Finding:
     options = next((text.removeprefix("OPT:").split(",")[0] for text in built if text.startswith("OPT:")), "")
     found = f"{who}, options {options or 'not given'}"
     if "V" not in options:
-        return Finding("stage", "missing", f"{found}, without V: it cannot switch the laser",
-                       "flash a Grbl with VARIABLE_SPINDLE, see docs/hardware-stage.md")  # fmt: skip
+        return Finding(
+            "stage",
+            "missing",
+            f"{found}, without V: it cannot switch the laser",
+            "flash a Grbl with VARIABLE_SPINDLE, see docs/hardware-stage.md",
+        )
     return Finding("stage", "ok", found)
 
 

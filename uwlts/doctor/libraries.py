@@ -35,9 +35,7 @@ _LOAD = "import importlib, sys\nfor name in sys.argv[1:]: print(name, flush=True
 def examine() -> list[Finding]:
     """Python and all libraries."""
     python, required, extras = project_requirements()
-    return [
-        examine_python(python), *examine_required(required), *examine_optional(OPTIONAL, requirements=extras),
-    ]  # fmt: skip
+    return [examine_python(python), *examine_required(required), *examine_optional(OPTIONAL, requirements=extras)]
 
 
 def project_requirements() -> tuple[str, list[str], list[str]]:

@@ -151,7 +151,7 @@ def examine_renderer() -> list[Finding]:
     subject = "libLLVM"
     if find_spec("twin") is None:
         return [Finding(subject, "ok", "not needed: the twin is not installed")]
-    command = [sys.executable, "-m", "twin.llvm"]
+    command = [sys.executable, "-m", "twin.backend.llvm"]
     try:
         asked = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_RENDERER_S)
     except subprocess.TimeoutExpired:

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.aravis_library import load_aravis
-from uwlts.errors import HardwareError
 from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
+from uwlts.model.errors import HardwareError
+from uwlts.runtime.aravis_library import load_aravis
 
 BUFFER_COMPLETE = 0
 
@@ -267,10 +267,13 @@ class AravisCamera(Camera):
             self._call("set_trigger", b"Software" if requested.trigger == "software" else b"Line0")
         exposure_us, gain, rate = (self._get_number(feature) for feature in ("exposure_time", "gain", "frame_rate"))
         return CameraSettings(
-            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us, gain_db=gain,
-            region=Region(*self._numbers("get_region", 4)), bits=_BITS[self._pixel_format()], trigger=requested.trigger,
+            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
+            gain_db=gain,
+            region=Region(*self._numbers("get_region", 4)),
+            bits=_BITS[self._pixel_format()],
+            trigger=requested.trigger,
             frame_rate_hz=rate if requested.trigger == "free" else None,
-        )  # fmt: skip
+        )
 
     def _set_number(self, feature: str, value: float) -> None:
         if not self._has(feature):

@@ -18,7 +18,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from uwlts.errors import HardwareError
+from uwlts.model.errors import HardwareError
 
 Trigger = Literal["free", "software", "line"]
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import HardwareError, SetupError
 from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
+from uwlts.model.errors import HardwareError, SetupError
 
 # A wait in the producer holds up Ctrl-C.
 _WAIT_S = 0.1
@@ -115,10 +115,13 @@ class GenicamCamera(Camera):
         x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
         region = Region(x, y, int(self._node("Width").value), int(self._node("Height").value))
         return CameraSettings(
-            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us, gain_db=gain, region=region,
-            bits=_BITS[self._node("PixelFormat").value], trigger=requested.trigger,
+            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
+            gain_db=gain,
+            region=region,
+            bits=_BITS[self._node("PixelFormat").value],
+            trigger=requested.trigger,
             frame_rate_hz=rate if requested.trigger == "free" else None,
-        )  # fmt: skip
+        )
 
     def _set_pixel_format(self, bits: int | None) -> None:
         """Grey values of so many bits; without a wish the format stays if it is a grey one, else 8 bits are taken."""

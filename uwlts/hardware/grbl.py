@@ -28,8 +28,8 @@ import math
 import time
 from types import TracebackType
 
-from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, GrblSettings, Message, Setting, Status, parse_settings
+from uwlts.model.errors import HardwareError, RangeError
 
 # A stage that moves by less than a step in this time, and in that of some steps, stands still.
 _STALL_S, _STALL_STEPS = 1.0, 5
@@ -122,8 +122,10 @@ class GrblStage:
         if self._power:
             self.laser(False)
         seek, feed, pull_off = (
-            settings.homing_seek_mm_per_min / 60, settings.homing_feed_mm_per_min / 60, settings.homing_pull_off_mm,
-        )  # fmt: skip
+            settings.homing_seek_mm_per_min / 60,
+            settings.homing_feed_mm_per_min / 60,
+            settings.homing_pull_off_mm,
+        )
         # Grbl seeks over 1.5 times the travel and then, twice the pull-off at the seek rate, 5 times it at the feed.
         longest_s = (1.5 * settings.travel_mm + 2 * pull_off) / seek + 5 * pull_off / feed
         longest_s += 4 * (settings.homing_debounce_ms / 1000 + seek / settings.acceleration_mm_per_s2)
@@ -223,8 +225,10 @@ class GrblStage:
             "Hold": "feed hold: its button was pressed, or noise on the line or on A1 was taken for it; home or unlock",
             "Door": "the safety door is open: close it, then home or unlock",
             "Alarm": "locked by an alarm: home",
-            "Sleep": "asleep: home", "Check": "in check mode, in which nothing moves: send $C", "Jog": "jogging",
-        }  # fmt: skip
+            "Sleep": "asleep: home",
+            "Check": "in check mode, in which nothing moves: send $C",
+            "Jog": "jogging",
+        }
         if report.state in advice:
             raise self._failed(f"the controller has stopped: {advice[report.state]}")
         self._refuse_pressed_switch(report)

@@ -18,8 +18,8 @@ from pathlib import Path
 import serial
 from serial.tools.list_ports import comports
 
-from uwlts.errors import HardwareError
 from uwlts.hardware import laser_guard
+from uwlts.model.errors import HardwareError
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
 _BANNER = re.compile(r"Grbl (1\.1[a-z]?) \['\$' for help\]$")
@@ -128,10 +128,14 @@ def _parse_status(body: str) -> Status | None:
         return None
     x = {name: float(values.split(",")[0]) for name, values in positions.items()}
     return Status(
-        state=state[1], substate=int(state[2]) if state[2] else None, machine_mm=x.get("MPos"), work_mm=x.get("WPos"),
-        offset_mm=x.get("WCO"), spindle=float(fields["FS"].split(",")[-1]) if "FS" in fields else None,
+        state=state[1],
+        substate=int(state[2]) if state[2] else None,
+        machine_mm=x.get("MPos"),
+        work_mm=x.get("WPos"),
+        offset_mm=x.get("WCO"),
+        spindle=float(fields["FS"].split(",")[-1]) if "FS" in fields else None,
         pins=fields.get("Pn", ""),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -177,12 +181,22 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
     if values[13] != 0:
         raise HardwareError("the controller reports inches ($13=1) where millimetres are expected: send $13=0")
     return GrblSettings(
-        steps_per_mm=values[100], max_feed_mm_per_min=values[110], acceleration_mm_per_s2=values[120],
-        travel_mm=values[130], soft_limits=values[20] != 0, hard_limits=values[21] != 0, homing=values[22] != 0,
-        homes_to_negative=bool(int(values[23]) & 1), homing_feed_mm_per_min=values[24],
-        homing_seek_mm_per_min=values[25], homing_debounce_ms=values[26], homing_pull_off_mm=values[27],
-        spindle_max=values[30], spindle_min=values[31], laser_mode=values[32] != 0,
-    )  # fmt: skip
+        steps_per_mm=values[100],
+        max_feed_mm_per_min=values[110],
+        acceleration_mm_per_s2=values[120],
+        travel_mm=values[130],
+        soft_limits=values[20] != 0,
+        hard_limits=values[21] != 0,
+        homing=values[22] != 0,
+        homes_to_negative=bool(int(values[23]) & 1),
+        homing_feed_mm_per_min=values[24],
+        homing_seek_mm_per_min=values[25],
+        homing_debounce_ms=values[26],
+        homing_pull_off_mm=values[27],
+        spindle_max=values[30],
+        spindle_min=values[31],
+        laser_mode=values[32] != 0,
+    )
 
 
 def alarm_text(code: int) -> str:
@@ -207,28 +221,60 @@ _ALARMS = {
     6: ("homing: a reset stopped it", "home again"),
     7: ("homing: the safety door was opened", "close it and home again"),
     8: ("homing: the limit switch stayed pressed after the pull-off", "check its wiring, or enlarge the pull-off $27"),
-    9: ("homing: no limit switch was found", "check the switch, its wiring, the direction $23 and the travel $130; "
-        "a firmware that homes axes which are not there ends so too"),
-}  # fmt: skip
+    9: (
+        "homing: no limit switch was found",
+        "check the switch, its wiring, the direction $23 and the travel $130; "
+        "a firmware that homes axes which are not there ends so too",
+    ),
+}
 _ERRORS = {
-    1: "a word does not begin with a letter", 2: "a number is missing or malformed", 3: "unknown $ command",
-    4: "negative value", 5: "homing is disabled", 6: "the step pulse must be longer than 3 us",
-    7: "the EEPROM could not be read; its defaults are restored", 8: "this $ command needs an idle controller",
-    9: "locked by an alarm", 10: "soft limits need homing", 11: "line too long",
-    12: "the step rate would exceed 30 kHz", 13: "the safety door is open", 14: "line too long for the EEPROM",
-    15: "the jog's target exceeds the travel", 16: "invalid jog command", 17: "laser mode needs a PWM output",
-    20: "unsupported G-code", 21: "two commands of one modal group", 22: "no feed rate", 23: "a whole number is needed",
-    24: "two commands use the axis words", 25: "a word is repeated", 26: "axis words are missing",
-    27: "invalid line number", 28: "a value is missing", 29: "unsupported work coordinate system",
-    30: "G53 needs G0 or G1", 31: "unused axis words", 32: "an arc lacks axis words", 33: "invalid target",
-    34: "invalid arc radius", 35: "an arc lacks its offset", 36: "unused words", 37: "invalid axis for G43.1",
+    1: "a word does not begin with a letter",
+    2: "a number is missing or malformed",
+    3: "unknown $ command",
+    4: "negative value",
+    5: "homing is disabled",
+    6: "the step pulse must be longer than 3 us",
+    7: "the EEPROM could not be read; its defaults are restored",
+    8: "this $ command needs an idle controller",
+    9: "locked by an alarm",
+    10: "soft limits need homing",
+    11: "line too long",
+    12: "the step rate would exceed 30 kHz",
+    13: "the safety door is open",
+    14: "line too long for the EEPROM",
+    15: "the jog's target exceeds the travel",
+    16: "invalid jog command",
+    17: "laser mode needs a PWM output",
+    20: "unsupported G-code",
+    21: "two commands of one modal group",
+    22: "no feed rate",
+    23: "a whole number is needed",
+    24: "two commands use the axis words",
+    25: "a word is repeated",
+    26: "axis words are missing",
+    27: "invalid line number",
+    28: "a value is missing",
+    29: "unsupported work coordinate system",
+    30: "G53 needs G0 or G1",
+    31: "unused axis words",
+    32: "an arc lacks axis words",
+    33: "invalid target",
+    34: "invalid arc radius",
+    35: "an arc lacks its offset",
+    36: "unused words",
+    37: "invalid axis for G43.1",
     38: "tool number too large",
-}  # fmt: skip
+}
 _ADVICE = {
-    5: "wire the limit switch and send $22=1", 7: "check every setting with $$: they may all have changed",
-    8: "wait until it is at rest", 9: "home (or unlock where the position is known)", 10: "send $22=1 first",
-    12: "lower the greatest feed $110", 13: "close it", 17: "flash a Grbl with variable spindle",
-}  # fmt: skip
+    5: "wire the limit switch and send $22=1",
+    7: "check every setting with $$: they may all have changed",
+    8: "wait until it is at rest",
+    9: "home (or unlock where the position is known)",
+    10: "send $22=1 first",
+    12: "lower the greatest feed $110",
+    13: "close it",
+    17: "flash a Grbl with variable spindle",
+}
 
 
 SOFT_RESET, STATUS_QUERY, FEED_HOLD = b"\x18", b"?", b"!"
@@ -290,9 +336,13 @@ class GrblLine:
         try:
             # In a session of its own the terminal's Ctrl-C does not reach it.
             self._guard = subprocess.Popen(
-                [*command, str(descriptor)], pass_fds=(ending, descriptor), start_new_session=True,
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            )  # fmt: skip
+                [*command, str(descriptor)],
+                pass_fds=(ending, descriptor),
+                start_new_session=True,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
         except OSError as error:
             raise HardwareError(f"cannot start the guard that switches the laser off: {error.strerror}") from error
         finally:
@@ -406,9 +456,10 @@ class GrblLine:
         self.fault = what
         sent = self._try_to_reset()
         laser = (
-            "the command to switch the laser off was sent" if sent
+            "the command to switch the laser off was sent"
+            if sent
             else "the laser CANNOT be switched off: switch its power off before going near"
-        )  # fmt: skip
+        )
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
 
     def close(self, error: BaseException | None = None) -> None:

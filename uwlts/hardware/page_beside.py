@@ -37,9 +37,13 @@ class PageBeside:
         library = ctypes.CDLL(None)
         # In a session of its own the terminal's Ctrl-C does not reach it. It ends with a scan that is killed, too.
         self._process = subprocess.Popen(
-            self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, start_new_session=True,
+            self._command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
             preexec_fn=lambda: library.prctl(_SIGNAL_WHEN_PARENT_ENDS, signal.SIGTERM),
-        )  # fmt: skip
+        )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, _POLITE)
         threading.Thread(target=self._announce, args=(self._process,), daemon=True).start()
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.capture import Capture
-from uwlts.errors import HardwareError, ImageError
 from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
-from uwlts.importing.images import SUFFIXES, read_image
+from uwlts.model.errors import HardwareError, ImageError
+from uwlts.storage.capture import Capture
+from uwlts.storage.import_.images import SUFFIXES, read_image
 
 # Frames that may wait to be fetched, as in the buffers of a camera's driver; later ones are lost.
 _BUFFERS = 32

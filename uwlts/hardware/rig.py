@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from uwlts.errors import HardwareError
 from uwlts.hardware.camera import Camera, GrabbedFrame
 from uwlts.hardware.scan_plan import Light, ScanPlan
-from uwlts.sensor import Sensor
+from uwlts.model.errors import HardwareError
+from uwlts.model.sensor import Sensor
 from uwlts.stripe import StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98

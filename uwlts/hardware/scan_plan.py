@@ -6,12 +6,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from uwlts.capture import CaptureHeader
-from uwlts.errors import DescriptionError, DesignError, RangeError
-from uwlts.library import load_sensor, read_table, validated
-from uwlts.metrology.artefact_descriptions import parse_artefact
-from uwlts.placement import check_design
-from uwlts.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.model.artefacts import parse_artefact
+from uwlts.model.errors import DescriptionError, DesignError, RangeError
+from uwlts.model.library import load_sensor, read_table, validated
+from uwlts.model.placement import check_design
+from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
 Light = Literal["laser", "lamp"]
@@ -90,10 +90,16 @@ class ScanPlan(Description):
             parse_artefact(self.artefact)
         full = sensor.detector.full_scale_dn()
         table = {
-            "name": name, "sensor": sensor, "medium_name": self.medium, "medium": sensor.medium(self.medium),
-            "stage_direction": self.stage.direction, "saturation_dn": full + self.zero_dn(sensor),
-            "target": self.target, "artefact": self.artefact, "provenance": provenance,
-        }  # fmt: skip
+            "name": name,
+            "sensor": sensor,
+            "medium_name": self.medium,
+            "medium": sensor.medium(self.medium),
+            "stage_direction": self.stage.direction,
+            "saturation_dn": full + self.zero_dn(sensor),
+            "target": self.target,
+            "artefact": self.artefact,
+            "provenance": provenance,
+        }
         return validated(CaptureHeader, table, f"the plan '{self.title}'")
 
     def zero_dn(self, sensor: Sensor) -> int:

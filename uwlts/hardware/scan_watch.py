@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.errors import HardwareError
 from uwlts.hardware.rig import Brightness, Rig, not_few
-from uwlts.metrology.robust_fit import MAD_TO_STD
-from uwlts.sensor import Sensor
+from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.errors import HardwareError
+from uwlts.model.sensor import Sensor
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 LOOKS = 9
@@ -110,10 +110,15 @@ class LaserWatch:
 
     def _look_elsewhere(self, here: LitPlace) -> None:
         """See the stripe where it was, or somewhere; HardwareError where it is not."""
-        wanted = [self.lit] if self.lit else [
-            LitPlace(position, here.exposure_ms)
-            for position in spread(self._positions_mm, LOOKS) if position != here.position_mm
-        ]  # fmt: skip
+        wanted = (
+            [self.lit]
+            if self.lit
+            else [
+                LitPlace(position, here.exposure_ms)
+                for position in spread(self._positions_mm, LOOKS)
+                if position != here.position_mm
+            ]
+        )
         for place in wanted:
             self._rig.move_to(place.position_mm)
             lit, unlit = (self._rig.image(light, place.exposure_ms)[0] for light in ("laser", "lamp"))

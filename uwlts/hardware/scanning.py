@@ -14,8 +14,6 @@ from typing import Literal
 import numpy as np
 
 import uwlts
-from uwlts.capture import Capture, CaptureWriter, Frame, part_path
-from uwlts.errors import HardwareError
 from uwlts.hardware.camera import Camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.replay import ReplayCamera
@@ -32,8 +30,10 @@ from uwlts.hardware.scan_watch import (
     shows_laser,
     spread,
 )
-from uwlts.importing.images import without_background
-from uwlts.sensor import Sensor
+from uwlts.model.errors import HardwareError
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, CaptureWriter, Frame, part_path
+from uwlts.storage.import_.images import without_background
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 _FAINT = 0.1
@@ -76,8 +76,10 @@ class Seen:
         if self.faint:
             said.append(f"{self.faint} laser images are faint: lengthen laser_ms, or is the laser lit?")
         if self.lines and self.found < 0.05 * self.lines:
-            said.append(f"only {self.found} of {self.lines} profile lines show a stripe: is the laser lit, the object "
-                        "in the volume?")  # fmt: skip
+            said.append(
+                f"only {self.found} of {self.lines} profile lines show a stripe: is the laser lit, the object "
+                "in the volume?"
+            )
         if self.repeated:
             said.append(f"{self.repeated} images were lost on their way from the camera and taken again")
         return said
@@ -123,13 +125,19 @@ def record_scan(
     dtype = np.dtype(np.uint16) if plan.background or camera.info.bits > 8 else np.dtype(np.uint8)
     shots, seen = shots_of(plan), Seen()
     provenance = {
-        "source": "scan", "title": plan.title, "camera": f"{camera.info.name} {camera.info.serial}".strip(),
-        "stage": f"Grbl {stage.version}", "images": len(shots), "background": plan.background,
-        "laser_power": plan.laser_power, "uwlts": uwlts.__version__,
-    }  # fmt: skip
+        "source": "scan",
+        "title": plan.title,
+        "camera": f"{camera.info.name} {camera.info.serial}".strip(),
+        "stage": f"Grbl {stage.version}",
+        "images": len(shots),
+        "background": plan.background,
+        "laser_power": plan.laser_power,
+        "uwlts": uwlts.__version__,
+    }
     before_s = _recorded(part_path(out), seen) if resume else 0.0
-    with CaptureWriter(out, plan.header(out.stem, provenance=provenance), dtype=dtype, overwrite=overwrite,
-                       resume=resume) as writer:  # fmt: skip
+    with CaptureWriter(
+        out, plan.header(out.stem, provenance=provenance), dtype=dtype, overwrite=overwrite, resume=resume
+    ) as writer:
         begun = len(writer)
         if begun == len(shots):
             return seen
@@ -139,9 +147,14 @@ def record_scan(
         for shot in shots[begun:]:
             position, image, exposure_ms = taking.take(shot, last=shot is shots[-1])
             writer.append(
-                Frame(image.astype(dtype, copy=False), position, shot.light == "laser", exposure_ms,
-                      time.monotonic() - start_s)
-            )  # fmt: skip
+                Frame(
+                    image.astype(dtype, copy=False),
+                    position,
+                    shot.light == "laser",
+                    exposure_ms,
+                    time.monotonic() - start_s,
+                )
+            )
             progress(shot.number + 1, len(shots), seen)
         # What is replayed does not know where the stage is.
         if plan.check_steps and not isinstance(camera, ReplayCamera):
@@ -230,9 +243,11 @@ class _Taking:
 
     def _settled(self, light: Light) -> float | None:
         return settled_exposure(
-            lambda wanted: self._rig.image(light, wanted)[0], sensor=self._sensor, light=light,
+            lambda wanted: self._rig.image(light, wanted)[0],
+            sensor=self._sensor,
+            light=light,
             start_ms=self._seen.exposure_ms.get(light, START_MS),
-        )  # fmt: skip
+        )
 
     def take(self, shot: Shot, *, last: bool) -> tuple[float, np.ndarray, float]:
         """Position read back, image (H, W) as it is stored, and its exposure in ms."""
@@ -256,9 +271,11 @@ class _Taking:
 
     def _stripe(self, image: np.ndarray, unlit: np.ndarray | None) -> Stripe:
         return extract_stripe(
-            image, stripe_along=self._sensor.camera.stripe_along, background=unlit,
+            image,
+            stripe_along=self._sensor.camera.stripe_along,
+            background=unlit,
             saturation=self._sensor.detector.full_scale_dn(),
-        )  # fmt: skip
+        )
 
     def check_steps(self) -> None:
         """Visit an early place again, if one has relief; HardwareError where the stage stands elsewhere than before."""

@@ -7,15 +7,15 @@ from typing import Any, ClassVar, Literal, assert_never
 
 import numpy as np
 
-from uwlts.cloud import PointCloud
-from uwlts.errors import EvaluationError
-from uwlts.metrology.artefact_descriptions import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
 from uwlts.metrology.evaluation import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
 from uwlts.metrology.flat_fits import PlaneFit, fit_plane
-from uwlts.metrology.robust_fit import RobustFit, fit_robustly
+from uwlts.metrology.least_squares import RobustFit, fit_robustly
 from uwlts.metrology.round_fits import CylinderFit, fit_cylinder
-from uwlts.metrology.sphere_evaluation import evaluate_spheres
+from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile, step_height_of_scan
+from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
+from uwlts.model.errors import EvaluationError
+from uwlts.storage.cloud import PointCloud
 
 _MOST_REJECTED = 0.1
 _DIAMETER_TOLERANCE = 0.2

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, assert_never
 
 import numpy as np
 
-from uwlts.metrology.artefact_descriptions import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
-from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
+from uwlts.metrology.least_squares import VDI_OUTLIER_SHARE
+from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
 
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 """Direction from a surface to the sensor in the object coordinate system."""

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import EvaluationError
 from uwlts.metrology.least_squares import accepted_points, is_flat, normalise, principal_axes
+from uwlts.model.errors import EvaluationError
 
 
 @dataclass(frozen=True, eq=False)

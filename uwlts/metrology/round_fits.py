@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.errors import EvaluationError
 from uwlts.metrology.least_squares import (
     LARGEST_RELATIVE_STD,
     covariance_of,
@@ -16,6 +15,7 @@ from uwlts.metrology.least_squares import (
     principal_axes,
     require_convergence,
 )
+from uwlts.model.errors import EvaluationError
 
 _THINNED = 600
 _NEIGHBOURS = 12

@@ -10,10 +10,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.errors import EvaluationError
 from uwlts.metrology.flat_fits import LineFit, PlaneFit, fit_line, fit_plane
-from uwlts.metrology.least_squares import accepted_points, evenly_thinned, principal_axes
-from uwlts.metrology.robust_fit import DEFAULT_K, MAD_TO_STD
+from uwlts.metrology.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
+from uwlts.model.errors import EvaluationError
 
 # Shares of the height.
 _SEARCH_LIMIT = 0.05

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import EvaluationError
-from uwlts.truth import TruthStatus
+from uwlts.model.errors import EvaluationError
+from uwlts.storage.truth import TruthStatus
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from scipy import stats
 
-from uwlts.errors import RangeError
+from uwlts.model.errors import RangeError
 
 Distribution = Literal["normal", "uniform", "triangular"]
 _DIVISORS = {"normal": 1.0, "uniform": math.sqrt(3.0), "triangular": math.sqrt(6.0)}
@@ -127,11 +127,16 @@ def combine(sources: Iterable[Source], *, coverage_probability: float = 0.95) ->
     factor = float(stats.t.ppf((1 + coverage_probability) / 2, whole))
     correction = sum(source.sensitivity * source.correction for source in sources)
     return Budget(
-        sources=sources, standard_uncertainty=total,
+        sources=sources,
+        standard_uncertainty=total,
         shares_percent=tuple(100 * (part / total) ** 2 for part in parts),
-        degrees_of_freedom=freedom, coverage_probability=coverage_probability, coverage_factor=factor,
-        expanded_uncertainty=factor * total, correction=correction, largest_error=abs(correction) + factor * total,
-    )  # fmt: skip
+        degrees_of_freedom=freedom,
+        coverage_probability=coverage_probability,
+        coverage_factor=factor,
+        expanded_uncertainty=factor * total,
+        correction=correction,
+        largest_error=abs(correction) + factor * total,
+    )
 
 
 def thermal_expansion_mm(*, length_mm: float, alpha_per_k: float, temperature_change_k: float) -> float:

@@ -11,8 +11,8 @@ import numpy as np
 from markupsafe import Markup
 
 import uwlts
-from uwlts.calibration.model import Calibration
-from uwlts.evaluation_file import ArtefactFigures, TruthComparisons, TruthFigures
+from uwlts.measurement.evaluation_file import ArtefactFigures, TruthComparisons, TruthFigures
+from uwlts.model.calibration import Calibration
 from uwlts.report import plot
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
@@ -349,10 +349,18 @@ def introduction(campaign: Campaign) -> list[tuple[str, str]]:
     calibration = campaign.main_calibration
     if calibration is not None:
         window = calibration.calibration.window
-        seen = "no window" if window is None else (
-            f"window {fixed(window.distance_mm)} mm from the entrance pupil, "
-            + ("glass plate with two refractions" if window.refractions == 2 else "taken as one refracting interface")
-        )  # fmt: skip
+        seen = (
+            "no window"
+            if window is None
+            else (
+                f"window {fixed(window.distance_mm)} mm from the entrance pupil, "
+                + (
+                    "glass plate with two refractions"
+                    if window.refractions == 2
+                    else "taken as one refracting interface"
+                )
+            )
+        )
         source = calibration.calibration.provenance.get("source")
         facts.append(("Calibration", f"{calibration.name}: {seen}" + (f" ({source})" if source else "")))
     return facts

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.any_calibration import calibration_digest
-from uwlts.calibration.model import Calibration, read_calibration
-from uwlts.capture import Capture, CaptureHeader
-from uwlts.cloud import PointCloud, is_cloud, read_cloud
-from uwlts.errors import CaptureError, DescriptionError
-from uwlts.evaluation_file import EvaluationRecord, read_evaluation
-from uwlts.library import find, read_table
-from uwlts.sensor import Sensor
-from uwlts.truth import read_truth
+from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
+from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CaptureError, DescriptionError
+from uwlts.model.library import find, read_table
+from uwlts.model.sensor import Sensor
+from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.capture import Capture, CaptureHeader
+from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
+from uwlts.storage.truth import read_truth
 
 _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"
 

@@ -14,9 +14,9 @@ from uwlts.calibration.model_comparison.candidates import DIMENSIONS, Candidate,
 from uwlts.calibration.model_comparison.comparison import Choice, Comparison, Judged
 from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE
 from uwlts.calibration.model_comparison.scores import POINTS, STRIPES, PolynomialScore
-from uwlts.files import json_text
 from uwlts.report.numbers import fixed, small_length
 from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
+from uwlts.storage.files import json_text
 
 _WAYS = (INSIDE, OUTSIDE)
 
@@ -107,13 +107,20 @@ def _row(comparison: Comparison, judged: Judged) -> ModelRow:
     for where, score in judged.scores.items():
         cost = adds(choice, judged.candidate, choice.best(), where)
         scores[where] = HeldOutScore(
-            px=score.px, mm=score.mm, all_mm=score.all_mm, std_mm=score.std_mm,
-            adds_mm=None if cost is None else cost[0], adds_std_mm=None if cost is None else cost[1],
-        )  # fmt: skip
+            px=score.px,
+            mm=score.mm,
+            all_mm=score.all_mm,
+            std_mm=score.std_mm,
+            adds_mm=None if cost is None else cost[0],
+            adds_std_mm=None if cost is None else cost[1],
+        )
     return ModelRow(
-        model=model, parameters=judged.parameters, inside=scores[INSIDE], outside=scores[OUTSIDE],
+        model=model,
+        parameters=judged.parameters,
+        inside=scores[INSIDE],
+        outside=scores[OUTSIDE],
         as_good=judged.candidate in choice.as_good(),
-    )  # fmt: skip
+    )
 
 
 def _of_polynomials(comparison: Comparison) -> str:
@@ -183,9 +190,13 @@ def _picture(content: ModelComparisonContent) -> Markup | None:
         )
         # Both pictures number all models, including those that add nothing.
         axes.set(
-            title=f"{where} the calibrated volume", xlabel="model", ylabel="adds / µm", yscale="log",
-            xlim=(0.5, len(content.models) + 0.5), xticks=range(1, len(content.models) + 1),
-        )  # fmt: skip
+            title=f"{where} the calibrated volume",
+            xlabel="model",
+            ylabel="adds / µm",
+            yscale="log",
+            xlim=(0.5, len(content.models) + 0.5),
+            xticks=range(1, len(content.models) + 1),
+        )
     legend_below(figure)
     return svg_of(figure)
 
@@ -243,8 +254,9 @@ def _costs(choice: Choice, without: Judged, usual: Candidate) -> str:
     found = {where: adds(choice, without.candidate, usual, where) for where in without.scores}
     parts = [
         f"{small_length(cost[0])} ± {small_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"
-        for where, cost in found.items() if cost is not None
-    ]  # fmt: skip
+        for where, cost in found.items()
+        if cost is not None
+    ]
     return f"points are missed by a further {' and '.join(parts)} the calibrated volume" if parts else ""
 
 

@@ -30,8 +30,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 from markupsafe import Markup
 
-from uwlts.errors import OutputError
-from uwlts.files import refuse_unsuitable, written_aside
+from uwlts.model.errors import OutputError
+from uwlts.storage.files import refuse_unsuitable, written_aside
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -50,11 +50,21 @@ COLOURS = (BLUE, "#d9822b", "#2e8b57", RED, "#7b4fa3", "#5b6770", "#12a3a8", "#a
 """Colours of the lines of one figure, in order."""
 
 _STYLE: dict[Any, Any] = {
-    "font.size": 9.0, "axes.edgecolor": INK, "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK,
-    "ytick.color": INK, "axes.titlesize": 10.0, "axes.titleweight": "bold", "axes.titlelocation": "left",
-    "axes.grid": True, "axes.axisbelow": True, "grid.color": FAINT, "axes.spines.top": False,
+    "font.size": 9.0,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "axes.spines.top": False,
     "axes.spines.right": False,
-}  # fmt: skip
+}
 # Text stays text, and the same figure gives the same file.
 _SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "page"}
 
@@ -202,9 +212,14 @@ def legend_below(figure: Figure, *, columns: int = 4) -> None:
             entries.setdefault(label, handle)
     if entries:
         figure.legend(
-            entries.values(), entries.keys(), loc="outside lower left", ncols=columns, fontsize=9, frameon=False,
+            entries.values(),
+            entries.keys(),
+            loc="outside lower left",
+            ncols=columns,
+            fontsize=9,
+            frameon=False,
             labelcolor=INK,
-        )  # fmt: skip
+        )
 
 
 def svg_of(drawn: Drawn) -> Markup:

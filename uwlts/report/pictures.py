@@ -7,11 +7,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from uwlts.capture import Capture
-from uwlts.files import written_aside
 from uwlts.report import plot
 from uwlts.report.gather import Campaign, Measurement
 from uwlts.report.page_toolkit import new_figure, png_of
+from uwlts.storage.capture import Capture
+from uwlts.storage.files import written_aside
 from uwlts.stripe import Stripe, extract_stripe
 
 _WIDTH_IN, _TALLEST_IN = 11.2, 4.4

@@ -17,21 +17,11 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
-from uwlts.calibration.model import Calibration
-from uwlts.capture import Frame
-from uwlts.cloud import PointCloud
+from uwlts.model.calibration import Calibration
 from uwlts.report.numbers import as_fine_as, is_number, unit_for, unit_of, words_of
-from uwlts.report.page_toolkit import (
-    BLUE,
-    COLOURS,
-    FAINT,
-    INK,
-    RED,
-    figure_of,
-    new_figure,
-    plain_text,
-    typographic,
-)
+from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, RED, figure_of, new_figure, plain_text, typographic
+from uwlts.storage.capture import Frame
+from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe
 
 if TYPE_CHECKING:
@@ -40,8 +30,12 @@ if TYPE_CHECKING:
 Colour = Literal["deviation", "depth", "intensity", "uncertainty"]
 
 STOPS = (
-    (0.0, (33, 82, 172)), (0.25, (99, 161, 214)), (0.5, (205, 205, 200)), (0.75, (236, 139, 96)), (1.0, (170, 21, 40)),
-)  # fmt: skip
+    (0.0, (33, 82, 172)),
+    (0.25, (99, 161, 214)),
+    (0.5, (205, 205, 200)),
+    (0.75, (236, 139, 96)),
+    (1.0, (170, 21, 40)),
+)
 """Colours of deviations: place between -1 and +1 limit (0 to 1), and red-green-blue."""
 
 DEVIATIONS = LinearSegmentedColormap.from_list(
@@ -196,47 +190,63 @@ def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
         deviation = cloud.deviation_mm[chosen] * np.float32(factor)
         unknown = np.isnan(deviation)
         figure.add_scatter3d(
-            **_xyz(points[~unknown]), mode="markers", name="evaluated",
+            **_xyz(points[~unknown]),
+            mode="markers",
+            name="evaluated",
             marker={
-                "size": 2, "color": deviation[~unknown],
+                "size": 2,
+                "color": deviation[~unknown],
                 "colorscale": [[at, "rgb({}, {}, {})".format(*rgb)] for at, rgb in STOPS],
-                "cmin": -factor * limit, "cmax": factor * limit,
+                "cmin": -factor * limit,
+                "cmax": factor * limit,
                 "colorbar": {"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
             },
             hovertemplate=f"{place}<br>deviation %{{marker.color:.4g}} {unit}<extra></extra>",
-        )  # fmt: skip
+        )
         shown += f" The colours end at {LIMIT_STD:g} standard deviations, ±{factor * limit:.3g} {unit}."
     if unknown.any():
         coloured = cloud.deviation_mm is not None
         figure.add_scatter3d(
-            **_xyz(points[unknown]), mode="markers", name="not evaluated",
+            **_xyz(points[unknown]),
+            mode="markers",
+            name="not evaluated",
             marker={"size": 1.5, "color": UNKNOWN if coloured else PLAIN},
             hovertemplate=f"{place}<extra>not evaluated</extra>",
-        )  # fmt: skip
+        )
         shown += (
-            " Dark points were not evaluated: outliers, near an edge, or beside the artefact." if coloured
+            " Dark points were not evaluated: outliers, near an edge, or beside the artefact."
+            if coloured
             else " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
-        )  # fmt: skip
+        )
     low, high = cloud_limits(cloud.points_mm)
     axes = {
         f"{name}axis": {
-            "title": {"text": f"{name.upper()} / mm"}, "gridcolor": FAINT, "color": INK,
-            "range": [low[number], high[number]], "nticks": 8 if number == 1 else 5,
+            "title": {"text": f"{name.upper()} / mm"},
+            "gridcolor": FAINT,
+            "color": INK,
+            "range": [low[number], high[number]],
+            "nticks": 8 if number == 1 else 5,
         }
         for number, name in enumerate("xyz")
-    }  # fmt: skip
+    }
     figure.update_layout(
-        template="none", height=520, margin={"l": 0, "r": 0, "t": 0, "b": 0}, showlegend=False,
+        template="none",
+        height=520,
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        showlegend=False,
         font={"size": 12, "color": INK},
         scene={
-            **axes, "aspectmode": "manual", "aspectratio": _xyz(2.7 * (high - low) / (high - low).max()),
+            **axes,
+            "aspectmode": "manual",
+            "aspectratio": _xyz(2.7 * (high - low) / (high - low).max()),
             "dragmode": "orbit",
             "camera": {
-                "eye": _xyz(-1.6 * view_direction()), "up": {"x": 0, "y": 0, "z": -1},
+                "eye": _xyz(-1.6 * view_direction()),
+                "up": {"x": 0, "y": 0, "z": -1},
                 "projection": {"type": "orthographic"},
             },
         },
-    )  # fmt: skip
+    )
     return figure, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor."
 
 
@@ -273,8 +283,10 @@ def stripe(
         grey, names = grey.T, names[::-1]
     ax.imshow(
         grey.astype(np.float32) if enlarged else np.sqrt(np.maximum(grey.astype(np.float32), 0)),
-        cmap="gray", interpolation="nearest" if enlarged else "antialiased", vmin=0,
-    )  # fmt: skip
+        cmap="gray",
+        interpolation="nearest" if enlarged else "antialiased",
+        vmin=0,
+    )
     ax.set(xlabel=names[0], ylabel=names[1])
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(integer=True))

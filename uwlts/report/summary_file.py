@@ -8,11 +8,11 @@ from typing import Generic, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from uwlts.evaluation_file import TruthComparisons, TruthFigures
-from uwlts.files import written_aside
+from uwlts.measurement.evaluation_file import TruthComparisons, TruthFigures
 from uwlts.metrology.evaluation import Quantity
 from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
 from uwlts.report.tables import true_window_distance
+from uwlts.storage.files import written_aside
 
 KEY_FIGURES = {
     "sphere_spacing_error_mm": ("spheres", Quantity.SPACING_ERROR),

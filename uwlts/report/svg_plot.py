@@ -103,13 +103,17 @@ def _panel(panel: Panel, left: float, clip: str) -> str:
     x_low, x_high = (x_low / margin, x_high * margin) if panel.log_x else (x_low - margin, x_high + margin)
     x = _Axis(x_low, x_high, left + LEFT, left + WIDTH - RIGHT, panel.log_x)
     y = _Axis(*(panel.y_range or _extent(panel)), HEIGHT - BOTTOM, TOP, panel.log_y)
-    parts = [f'<clipPath id="{clip}"><rect x="{x.start}" y="{y.end}" width="{x.end - x.start}" '
-             f'height="{y.start - y.end}"/></clipPath>']  # fmt: skip
+    parts = [
+        f'<clipPath id="{clip}"><rect x="{x.start}" y="{y.end}" width="{x.end - x.start}" '
+        f'height="{y.start - y.end}"/></clipPath>'
+    ]
     for band in panel.bands:
         first, last = (x.at(v) for v in band.x) if band.x else (x.start, x.end)
         top, foot = y.at(band.high), y.at(band.low)
-        parts.append(f'<rect x="{first:.1f}" y="{top:.1f}" width="{last - first:.1f}" height="{foot - top:.1f}" '
-                     f'fill="{band.colour}" clip-path="url(#{clip})"/>')  # fmt: skip
+        parts.append(
+            f'<rect x="{first:.1f}" y="{top:.1f}" width="{last - first:.1f}" height="{foot - top:.1f}" '
+            f'fill="{band.colour}" clip-path="url(#{clip})"/>'
+        )
     for mark in panel.x_ticks or x.ticks():
         at = x.at(mark)
         parts += [_line(at, y.start, at, y.end, FAINT), _text(_number(mark), at, y.start + 17)]

@@ -11,20 +11,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from uwlts.calibration.model import Calibration
-from uwlts.calibration.nominal import nominal_calibration
 from uwlts.metrology.evaluation import FigureKey
+from uwlts.model.calibration import Calibration
+from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.gather import CALIBRATION, Campaign, GatheredCalibration, Measurement, Reference
 from uwlts.report.numbers import fixed, is_number, plain, unit_of, words_of
 from uwlts.report.page_toolkit import MISSING, Comparison
 from uwlts.report.plot import SHORT_LIST
 
-_QUANTITIES = {
-    "PE": "probing error PE",
-    "RE": "range error RE",
-    "STD": "deviations STD",
-    "range": "deviations range",
-}
+_QUANTITIES = {"PE": "probing error PE", "RE": "range error RE", "STD": "deviations STD", "range": "deviations range"}
 _ORDER = ("sphere spacing", "step height", "pipe diameter", "diameter", "probing", "range", "deviations", "ovality")
 _WIDTH = 110
 
@@ -157,8 +152,7 @@ def parameter_table(campaign: Campaign) -> Comparison:
         parameters.append(_parameters(nominal_calibration(campaign.true_sensor)))
     names = dict.fromkeys(name for table in parameters for name in table)
     return Comparison(
-        tuple(columns),
-        tuple((*name, tuple(table.get(name, MISSING) for table in parameters)) for name in names),
+        tuple(columns), tuple((*name, tuple(table.get(name, MISSING) for table in parameters)) for name in names)
     )
 
 
@@ -176,8 +170,12 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
     std = _camera_std(calibration)
     table = {}
-    for key, words in {"fx_px": "focal length, x", "fy_px": "focal length, y", "cx_px": "principal point, x",
-                       "cy_px": "principal point, y"}.items():  # fmt: skip
+    for key, words in {
+        "fx_px": "focal length, x",
+        "fy_px": "focal length, y",
+        "cx_px": "principal point, x",
+        "cy_px": "principal point, y",
+    }.items():
         known = next((std[name] for name in _STD_NAMES[key] if name in std), None)
         table[words, "px"] = _with_std(getattr(camera, key), known, 3)
     for name in ("k1", "k2", "k3", "p1", "p2"):

@@ -9,7 +9,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from uwlts.errors import ImageError
+from uwlts.model.errors import ImageError
 from uwlts.stripe.candidates import (
     block_contrast,
     block_extremes,

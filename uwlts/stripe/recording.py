@@ -8,8 +8,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from uwlts.errors import CaptureError, ImageError
-from uwlts.sensor import Sensor
+from uwlts.model.errors import CaptureError, ImageError
+from uwlts.model.sensor import Sensor
 from uwlts.stripe.extract import extract_stripe
 from uwlts.stripe.result import StripeOptions, StripeStatus
 
@@ -87,7 +87,7 @@ def find_stripes(
     Parameters
     ----------
     capture : LaserImages
-        Such as an opened `uwlts.capture.Capture`.
+        Such as an opened `uwlts.storage.capture.Capture`.
     options : StripeOptions, optional
     progress : callable, optional
         Called after each image with the number of images done and the number in all.

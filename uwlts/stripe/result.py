@@ -7,7 +7,7 @@ from enum import IntEnum, StrEnum
 
 import numpy as np
 
-from uwlts.errors import RangeError
+from uwlts.model.errors import RangeError
 from uwlts.stripe.methods import method_names
 
 

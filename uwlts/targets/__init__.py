@@ -10,19 +10,9 @@ from pkgutil import iter_modules
 from uwlts.targets.charuco import CharucoTarget
 from uwlts.targets.chessboard import ChessboardTarget
 from uwlts.targets.circles import CircleTarget
-from uwlts.targets.ellipse_bias import circle_centre_bias
 from uwlts.targets.target import Patch, Target, TargetView, parse_target
 
-__all__ = [
-    "CharucoTarget",
-    "ChessboardTarget",
-    "CircleTarget",
-    "Patch",
-    "Target",
-    "TargetView",
-    "circle_centre_bias",
-    "parse_target",
-]
+__all__ = ["CharucoTarget", "ChessboardTarget", "CircleTarget", "Patch", "Target", "TargetView", "parse_target"]
 
 for _module in iter_modules(__path__):
     if not _module.ispkg:

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.errors import TargetError
-from uwlts.sensor import Positive
+from uwlts.model.errors import TargetError
+from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices, rectangle_corners
 
 _MIN_CORNERS = 4

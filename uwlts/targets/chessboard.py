@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from uwlts.errors import TargetError
-from uwlts.sensor import Positive
+from uwlts.model.errors import TargetError
+from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 
 _SECTOR_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY

@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.errors import TargetError
-from uwlts.sensor import Positive
+from uwlts.model.errors import TargetError
+from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 
 Place = tuple[int, int]

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from uwlts.errors import DescriptionError
-from uwlts.sensor import Description
+from uwlts.model.errors import DescriptionError
+from uwlts.model.sensor import Description
 
 # A target seen in part is found from about a dozen points, or from this share of a larger one: fewer are too likely to
 # miss the marks or markers that number them.

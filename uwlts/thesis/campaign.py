@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from uwlts.errors import CaptureError
-from uwlts.files import written_aside
+from uwlts.model.errors import CaptureError
+from uwlts.storage.files import written_aside
 
 MEDIA = ("air", "water")
 OBJECTS = ("spheres", "plane", "pipe", "head", "weld")

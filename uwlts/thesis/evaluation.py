@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.any_calibration import AnyCalibration
-from uwlts.calibration.model import Calibration
-from uwlts.calibration.nominal import nominal_calibration
-from uwlts.calibration.polynomial_model import PolynomialCalibration
-from uwlts.calibration.procedure import CalibrationOptions, gather
-from uwlts.capture import Capture
-from uwlts.errors import CaptureError
-from uwlts.reconstruction import reconstruct_by_polynomials
-from uwlts.scan import reconstruct
+from uwlts.calibration.sequential import CalibrationOptions, gather
+from uwlts.measurement.reconstruction import reconstruct
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CaptureError
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.reconstruction import reconstruct_by_polynomials
+from uwlts.runtime.workers import work_through
+from uwlts.storage.capture import Capture
 from uwlts.thesis.campaign import MEDIA, CampaignFolder, ScanFile, keep, kept, up_to_date
 from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED, THESIS, TWO, Measurement, calibrations, measure_scan
 from uwlts.thesis.monte_carlo import propagate
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan, window_choices
-from uwlts.workers import work_through
 
 RESULTS = "results.json"
 FORMAT, VERSION = "uwlts-thesis-results", 1
@@ -34,9 +34,13 @@ Progress = Callable[[str, int, int], None]
 
 
 def evaluate_campaign(
-    folder: CampaignFolder, *, trials: int = TRIALS, workers: int | None = None, overwrite: bool = False,
+    folder: CampaignFolder,
+    *,
+    trials: int = TRIALS,
+    workers: int | None = None,
+    overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Results of a campaign as plain JSON, kept in its file results.json; read from there if no recording is newer.
 
     Kept results without the Monte-Carlo propagation, or with another number of trials, are completed.
@@ -90,9 +94,11 @@ def _measured(
     clouds.mkdir(exist_ok=True)
     scans, numbers = folder.scans(), count(1)
     found = work_through(
-        partial(_measure, calibrated, clouds), scans, workers=workers,
+        partial(_measure, calibrated, clouds),
+        scans,
+        workers=workers,
         heard=lambda _: progress("measurements", next(numbers), len(scans)),
-    )  # fmt: skip
+    )
     return list(chain.from_iterable(found))
 
 
@@ -126,9 +132,11 @@ def _curves(calibration: PolynomialCalibration) -> dict[str, Any]:
             calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
         ).points_mm
         lines[name] = {
-            "line": number, "centre_px": np.round(centres, 3).tolist(),
-            "y_mm": np.round(points[:, 1], 4).tolist(), "z_mm": np.round(points[:, 2], 4).tolist(),
-        }  # fmt: skip
+            "line": number,
+            "centre_px": np.round(centres, 3).tolist(),
+            "y_mm": np.round(points[:, 1], 4).tolist(),
+            "z_mm": np.round(points[:, 2], 4).tolist(),
+        }
     return {"lines": lines, "residual_mm": calibration.residuals["depth"]["rms_mm"]}
 
 
@@ -142,9 +150,11 @@ def _budget(
     wanted = ("spheres", "water", PROPOSED, THESIS)
     spheres = [m for m in measurements if (m.thing, m.medium, m.method, m.processing) == wanted]
     return spacing_budget(
-        calibration, scans, medium,
+        calibration,
+        scans,
+        medium,
         deviation_mm=max((m.figures_mm["STD"] for m in spheres if "STD" in m.figures_mm), default=0.0),
-    )  # fmt: skip
+    )
 
 
 def _monte_carlo(
@@ -159,16 +169,25 @@ def _monte_carlo(
         steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
         evidence, medium = gather(air, steps, options=options), steps[0].header.medium
     found = propagate(
-        evidence, scans, medium, _knowledge(folder), options=options, trials=trials, workers=workers,
+        evidence,
+        scans,
+        medium,
+        _knowledge(folder),
+        options=options,
+        trials=trials,
+        workers=workers,
         progress=lambda done, total: progress("Monte Carlo", done, total),
-    )  # fmt: skip
+    )
     intervals = [
         {
-            "placement": each.placement, "observed_mm": each.observed_mm, "std_mm": each.std_mm(),
-            "interval_mm": each.interval_mm(), "contains_truth": each.contains_truth(),
+            "placement": each.placement,
+            "observed_mm": each.observed_mm,
+            "std_mm": each.std_mm(),
+            "interval_mm": each.interval_mm(),
+            "contains_truth": each.contains_truth(),
         }
         for each in found
-    ]  # fmt: skip
+    ]
     return {"monte_carlo": intervals, "trials": trials}
 
 

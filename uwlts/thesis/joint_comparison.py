@@ -14,22 +14,23 @@ from markupsafe import Markup
 import uwlts
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.model import Calibration, write_calibration
-from uwlts.calibration.procedure import CalibrationOptions
-from uwlts.capture import Capture
-from uwlts.design import speckle_limit_um
-from uwlts.design_table import nominal_setup
-from uwlts.files import written_aside
-from uwlts.metrology.artefact_descriptions import parse_artefact
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.measurement.figure_uncertainty import figure_uncertainties
+from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.model.artefacts import parse_artefact
+from uwlts.model.calibration import Calibration
+from uwlts.optics.design import speckle_limit_um
+from uwlts.report.inventory import nominal_setup
 from uwlts.report.page_toolkit import render_page
 from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
-from uwlts.scan import reconstruct_stripes
+from uwlts.runtime.workers import Tell, work_through
+from uwlts.storage.calibration_file import write_calibration
+from uwlts.storage.capture import Capture
+from uwlts.storage.files import written_aside
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile, keep, kept, up_to_date
 from uwlts.thesis.measurements import PROPOSED, TWO, calibrations
-from uwlts.uncertainty.figures import figure_uncertainties
-from uwlts.workers import Tell, work_through
 
 RESULTS = "joint.json"
 FORMAT, VERSION = "uwlts-joint-comparison", 1
@@ -67,9 +68,12 @@ def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
 
 
 def compare_campaigns(
-    folders: Sequence[CampaignFolder], *, workers: int | None = None, again: bool = False,
+    folders: Sequence[CampaignFolder],
+    *,
+    workers: int | None = None,
+    again: bool = False,
     progress: Progress = lambda done, total: None,
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> list[dict[str, Any]]:
     """Errors of every scan of spheres and planes by the three ways, with the joint one's uncertainties, as plain JSON.
 
     Those of each campaign are kept in its folder, and read from there unless ``again`` is set or a recording is newer.
@@ -152,13 +156,13 @@ def _of_plane(scan: ScanFile, joint: Calibration) -> dict[str, Any]:
         camera = header.sensor.camera
         window = setup.window if joint.window is None else replace(setup.window, distance_mm=joint.window.distance_mm)
         across = 1e-3 * speckle_limit_um(
-            wavelength_nm=joint.wavelength_nm, focal_length_mm=camera.focal_length_mm, f_number=camera.f_number,
+            wavelength_nm=joint.wavelength_nm,
+            focal_length_mm=camera.focal_length_mm,
+            f_number=camera.f_number,
             distance_mm=float(window.reach_mm(depth)),
-        )  # fmt: skip
+        )
     limit = across * leaning / np.tan(setup.triangulation_angle_rad)
-    return {
-        "placement": scan.placement, "medium": scan.medium, "std_mm": std_mm, "over_limit": float(std_mm / limit),
-    }  # fmt: skip
+    return {"placement": scan.placement, "medium": scan.medium, "std_mm": std_mm, "over_limit": float(std_mm / limit)}
 
 
 def joint_summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -198,9 +202,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
 
 
 _WORDS = {ONE_REFRACTION: "one refraction", TWO_REFRACTIONS: "two refractions", JOINT: "joint"}
-_QUANTITIES = {
-    "spacing_error_mm": ("sphere spacing", (SPACING,)), "diameter_error_mm": ("sphere diameter", DIAMETERS),
-}  # fmt: skip
+_QUANTITIES = {"spacing_error_mm": ("sphere spacing", (SPACING,)), "diameter_error_mm": ("sphere diameter", DIAMETERS)}
 # Side by side within each campaign.
 _BESIDE = {ONE_REFRACTION: -0.2, TWO_REFRACTIONS: 0.0, JOINT: 0.2}
 
@@ -223,8 +225,11 @@ def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> st
     """The page as text, from the results of `compare_campaigns` and their `joint_summary`."""
     media = [medium for medium in ("water", "air") if any(summary[medium]["spacing_error_mm"].values())]
     return render_page(
-        "uwlts.thesis", "joint.html.j2",
-        software=f"uwlts {uwlts.__version__}", campaigns=summary["campaigns"], solve_s=max(summary["solve_s"]),
+        "uwlts.thesis",
+        "joint.html.j2",
+        software=f"uwlts {uwlts.__version__}",
+        campaigns=summary["campaigns"],
+        solve_s=max(summary["solve_s"]),
         media=[
             {
                 "name": medium,
@@ -235,7 +240,7 @@ def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> st
             }
             for medium in media
         ],
-    )  # fmt: skip
+    )
 
 
 def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
@@ -245,12 +250,15 @@ def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
         means = {way: float(np.mean(np.abs(errors))) for way, errors in part[name].items()}
         rows += [
             {
-                "quantity": quantity, "way": _WORDS[way], "mean": mean,
-                "largest": float(np.max(np.abs(part[name][way]))), "times": mean / means[JOINT],
+                "quantity": quantity,
+                "way": _WORDS[way],
+                "mean": mean,
+                "largest": float(np.max(np.abs(part[name][way]))),
+                "times": mean / means[JOINT],
                 "number": len(part[name][way]),
             }
             for way, mean in means.items()
-        ]  # fmt: skip
+        ]
     return rows
 
 

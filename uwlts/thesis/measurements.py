@@ -14,21 +14,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uwlts.calibration.any_calibration import AnyCalibration, read_any_calibration
-from uwlts.calibration.model import Calibration, write_calibration
 from uwlts.calibration.polynomial import calibrate_polynomials
-from uwlts.calibration.polynomial_model import PolynomialCalibration, write_polynomials
-from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially
-from uwlts.capture import Capture
-from uwlts.cloud import PointCloud, write_cloud
-from uwlts.errors import CalibrationError, CaptureError, EvaluationError
-from uwlts.evaluation import Evaluation, evaluate
-from uwlts.metrology.artefact_descriptions import parse_artefact
-from uwlts.metrology.robust_fit import VDI_OUTLIER_SHARE
-from uwlts.scan import reconstruct_stripes
+from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
+from uwlts.measurement.evaluation import Evaluation, evaluate
+from uwlts.measurement.reconstruction import reconstruct_stripes
+from uwlts.metrology.least_squares import VDI_OUTLIER_SHARE
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.artefacts import parse_artefact
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError, CaptureError, EvaluationError
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.storage.calibration_file import read_any_calibration, write_calibration, write_polynomials
+from uwlts.storage.capture import Capture
+from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import FoundStripes, find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile
-from uwlts.truth import read_truth, truth_path
 
 PROPOSED, TWO, POLYNOMIALS, SINGLE = "proposed", "two refractions", "polynomials", "single viewpoint"
 FORGOTTEN = "window forgotten"
@@ -133,9 +134,10 @@ def _peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: i
 THESIS, OURS = "thesis", "ours"
 """Image processing: the thesis's, and this program's default."""
 VARIANTS = {
-    "thesis, mean of 5x5": {"tolerance": 0.0}, "thesis, fit over 3 px": {"fitted_px": 3},
+    "thesis, mean of 5x5": {"tolerance": 0.0},
+    "thesis, fit over 3 px": {"fitted_px": 3},
     "thesis, fit over 7 px": {"fitted_px": 7},
-}  # fmt: skip
+}
 """Other readings of the thesis's text, tried on the spheres by the proposed method."""
 _SHOWN = ("pipe", "head", "weld")
 """Things whose coloured clouds are kept for the report."""

@@ -14,12 +14,12 @@ from itertools import count
 import numpy as np
 
 from uwlts.calibration.evidence import AirEvidence, StepEvidence
-from uwlts.calibration.procedure import CalibrationOptions, CalibrationResult, Evidence, solve
-from uwlts.camera import project
-from uwlts.errors import CalibrationError, EvaluationError, RangeError
-from uwlts.sensor import Medium
+from uwlts.calibration.sequential import CalibrationOptions, CalibrationResult, Evidence, solve
+from uwlts.model.errors import CalibrationError, EvaluationError, RangeError
+from uwlts.model.sensor import Medium
+from uwlts.optics.camera import project
+from uwlts.runtime.workers import work_through
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_error
-from uwlts.workers import work_through
 
 COVERAGE = 0.95
 LEAST_TRIALS = 20
@@ -103,9 +103,11 @@ def propagate(
     draw = _Draw(evidence, start, medium, knowledge, wavelength_nm=start.calibration.wavelength_nm)
     numbers = count(1)
     made = work_through(
-        partial(_trial, draw, scans, options, start, seed), range(trials), workers=workers,
+        partial(_trial, draw, scans, options, start, seed),
+        range(trials),
+        workers=workers,
         heard=lambda _: progress(next(numbers), trials),
-    )  # fmt: skip
+    )
     spacing = np.array([errors for errors in made if errors is not None])
     if trials - len(spacing) > trials // 10:
         raise CalibrationError(f"{trials - len(spacing)} of {trials} trials give no calibration or no spheres")
@@ -116,9 +118,14 @@ def propagate(
 
 
 def _trial(
-    draw: "_Draw", scans: Sequence[SphereScan], options: CalibrationOptions, start: CalibrationResult, seed: int,
-    number: int, tell: Callable[[None], None],
-) -> list[float] | None:  # fmt: skip
+    draw: "_Draw",
+    scans: Sequence[SphereScan],
+    options: CalibrationOptions,
+    start: CalibrationResult,
+    seed: int,
+    number: int,
+    tell: Callable[[None], None],
+) -> list[float] | None:
     """Sphere spacing errors of one trial; None where its inputs give no calibration or no spheres."""
     tell(None)
     try:
@@ -128,9 +135,12 @@ def _trial(
 
 
 def _errors(
-    draw: "_Draw", scans: Sequence[SphereScan], options: CalibrationOptions, start: CalibrationResult,
+    draw: "_Draw",
+    scans: Sequence[SphereScan],
+    options: CalibrationOptions,
+    start: CalibrationResult,
     rng: np.random.Generator,
-) -> list[float]:  # fmt: skip
+) -> list[float]:
     perturbed = draw.evidence(rng)
     calibration = solve(perturbed, options=options, start=start.camera).calibration
     index = draw.index(rng)
@@ -151,9 +161,14 @@ class _Draw:
     """Draws inputs about those observed."""
 
     def __init__(
-        self, evidence: Evidence, start: CalibrationResult, medium: Medium, knowledge: Mapping[str, float], *,
+        self,
+        evidence: Evidence,
+        start: CalibrationResult,
+        medium: Medium,
+        knowledge: Mapping[str, float],
+        *,
         wavelength_nm: float,
-    ):  # fmt: skip
+    ):
         self._evidence, self._medium, self._wavelength = evidence, medium, wavelength_nm
         self._known = {name: float(value) for name, value in knowledge.items()}
         self._circle_px = start.camera.sigma_px

@@ -11,19 +11,14 @@ from typing import Any
 from markupsafe import Markup
 
 import uwlts
-from uwlts.capture import Capture
-from uwlts.cloud import read_cloud
-from uwlts.files import written_aside
 from uwlts.report import plot
 from uwlts.report.page_toolkit import png_data_uri, render_page
 from uwlts.report.pictures import stripe_picture, stripe_view
+from uwlts.storage.capture import Capture
+from uwlts.storage.cloud import read_cloud
+from uwlts.storage.files import written_aside
 from uwlts.thesis.campaign import campaign_folders
-from uwlts.thesis.figures import (
-    comparison_figure,
-    line_figure,
-    polynomials_figures,
-    window_distance_figure,
-)
+from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
 from uwlts.thesis.measurements import FORGOTTEN
 from uwlts.thesis.tables import LARGEST_RATIO, MEAN, Published, TableRow, all_rows, headline_rows
 
@@ -190,9 +185,11 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
     shown = [
         row
         for row in rows
-        if row.table == "Figure 66" and row.quantity == "STD" and row.row.endswith("thesis image processing")
+        if row.table == "Figure 66"
+        and row.quantity == "STD"
+        and row.row.endswith("thesis image processing")
         and FORGOTTEN not in row.row
-    ]  # fmt: skip
+    ]
     return render_page(
         "uwlts.thesis",
         "template.html.j2",
@@ -206,20 +203,22 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
         ],
         differences=differences(rows),
         figures=[
-            ("Figure 66", "Means over the positions: bars are ours (blue in water, red in air), the line spans the "
-             "campaigns, diamonds are the thesis's.", Markup(comparison_figure([*headline, *shown]))),
+            (
+                "Figure 66",
+                "Means over the positions: bars are ours (blue in water, red in air), the line spans the "
+                "campaigns, diamonds are the thesis's.",
+                Markup(comparison_figure([*headline, *shown])),
+            ),
             ("Figure 45", "Points on a step for several window distances.", Markup(window_distance_figure(first))),
             ("Figure 58", "Polynomials Z(v).", Markup(z_of_v)),
             ("Figure 59", "Polynomials Y(Z).", Markup(y_of_z)),
         ]
         + ([("Figure 67", "Stripe on a 300 mm pipe.", Markup(line_figure(first)))] if first["line_profiles"] else []),
         monte_carlo=_monte_carlo(results),
-        failures=[
-            (number, m) for number, result in enumerate(results) for m in result["measurements"] if m["failure"]
-        ],
+        failures=[(number, m) for number, result in enumerate(results) for m in result["measurements"] if m["failure"]],
         pictures=_pictures(folder),
         version=uwlts.__version__,
-    )  # fmt: skip
+    )
 
 
 def _folded(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[TableRow | None]]]]:
@@ -244,13 +243,11 @@ def _monte_carlo(results: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
         for each in result["monte_carlo"]
     ]
     return {
-        "intervals": [
-            (number, each) for number, result in enumerate(results) for each in result["monte_carlo"]
-        ],
+        "intervals": [(number, each) for number, result in enumerate(results) for each in result["monte_carlo"]],
         "held": sum(each["contains_truth"] for each in trials),
         "budget_held": sum(held),
         "count": len(trials),
-    }  # fmt: skip
+    }
 
 
 def _pictures(folder: Path) -> list[tuple[str, str, str]]:

@@ -5,20 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.any_calibration import AnyCalibration
 from uwlts.calibration.evidence import step_evidence
-from uwlts.calibration.model import Calibration
-from uwlts.calibration.procedure import nominal_window, step_image
+from uwlts.calibration.sequential import nominal_window, step_image
 from uwlts.calibration.window import StepImage, solve_window, step_profile
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError
-from uwlts.metrology.artefact_descriptions import SphereStandard
+from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.round_fits import fit_sphere
-from uwlts.metrology.sphere_evaluation import evaluate_spheres
+from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
-from uwlts.reconstruction import reconstruct_pixels
-from uwlts.scan import reconstruct_stripes
-from uwlts.sensor import Medium
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.artefacts import SphereStandard
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
+from uwlts.model.sensor import Medium
+from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import STEP_PLACES, CampaignFolder
 
@@ -108,9 +108,12 @@ def mean_spacing_error(calibration: Calibration, scans: Sequence[SphereScan]) ->
 def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: float | None = None) -> float:
     """Sphere spacing error of a scan in mm, in a medium of another index if one is given."""
     points = reconstruct_pixels(
-        calibration, scan.pixels, medium_index=medium_index or scan.medium_index,
-        stage_mm=scan.stage_mm, stage_direction=scan.stage_direction,
-    )  # fmt: skip
+        calibration,
+        scan.pixels,
+        medium_index=medium_index or scan.medium_index,
+        stage_mm=scan.stage_mm,
+        stage_direction=scan.stage_direction,
+    )
     return scan.spacing_error(points.points_mm)
 
 
@@ -207,12 +210,14 @@ def spacing_budget(
             Source(name="resolution", half_width=resolution / 2, distribution="uniform"),
             Source(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),
             Source(
-                name="SSE", half_width=float(np.std(errors, ddof=1)), degrees_of_freedom=len(errors) - 1,
+                name="SSE",
+                half_width=float(np.std(errors, ddof=1)),
+                degrees_of_freedom=len(errors) - 1,
                 correction=correction,
             ),
             Source(name="PE", half_width=deviation_mm),
         ]
-    )  # fmt: skip
+    )
     return {source.name: source.standard_uncertainty for source in budget.sources} | {
         "degrees_of_freedom": budget.degrees_of_freedom,
         "expanded": budget.expanded_uncertainty,

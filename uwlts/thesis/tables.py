@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.errors import DescriptionError
-from uwlts.library import find, read_table
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import find, read_table
 from uwlts.thesis.campaign import MEDIA, STEP_PLACES
 from uwlts.thesis.measurements import FORGOTTEN, OURS, POLYNOMIALS, PROPOSED, SINGLE, THESIS, TWO, VARIANTS
 
@@ -130,9 +130,12 @@ def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
     counts = {len(values) for values in complete}
     if complete and len(counts) == 1:
         yield TableRow(
-            rows[0].table, name, rows[0].quantity,
-            None if None in theirs else float(np.mean(theirs)), tuple(np.mean(complete, axis=0).tolist()),
-        )  # fmt: skip
+            rows[0].table,
+            name,
+            rows[0].quantity,
+            None if None in theirs else float(np.mean(theirs)),
+            tuple(np.mean(complete, axis=0).tolist()),
+        )
 
 
 @dataclass(frozen=True)
@@ -187,12 +190,14 @@ def _refractions(seen: _Seen) -> Iterator[TableRow]:
     for (key, method), name in product((("one", PROPOSED), ("two", TWO)), ("STD", "SSE")):
         rows = [
             TableRow(
-                "Table 5", f"{key} refraction{'s' if key == 'two' else ''}, {place}", name,
+                "Table 5",
+                f"{key} refraction{'s' if key == 'two' else ''}, {place}",
+                name,
                 seen.published.value("refractions", key, name, number),
                 seen.figures("spheres", place, "water", method, THESIS, name),
             )
             for number, place in enumerate(seen.published.positions("spheres"))
-        ]  # fmt: skip
+        ]
         yield from _with_mean(rows, f"{key} refraction{'s' if key == 'two' else ''}, {MEAN}")
 
 

@@ -1,11 +1,128 @@
-"""Which parts of the image the target's points have covered, and how far tilts and distances are spread."""
+"""Poses of a target before a camera: which are possible, what an image of each would add, and what is covered."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
+import cv2
 import numpy as np
 
+from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
+from uwlts.calibration.target_images import Placement, observe
+from uwlts.model.calibration import CameraModel
+from uwlts.model.sensor import Sensor
+from uwlts.optics.camera import directions
+from uwlts.targets import Target
+
+TILT_RAD = np.radians(25.0)
+
+
+_PLACES = (0.2, 0.5, 0.8)
+
+
+_DEPTHS = (0.1, 0.5, 0.9)
+
+
+_MARGIN_PX = 10.0
+
+
+# So many of a candidate's points stand for all of them: the others repeat what these tell.
+_SAMPLE = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose ``T_camera_target`` (4, 4) with the pixels (N, 2) and the information (P, P) that its image would give.
+
+    The information is for points that are found to 1 px.
+    """
+
+    pose: np.ndarray
+    pixels: np.ndarray
+    information: np.ndarray
+
+
+def target_middle(target: Target) -> np.ndarray:
+    """Middle (3,) of a target's points in its frame, mm."""
+    return target.points_mm.mean(axis=0)
+
+
+def working_range_mm(sensor: Sensor) -> tuple[float, float]:
+    """Nearest and farthest distance from the pupil at which the sensor is meant to see something."""
+    window = sensor.camera.window
+    outer = window.distance_mm + window.thickness_mm
+    return outer + sensor.volume.near_mm, outer + sensor.volume.far_mm
+
+
+def information_of(
+    points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, options: CameraOptions
+) -> np.ndarray:
+    """What the points of one image, each found to 1 px, tell of the camera's parameters (P, P), its pose being unknown.
+
+    The pose's part is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
+    """
+    intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
+    placement = Placement(points_mm, np.zeros(len(points_mm)), pixels, np.zeros(len(points_mm), dtype=int), 1.0)
+    local = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
+    seen = observe(placement, intrinsics, intrinsics.from_model(camera), local)
+    if seen is None:
+        return np.zeros((len(intrinsics.names),) * 2)
+    by_global, basis = seen.by_global, np.linalg.qr(seen.by_local / np.linalg.norm(seen.by_local, axis=0))[0]
+    left = by_global - basis @ (basis.T @ by_global)
+    return left.T @ left
+
+
+def candidates(
+    target: Target, camera: CameraModel, options: CameraOptions, *, range_mm: tuple[float, float], spin_rad: float = 0.0
+) -> list[Candidate]:
+    """Poses at three distances, nine places of the image, nine tilts, in which the target could be found.
+
+    Parameters
+    ----------
+    range_mm : (nearest, farthest)
+        Distances along the camera's axis.
+    spin_rad : float
+        How the target is turned in the image, from its x axis to the image's.
+    """
+    points, middle = target.points_mm, target_middle(target)
+    step = max(1, len(points) // _SAMPLE)
+    found = []
+    for depth, x, y, rotation in product(_DEPTHS, _PLACES, _PLACES, _rotations(spin_rad)):
+        distance = range_mm[0] + depth * (range_mm[1] - range_mm[0])
+        ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = ray / ray[2] * distance - rotation @ middle
+        pixels = _seen(points, pose, camera)
+        largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
+        inside = np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
+        if not target.findable(inside):
+            continue
+        sample = np.flatnonzero(inside)[::step]
+        tells = information_of(points[sample], pixels[sample], pose, camera, options)
+        found.append(Candidate(pose, pixels[inside], tells * inside.sum() / len(sample)))
+    return found
+
+
+def _rotations(spin_rad: float) -> list[np.ndarray]:
+    """Rotations (3, 3): square to the camera, and tilted so that one of eight sides of the image is farther."""
+    spin = cv2.Rodrigues(np.array([0.0, 0.0, spin_rad]))[0]
+    sides = np.arange(8) * np.pi / 4
+    tilts = [np.zeros(3), *(TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
+    return [cv2.Rodrigues(tilt)[0] @ spin for tilt in tilts]
+
+
+def _seen(points: np.ndarray, pose: np.ndarray, camera: CameraModel) -> np.ndarray:
+    """Pixels (N, 2) of the target's points; far outside the image where a point lies behind the camera."""
+    rotation = cv2.Rodrigues(pose[:3, :3])[0]
+    pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
+    behind = points @ pose[2, :3] + pose[2, 3] <= 0
+    return np.where(behind[:, None], -1e6, pixels)
+
+
 _LONG_SIDE_CELLS = 8
+
+
 _POINTS_IN_CELL = 3
 
 

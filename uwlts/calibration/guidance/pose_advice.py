@@ -5,27 +5,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.camera_poses import CameraSolution
-from uwlts.calibration.guidance.candidates import (
+from uwlts.calibration.camera import CameraSolution
+from uwlts.calibration.guidance.coverage import (
     Candidate,
+    Coverage,
+    Spread,
     candidates,
+    coverage_of,
     information_of,
+    place_words,
+    spread_of,
     target_middle,
+    tilts_rad,
     working_range_mm,
 )
-from uwlts.calibration.guidance.coverage import Coverage, Spread, coverage_of, place_words, spread_of, tilts_rad
-from uwlts.calibration.guidance.solution import (
-    RecordedPose,
-    Setting,
-    nominal_camera,
-    pose_of,
-    sheet_of,
-    solve_recorded,
-)
+from uwlts.calibration.guidance.solution import RecordedPose, Setting, nominal_camera, pose_of, sheet_of, solve_recorded
 from uwlts.calibration.intrinsics import Intrinsics
-from uwlts.calibration.model import CameraModel
-from uwlts.camera import project
-from uwlts.errors import CalibrationError
+from uwlts.model.calibration import CameraModel
+from uwlts.model.errors import CalibrationError
+from uwlts.optics.camera import project
 from uwlts.targets import TargetView
 
 # Until the residuals tell: how well points are usually found. Sharp circles do better, in reality too.
@@ -154,12 +152,17 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
         information = information + _scaled(view, where, camera, setting, sigma)
     image = setting.sensor.camera
     return State(
-        setting=setting, wanted=wanted, recorded=tuple(recorded), camera=camera, solution=solution,
-        undetermined=undetermined, poses=poses.reshape(-1, 4, 4),
+        setting=setting,
+        wanted=wanted,
+        recorded=tuple(recorded),
+        camera=camera,
+        solution=solution,
+        undetermined=undetermined,
+        poses=poses.reshape(-1, 4, 4),
         coverage=coverage_of([p.view.pixels for p in recorded], width_px=image.width_px, height_px=image.height_px),
         spread=spread_of(list(poses), [pose.view.points_mm.mean(axis=0) for pose in recorded]),
         information=information,
-    )  # fmt: skip
+    )
 
 
 def lack(state: State, information: np.ndarray, coverage: Coverage, poses: Iterable[np.ndarray]) -> float:
@@ -193,11 +196,13 @@ def best_pose(state: State, *, spin_rad: float = 0.0) -> PoseAdvice | None:
     before = lack(state, state.information, state.coverage, state.poses)
     after = [
         lack(
-            state, state.information + c.information / sigma**2, state.coverage.with_points(c.pixels),
+            state,
+            state.information + c.information / sigma**2,
+            state.coverage.with_points(c.pixels),
             [*state.poses, c.pose],
         )
         for c in options
-    ]  # fmt: skip
+    ]
     best = int(np.argmin(after))
     place, distance = middle_of(options[best].pose, state)
     return PoseAdvice(options[best], before - after[best], place, distance)

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.circle_bias import solve_without_bias
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.model import CameraModel
 from uwlts.calibration.sheet import SheetSolution, fit_sheet, points_on_target
-from uwlts.calibration.target_image import TargetImage
-from uwlts.errors import CalibrationError, RangeError
-from uwlts.placement import laser_pose
-from uwlts.sensor import Medium, Sensor
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.calibration import CameraModel
+from uwlts.model.errors import CalibrationError, RangeError
+from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import Medium, Sensor
 from uwlts.targets import Target, TargetView
 
 # A residual this many times that of the others, and this much beyond what noise alone may do, contradicts them.
@@ -53,9 +53,14 @@ def nominal_camera(setting: Setting) -> CameraModel:
     f, (cx, cy) = camera.focal_length_px() * index, camera.principal_point()
     distortion = camera.distortion if index == 1.0 else type(camera.distortion)()
     return CameraModel(
-        width_px=camera.width_px, height_px=camera.height_px, fx_px=f, fy_px=f, cx_px=cx, cy_px=cy,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        fx_px=f,
+        fy_px=f,
+        cx_px=cx,
+        cy_px=cy,
         distortion=distortion,
-    )  # fmt: skip
+    )
 
 
 def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
@@ -80,9 +85,14 @@ def solve_recorded(recorded: Sequence[RecordedPose], setting: Setting) -> Camera
 
     def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
         return solve_camera(
-            images, width_px=camera.width_px, height_px=camera.height_px, poses=setting.poses,
-            approaching=setting.approaching, options=setting.camera, start=start,
-        )  # fmt: skip
+            images,
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            poses=setting.poses,
+            approaching=setting.approaching,
+            options=setting.camera,
+            start=start,
+        )
 
     images = [pose.image() for pose in recorded]
     try:
@@ -114,9 +124,12 @@ def sheet_of(recorded: Sequence[RecordedPose], solution: CameraSolution, setting
     """The laser sheet by the recorded stripes; CalibrationError where they do not determine it yet."""
     target = setting.target
     points = points_on_target(
-        solution.model, [pose.stripe for pose in recorded], solution.target_poses, extent_mm=target.extent_mm,
+        solution.model,
+        [pose.stripe for pose in recorded],
+        solution.target_poses,
+        extent_mm=target.extent_mm,
         margin_mm=target.spacing_mm / 2,
-    )  # fmt: skip
+    )
     return fit_sheet(points.points_mm, nominal_normal=laser_pose(setting.sensor).normal)
 
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.evidence import StepEvidence
-from uwlts.calibration.model import Calibration, WindowModel
-from uwlts.calibration.procedure import step_image
-from uwlts.errors import EvaluationError, ImageError
-from uwlts.metrology.artefact_descriptions import StepStandard
-from uwlts.reconstruction import points_on_sheet
-from uwlts.sensor import Sensor
+from uwlts.calibration.sequential import step_image
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.errors import EvaluationError, ImageError
+from uwlts.model.sensor import Sensor
+from uwlts.optics.reconstruction import points_on_sheet
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 
 PLACES = 3

@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from uwlts.calibration.joint.evidence import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.noise import Noise, judged, outliers, with_slope_bias
-from uwlts.calibration.joint.observations import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters
-from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
-from uwlts.calibration.joint.surfaces import SCANNED
-from uwlts.calibration.parameter_keys import ParameterKey
+from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
-from uwlts.errors import CalibrationError
-from uwlts.sensor import Uncertainty
+from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import ParameterKey
+from uwlts.model.sensor import Uncertainty
 
 Evidence = TargetEvidence | StepProfileEvidence | SurfaceScanEvidence
 Correct = Callable[[Sequence[Evidence], np.ndarray, Sequence[np.ndarray]], list[Evidence]]
@@ -115,16 +114,26 @@ def estimate(
             for e, parts, masks in zip(corrected, residuals, left_out, strict=True)
         ]
         moved = max(
-            (float(np.abs(a.placement.pixels - b.placement.pixels).max())
-             for a, b in zip(used, evidence, strict=True) if isinstance(a, TargetEvidence)), default=0.0,
-        )  # fmt: skip
+            (
+                float(np.abs(a.placement.pixels - b.placement.pixels).max())
+                for a, b in zip(used, evidence, strict=True)
+                if isinstance(a, TargetEvidence)
+            ),
+            default=0.0,
+        )
         steady = all(abs(known[k].effective_px() / before[k].effective_px() - 1) < _SETTLED for k in known)
         if moved <= _SETTLED_PX and not first and (steady or last):
             return Estimate(
-                parameters=parameters, values=global_values, covariance=fit.covariance / fit.sigma**2, local=local,
-                noise=known, residuals=residuals, outliers=sum(int(mask.sum()) for parts in left_out for mask in parts),
-                rounds=rounds, stopped=fit.stopped if steady else UNSETTLED,
-            )  # fmt: skip
+                parameters=parameters,
+                values=global_values,
+                covariance=fit.covariance / fit.sigma**2,
+                local=local,
+                noise=known,
+                residuals=residuals,
+                outliers=sum(int(mask.sum()) for parts in left_out for mask in parts),
+                rounds=rounds,
+                stopped=fit.stopped if steady else UNSETTLED,
+            )
     raise CalibrationError(
         f"the joint calibration did not settle in {_ROUNDS} rounds: the offsets of the circles' images still move by "
         f"{moved:.2g} px; is the circles' diameter right?"
@@ -140,9 +149,13 @@ class _Problem:
         self._position_mm = uncertainty.stage_position_mm
 
     def fit(
-        self, evidence: Sequence[Evidence], global_values: np.ndarray, local: Sequence[np.ndarray],
-        noise: dict[str, Noise], left_out: list[list[np.ndarray]] | None,
-    ) -> SchurFit:  # fmt: skip
+        self,
+        evidence: Sequence[Evidence],
+        global_values: np.ndarray,
+        local: Sequence[np.ndarray],
+        noise: dict[str, Noise],
+        left_out: list[list[np.ndarray]] | None,
+    ) -> SchurFit:
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
             if group == len(evidence):
                 return self._before(global_values)
@@ -164,9 +177,14 @@ class _Problem:
         if left_out is not None:
             return schur_least_squares(model, global_values, starts, smallest_gain=_SMALLEST_GAIN, damping=_DAMPING)
         return schur_least_squares(
-            model, global_values, starts, smallest_gain=_FIRST_GAIN, damping=_FIRST_DAMPING, soft_limit=_SOFT_LIMIT,
+            model,
+            global_values,
+            starts,
+            smallest_gain=_FIRST_GAIN,
+            damping=_FIRST_DAMPING,
+            soft_limit=_SOFT_LIMIT,
             enough_rounds=_FIRST_ROUNDS,
-        )  # fmt: skip
+        )
 
     def _before(self, global_values: np.ndarray) -> list[Observation]:
         """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
@@ -209,9 +227,11 @@ def _thinned(evidence: Evidence) -> Evidence:
     if not isinstance(evidence, TargetEvidence):
         return evidence
     return replace(
-        evidence, stripe_pixels=evidence.stripe_pixels[::_FIRST_EVERY],
-        stripe_image=evidence.stripe_image[::_FIRST_EVERY], stripe_shifts_mm=evidence.stripe_shifts_mm[::_FIRST_EVERY],
-    )  # fmt: skip
+        evidence,
+        stripe_pixels=evidence.stripe_pixels[::_FIRST_EVERY],
+        stripe_image=evidence.stripe_image[::_FIRST_EVERY],
+        stripe_shifts_mm=evidence.stripe_shifts_mm[::_FIRST_EVERY],
+    )
 
 
 def _of_local(off: np.ndarray, by_local: np.ndarray, local: np.ndarray, global_values: int) -> Observation:

@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from uwlts.calibration.joint.estimate import Estimate, Evidence
+from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence
 from uwlts.calibration.joint.noise import outliers
-from uwlts.calibration.joint.observations import TARGET, StepProfileEvidence
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
-from uwlts.calibration.joint_estimate import CoveredRegion, ImageFit, JointEstimate
-from uwlts.calibration.parameter_keys import LensParameter, WindowParameter
-from uwlts.errors import CalibrationError
+from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
+from uwlts.model.errors import CalibrationError
+from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
+from uwlts.model.parameter_keys import LensParameter, WindowParameter
 
 
 def joint_estimate(

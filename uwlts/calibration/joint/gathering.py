@@ -1,4 +1,4 @@
-"""What captures show of all evidence, and through what they were taken."""
+"""Evidence of captures and prior knowledge from descriptions, as the joint calibration needs them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,15 +6,53 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.evidence import Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
-from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.scan_start import ScanStripes, scan_stripes
-from uwlts.calibration.joint.start import Series
-from uwlts.calibration.procedure import CalibrationOptions, common_sensor, sources_of
-from uwlts.calibration.sources import captures_in
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError
-from uwlts.sensor import Medium, Sensor
+from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
+from uwlts.calibration.joint.initial_scans import ScanStripes, scan_stripes
+from uwlts.calibration.joint.parameters import Prior, View
+from uwlts.calibration.joint.scanned_surfaces import SLOPES
+from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sources_of
+from uwlts.calibration.target_images import Placement, placements, single_images
+from uwlts.model.calibration import WindowModel
+from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import (
+    MediumIndex,
+    ParameterKey,
+    SheetParameter,
+    StageParameter,
+    StepHeight,
+    TargetParameter,
+    WindowParameter,
+)
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.storage.capture import Capture
+from uwlts.storage.capture_sources import captures_in
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Images of the target seen through the same.
+
+    Attributes
+    ----------
+    view : View
+    found : AirEvidence
+    approaching : bool or None
+        Whether the stage moves the sensor towards the target; None where it moves otherwise.
+    names : list of str
+        Of the captures.
+    """
+
+    view: View
+    found: AirEvidence
+    approaching: bool | None
+    names: list[str]
+
+    def placements(self, *, free: bool) -> list[Placement]:
+        """The images joined by the stage's motion, or one by one."""
+        if free or self.approaching is None:
+            return single_images(self.found.images)
+        return placements(self.found.images, approaching=self.approaching)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +98,13 @@ class Gathered:
 
 
 def gather_jointly(
-    targets: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = (), *,
-    options: CalibrationOptions, progress: Progress | None = None,
-) -> Gathered:  # fmt: skip
+    targets: Sequence[Capture],
+    steps: Sequence[Capture],
+    scans: Sequence[Capture] = (),
+    *,
+    options: CalibrationOptions,
+    progress: Progress | None = None,
+) -> Gathered:
     """Find the target, the stripes on it and those on steps and scanned surfaces in all images.
 
     Raises
@@ -103,9 +145,14 @@ def gather_jointly(
         on_scans.append(scan_stripes(capture, _view(capture, media, name), stripe=options.stripe))
     windowed = [c for c in [*steps, *targets, *scans] if c.header.sensor.camera.window.mounted]
     return Gathered(
-        sensor=windowed[0].header.sensor if windowed else sensor, media=media, series=series, steps=on_steps,
-        scans=on_scans, provenance=provenance, warnings=warnings,
-    )  # fmt: skip
+        sensor=windowed[0].header.sensor if windowed else sensor,
+        media=media,
+        series=series,
+        steps=on_steps,
+        scans=on_scans,
+        provenance=provenance,
+        warnings=warnings,
+    )
 
 
 def refuse_two_lenses(gathered: Gathered) -> None:
@@ -146,3 +193,53 @@ def _approaching(captures: Sequence[Capture]) -> bool | None:
     """Whether the stage moves the sensor towards the target; None where it does not move along the OCS's Z."""
     along = {float(capture.header.stage_direction[2]) for capture in captures}
     return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
+
+
+def priors_of(
+    gathered: Gathered,
+    window: WindowModel | None,
+    indices: list[float],
+    turns: np.ndarray,
+    heights: dict[StepHeight, Prior],
+    options: CalibrationOptions,
+) -> dict[ParameterKey, Prior]:
+    """What is known of all global parameters but the lens's.
+
+    Parameters
+    ----------
+    window : WindowModel or None
+        As described.
+    indices : list of float
+        Of the media, as described.
+    turns : (3,)
+        Where the sheet's turns and shift start.
+    heights : dict
+        Of the step standards.
+    """
+    sensor, known = gathered.sensor, gathered.sensor.uncertainty
+    priors: dict[ParameterKey, Prior] = {}
+    if window is not None:
+        tilt = float(np.tan(np.radians(known.window_tilt_deg)))
+        normal = np.array(window.normal) / window.normal[2]
+        priors |= {
+            WindowParameter.DISTANCE: Prior(window.distance_mm, known.window_distance_mm),
+            WindowParameter.SLOPE_X: Prior(float(normal[0]), tilt),
+            WindowParameter.SLOPE_Y: Prior(float(normal[1]), tilt),
+            WindowParameter.THICKNESS: Prior(window.thickness_mm, known.glass_thickness_mm),
+            WindowParameter.GLASS_INDEX: Prior(window.glass_index, known.glass_index),
+        }
+    for (name, medium), index in zip(gathered.media.items(), indices, strict=True):
+        std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
+        priors[MediumIndex(name)] = Prior(index, known.index if options.medium_index else std)
+    priors |= {key: Prior(float(value), np.inf) for key, value in zip(SHEET[:3], turns, strict=True)}
+    bow, turn = np.radians([known.bow_deg, known.laser_window_tilt_deg])
+    priors[SheetParameter.BOW] = Prior(float(np.radians(sensor.laser.bow_deg)), float(bow))
+    if gathered.media and sensor.laser.window.mounted:
+        priors[SheetParameter.WINDOW_TURN] = Prior(float(np.arcsin(sensor.laser.window.normal()[0])), float(turn))
+    if gathered.scans:
+        lean = float(np.tan(np.radians(known.stage_alignment_deg)))
+        priors |= dict.fromkeys(SLOPES, Prior(0.0, lean))
+    if options.poses != "free" or gathered.scans:
+        priors[StageParameter.SCALE] = Prior(0.0, known.stage_scale)
+    priors[TargetParameter.BOW] = Prior(0.0, known.target_bow_mm)
+    return priors | heights

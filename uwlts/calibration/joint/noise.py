@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.joint.observations import TARGET, Residuals
-from uwlts.metrology.robust_fit import MAD_TO_STD
+from uwlts.calibration.joint.evidence import TARGET, Residuals
+from uwlts.metrology.least_squares import MAD_TO_STD
 
 _OUTLIER = 5.0
 _LAGS = 100
 _SHARED_LAG = 0.05
 _SLOPE_BIAS_PX = 0.01
-"""Size of the error of a stripe's centre that goes with the slope of the surface, of which `uwlts.brightness` takes out
-two thirds where rendered spheres show it."""
+"""Size of the error of a stripe's centre that goes with the slope of the surface, of which
+`uwlts.optics.brightness` takes out two thirds where rendered spheres show it."""
 
 _FINEST_PX = 1e-3
 """No point of an image counts as better known, lest what is known before counts for nothing."""

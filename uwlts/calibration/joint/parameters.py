@@ -1,16 +1,71 @@
-"""The parameters that all evidence shares: their keys, where they start, what is known of them before."""
+"""An earlier joint estimate as knowledge before a new one: all its parameters at once, with their correlations."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from uwlts.calibration.intrinsics import Intrinsics
-from uwlts.calibration.joint.earlier import EarlierEstimate
-from uwlts.calibration.joint.rays import COLUMNS, LENS, WINDOW, RayDerivatives, ray_derivatives
-from uwlts.calibration.joint.sheet_derivatives import PARAMETERS as SHEET
-from uwlts.calibration.joint.sheet_derivatives import DescribedSheet, PointDerivatives, points_on_sheet
-from uwlts.calibration.model import CameraModel, SheetModel, WindowModel
-from uwlts.calibration.parameter_keys import MediumIndex, ParameterKey, parameter_of
+from uwlts.calibration.joint.derivatives import (
+    COLUMNS,
+    LENS,
+    WINDOW,
+    DescribedSheet,
+    PointDerivatives,
+    RayDerivatives,
+    points_on_sheet,
+    ray_derivatives,
+)
+from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
+from uwlts.model.calibration import CameraModel, SheetModel, WindowModel
+from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import MediumIndex, ParameterKey, parameter_of
+
+
+@dataclass(frozen=True, eq=False)
+class EarlierEstimate:
+    """What an earlier estimate says of the first K parameters of a vector.
+
+    Attributes
+    ----------
+    values : (K,)
+    covariance : (K, K)
+    whitening : (K, K)
+        W with W^T W the inverse of the covariance: W (x - values) are K residuals of variance one, independent.
+
+    Raises
+    ------
+    CalibrationError
+        The covariance is not positive definite.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    whitening: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        variance = np.diag(self.covariance)
+        try:
+            if not variance.min() > 0:
+                raise np.linalg.LinAlgError("a variance is not positive")
+            # Pixels, millimetres and radians stand beside each other: factored as correlations, none is lost.
+            std = np.sqrt(variance)
+            root = np.linalg.cholesky(self.covariance / np.outer(std, std))
+        except np.linalg.LinAlgError as error:
+            raise CalibrationError(
+                f"the covariance of the earlier calibration is damaged or says nothing ({error}): calibrate again"
+            ) from error
+        object.__setattr__(self, "whitening", np.linalg.inv(root) / std)
+
+    def std(self) -> np.ndarray:
+        """Standard uncertainty (K,) of each parameter."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def residuals(self, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (K,) of variance one of a vector (P,) that begins with these parameters, and derivatives (K, P)."""
+        count = len(self.values)
+        by_global = np.zeros((count, len(global_values)))
+        by_global[:, :count] = self.whitening
+        return self.whitening @ (global_values[:count] - self.values), by_global
 
 
 @dataclass(frozen=True)
@@ -88,10 +143,12 @@ class Parameters:
         normal = np.array([slope_x, slope_y, 1.0])
         return self.window.model_copy(
             update={
-                "distance_mm": distance, "thickness_mm": thickness, "glass_index": index,
+                "distance_mm": distance,
+                "thickness_mm": thickness,
+                "glass_index": index,
                 "normal": tuple((normal / np.linalg.norm(normal)).tolist()),
             }
-        )  # fmt: skip
+        )
 
     def sheet_model(self, values: np.ndarray) -> SheetModel:
         """The sheet of a vector."""

@@ -1,33 +1,32 @@
 """The joint calibration from captures: target images in air and in water, stripes on it, steps, scans; in any mix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.circle_centres import centred
-from uwlts.calibration.joint.contradictions import findings
+from uwlts.calibration.joint.consistency import findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
+from uwlts.calibration.joint.evidence import TargetEvidence
 from uwlts.calibration.joint.evidence_summary import joint_estimate, lens_and_window_figures
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly, refuse_two_lenses
+from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of, refuse_two_lenses
+from uwlts.calibration.joint.initial import line_start, series_start, sheet_start, step_profiles
+from uwlts.calibration.joint.initial_scans import surface_scans
 from uwlts.calibration.joint.parameters import Parameters, View
-from uwlts.calibration.joint.priors import priors_of
-from uwlts.calibration.joint.scan_start import surface_scans
-from uwlts.calibration.joint.start import series_start, sheet_start
-from uwlts.calibration.joint.step_start import line_start, step_profiles
-from uwlts.calibration.joint.surface_scans import SurfaceScanEvidence
-from uwlts.calibration.joint.surfaces import Plane
-from uwlts.calibration.joint_estimate import JointEstimate
-from uwlts.calibration.model import Calibration, KnownMedium, KnownStage
-from uwlts.calibration.procedure import CalibrationOptions, nominal_window
+from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
+from uwlts.calibration.sequential import CalibrationOptions, nominal_window
 from uwlts.calibration.sheet import object_frame
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError
-from uwlts.placement import laser_pose
-from uwlts.sensor import Uncertainty
+from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
+from uwlts.model.errors import CalibrationError
+from uwlts.model.joint_estimate import JointEstimate
+from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import Uncertainty
+from uwlts.optics.camera import project_through_window
+from uwlts.storage.capture import Capture
+from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +61,13 @@ class JointProblem:
     def solve(self) -> Estimate:
         """The estimate, not judged yet; errors as `estimate`."""
         return estimate(
-            self.parameters, self.evidence, self.global_values, self.local, uncertainty=self.uncertainty,
+            self.parameters,
+            self.evidence,
+            self.global_values,
+            self.local,
+            uncertainty=self.uncertainty,
             correct=None if self.diameter_mm is None else partial(centred, self.parameters, self.diameter_mm),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +163,7 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     sources = gathered.sources(free=free)
     sources += [{e.image: gathered.steps[e.image][0].source} for e, _ in steps]
     sources += [e.sources() for e, _ in scans]
-    return JointProblem(
-        parameters, evidence, global_values, local, sensor.uncertainty, diameter_mm, sources,
-        warnings,
-    )  # fmt: skip
+    return JointProblem(parameters, evidence, global_values, local, sensor.uncertainty, diameter_mm, sources, warnings)
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
@@ -192,9 +192,13 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
 
 
 def _calibration(
-    gathered: Gathered, result: Estimate, frame: np.ndarray, stages: list[KnownStage], joint: JointEstimate,
+    gathered: Gathered,
+    result: Estimate,
+    frame: np.ndarray,
+    stages: list[KnownStage],
+    joint: JointEstimate,
     provenance: dict[str, Any],
-) -> Calibration:  # fmt: skip
+) -> Calibration:
     sensor, parameters, values = gathered.sensor, result.parameters, result.values
     sheet = parameters.sheet_model(values)
     wet = parameters.window is None and gathered.media
@@ -216,3 +220,37 @@ def _calibration(
         joint=joint,
         provenance=provenance,
     )
+
+
+def centred(
+    parameters: Parameters,
+    diameter_mm: float,
+    found: Sequence[Evidence],
+    global_values: np.ndarray,
+    local: Sequence[np.ndarray],
+) -> list[Evidence]:
+    """The evidence with the images of the circles' centres instead of the centres of the circles' images."""
+    return [
+        _with_centres(e, parameters, global_values, o, diameter_mm) if isinstance(e, TargetEvidence) else e
+        for e, o in zip(found, local, strict=True)
+    ]
+
+
+def _with_centres(
+    evidence: TargetEvidence, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
+) -> TargetEvidence:
+    view, placement = evidence.view, evidence.placement
+    camera, index = parameters.camera(global_values), parameters.medium_index(global_values, view)
+    window = parameters.window_model(global_values) if view.window else None
+    pixels = placement.pixels.copy()
+    for image in np.unique(placement.image):
+        pose, here = evidence.pose(parameters, global_values, local, image), placement.image == image
+
+        def project(points: np.ndarray, pose: np.ndarray = pose) -> np.ndarray:
+            seen = points @ pose[:3, :3].T + pose[:3, 3]
+            return project_through_window(camera, window, seen, medium_index=index)
+
+        pixels[here] -= circle_centre_bias(
+            project, placement.points_mm[here], diameter_mm=diameter_mm, axis_u=np.eye(3)[0], axis_v=np.eye(3)[1]
+        )
+    return replace(evidence, placement=replace(placement, pixels=pixels))

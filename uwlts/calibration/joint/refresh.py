@@ -1,35 +1,236 @@
-"""A joint calibration carried over to new water by images of a step in it; what it found is what is known before."""
+"""What images in new water changed: its index, and how well lengths in it are known."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from uwlts.calibration.any_calibration import check_fits
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.contradictions import Findings, findings
-from uwlts.calibration.joint.earlier import EarlierEstimate
-from uwlts.calibration.joint.estimate import Estimate, estimate
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly
-from uwlts.calibration.joint.observations import StepProfileEvidence
-from uwlts.calibration.joint.parameters import Parameters, View
-from uwlts.calibration.joint.priors import priors_of
-from uwlts.calibration.joint.refreshed_calibration import refreshed_calibration
-from uwlts.calibration.joint.sheet_derivatives import PARAMETERS as SHEET
-from uwlts.calibration.joint.step_start import line_start, step_profiles
-from uwlts.calibration.joint.stored import StoredEstimate, found_estimate
-from uwlts.calibration.joint.water_change import WaterChange, water_changes
-from uwlts.calibration.model import Calibration
-from uwlts.calibration.parameter_keys import MediumIndex
-from uwlts.calibration.procedure import CalibrationOptions
-from uwlts.calibration.sources import captures_in
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError, RangeError
-from uwlts.sensor import Medium, Sensor
+from uwlts.calibration.joint.consistency import Findings, findings
+from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
+from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
+from uwlts.calibration.joint.evidence import StepProfileEvidence
+from uwlts.calibration.joint.evidence_summary import joint_estimate, lens_and_window_figures, outline
+from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
+from uwlts.calibration.joint.initial import line_start, step_profiles
+from uwlts.calibration.joint.observability import Lengths, Region, estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import EarlierEstimate, Parameters, View
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, found_estimate, require_joint
+from uwlts.calibration.sequential import CalibrationOptions, sources_of
+from uwlts.calibration.sheet import object_frame
+from uwlts.model.any_calibration import calibration_digest, check_fits
+from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
+from uwlts.model.errors import CalibrationError, RangeError
+from uwlts.model.joint_estimate import CoveredRegion, JointEstimate
+from uwlts.model.parameter_keys import MediumIndex
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.storage.capture import Capture
+from uwlts.storage.capture_sources import captures_in
+
+
+@dataclass(frozen=True)
+class LengthChange:
+    """The length over the volume that was known worst before.
+
+    Attributes
+    ----------
+    length_mm : float
+    before_mm, after_mm : float
+        Standard uncertainty by the calibration.
+    longer_mm : float
+        By how much it is measured longer than by what was known before.
+    """
+
+    length_mm: float
+    before_mm: float
+    after_mm: float
+    longer_mm: float
+
+
+@dataclass(frozen=True)
+class WaterChange:
+    """New water by its name, its index with its standard uncertainty before and after, and what a length gains."""
+
+    name: str
+    index_before: float
+    std_before: float
+    index: float
+    std: float
+    length: LengthChange | None
+
+    def lines(self) -> list[str]:
+        """The change in words."""
+        lines = [
+            f"index of {self.name}: {self.index_before:.5f} ± {self.std_before:.2g} before, {self.index:.5f} ± "
+            f"{self.std:.2g} by the step (standard uncertainties)"
+        ]
+        if self.length is not None:
+            length = self.length
+            lines.append(
+                f"a length of {length.length_mm:.0f} mm, the one known worst: ± {2 * length.before_mm:.4f} mm before, "
+                f"± {2 * length.after_mm:.4f} mm now (k = 2, by the calibration); it is measured "
+                f"{abs(length.longer_mm):.4f} mm {'longer' if length.longer_mm > 0 else 'shorter'}"
+            )
+        return lines
+
+
+def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChange]:
+    """What an estimate to which an earlier one was known says of the media that are new in it and were seen.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        That of the estimate.
+    result : Estimate
+    """
+    parameters, earlier = result.parameters, result.parameters.earlier
+    if earlier is None:
+        return []
+    count, before = len(earlier.values), parameters.prior_mean()
+    before[:count] = earlier.values
+    covariance = np.diag(parameters.prior_std() ** 2)
+    covariance[:count] = 0.0
+    covariance[:count, :count] = earlier.covariance
+    std_before, std = np.sqrt(np.diag(covariance)), result.std()
+    seen = {region.view.medium: region for region in regions(calibration)}
+    found = []
+    for number, name in enumerate(parameters.media):
+        key = MediumIndex(name)
+        place = parameters.keys.index(key)
+        if place < count or number not in seen:
+            continue
+        lengths = _lengths(calibration, seen[number])
+        found.append(
+            WaterChange(
+                name,
+                float(before[place]),
+                float(std_before[place]),
+                float(result.values[place]),
+                std[key],
+                None if lengths is None else _length_change(lengths, result, before, covariance),
+            )
+        )
+    return found
+
+
+def _lengths(calibration: Calibration, region: Region) -> Lengths | None:
+    return lengths_over(calibration, estimate_in(calibration, region), region) if region.has_area() else None
+
+
+def _length_change(lengths: Lengths, result: Estimate, before: np.ndarray, covariance: np.ndarray) -> LengthChange:
+    std = lengths.std_mm(covariance)
+    worst = int(np.argmax(std))
+    return LengthChange(
+        length_mm=float(lengths.length_mm[worst]),
+        before_mm=float(std[worst]),
+        after_mm=float(lengths.std_mm(result.covariance)[worst]),
+        longer_mm=float(lengths.by_parameters[worst] @ (result.values - before)),
+    )
+
+
+def refreshed_calibration(
+    earlier: Calibration,
+    gathered: Gathered,
+    result: Estimate,
+    evidence: Sequence[Evidence],
+    sources: Sequence[Mapping[int, str]],
+    *,
+    warnings: list[str],
+) -> Calibration:
+    """The calibration of an estimate to which an earlier one was known.
+
+    Its figures tell of all evidence, earlier and new, the scatter of steps of the new ones alone, and its
+    ``std_before`` of what was known before any. Where the camera's pixels were calibrated in earlier water they are in
+    the new as well, so that the volume is the same. Directions of stages stay as they were found.
+    """
+    parameters, values = result.parameters, result.values
+    sheet = parameters.sheet_model(values)
+    frame = object_frame(sheet, laser_axis=parameters.sheet.axis)
+    turned = frame[:3, :3].T @ earlier.object_transform()[:3, :3]
+    media = [*(known.medium for known in earlier.media), *gathered.media.values()]
+    return earlier.model_copy(
+        update={
+            "camera": parameters.camera(values),
+            "window": parameters.window_model(values),
+            "sheet": sheet,
+            "camera_from_object": tuple(map(tuple, frame.tolist())),
+            "stages": tuple(
+                KnownStage(described=stage.described, direction=tuple((turned @ stage.direction).tolist()))
+                for stage in earlier.stages
+            ),
+            "media": tuple(
+                KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
+                for number, medium in enumerate(media)
+            ),
+            "residuals": earlier.residuals
+            | {
+                name: {**earlier.residuals.get(name, {}), **figures}
+                for name, figures in lens_and_window_figures(result).items()
+            },
+            "joint": _joint(require_joint(earlier), joint_estimate(result, evidence, sources, frame)),
+            "provenance": _provenance(earlier, gathered, warnings),
+        }
+    )
+
+
+def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
+    """The new estimate with what the earlier one knew of all evidence before."""
+    fields = {name: getattr(new, name) for name in JointEstimate.model_fields}
+    return before.model_copy(
+        update=fields
+        | {
+            "std_before": before.std_before + new.std_before[len(before.std_before) :],
+            "scatter_px": before.scatter_px | new.scatter_px,
+            "shared_variance": before.shared_variance | new.shared_variance,
+            "residual_count": before.residual_count + new.residual_count,
+            "outlier_count": before.outlier_count + new.outlier_count,
+            "images": before.images + new.images,
+            "covered": before.covered + tuple(_with_earlier(region, before.covered) for region in new.covered),
+        }
+    )
+
+
+def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
+    """What is covered in new water, with the largest region covered in earlier water through the window."""
+    wet = [other for other in covered if other.window and other.medium is not None]
+    if not wet:
+        return region
+    most = max(wet, key=lambda other: other.point_count)
+    depths = (*region.camera_depth_mm, *most.camera_depth_mm)
+    return region.model_copy(
+        update={
+            "point_count": region.point_count + most.point_count,
+            "camera_depth_mm": (min(depths), max(depths)),
+            "outline_mm": tuple(map(tuple, outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
+        }
+    )
+
+
+def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, Any]:
+    old, new = earlier.provenance, sources_of([], []) | gathered.provenance
+    refreshed = {
+        "digest": calibration_digest(earlier),
+        **{key: old.get(key) for key in ("source", "date", "software")},
+        "step_captures": [source["file"] for source in new["step_captures"]],
+    }
+    return old | {
+        "source": "calibration refreshed in new water",
+        "date": new["date"],
+        "software": new["software"],
+        "step_captures": [*old.get("step_captures", []), *new["step_captures"]],
+        "refreshed": [*old.get("refreshed", []), refreshed],
+        "warnings": [*old.get("warnings", []), *warnings],
+    }
+
 
 _AIR = Medium(kind="air")
+
+
 _ANY_INDEX = 0.02
 """Standard uncertainty of the index of a liquid of which nothing is known."""
+
+
 _TELLING = 4.0
 """Standard uncertainties by which steps must contradict an index to be told as doing so."""
 

@@ -8,13 +8,14 @@ import numpy as np
 from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.procedure import JointProblem
-from uwlts.calibration.model import WindowModel
-from uwlts.calibration.parameter_keys import ParameterKey, SheetParameter, WindowParameter
+from uwlts.model.calibration import WindowModel
+from uwlts.model.parameter_keys import ParameterKey, SheetParameter, WindowParameter
 
 _HELD: dict[str, tuple[ParameterKey, ...]] = {
-    "window_tilt": (WindowParameter.SLOPE_X, WindowParameter.SLOPE_Y), "bow": (SheetParameter.BOW,),
+    "window_tilt": (WindowParameter.SLOPE_X, WindowParameter.SLOPE_Y),
+    "bow": (SheetParameter.BOW,),
     "window_turn": (SheetParameter.WINDOW_TURN,),
-}  # fmt: skip
+}
 _GLASS = (WindowParameter.THICKNESS, WindowParameter.GLASS_INDEX)
 
 

@@ -4,23 +4,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from uwlts.calibration.evidence import Progress as Searched
+from uwlts.calibration.joint.evidence import TargetEvidence
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly
-from uwlts.calibration.joint.observations import TargetEvidence
 from uwlts.calibration.joint.procedure import JointProblem, joint_problem
 from uwlts.calibration.model_comparison.candidates import Candidate, dimensions_of
 from uwlts.calibration.model_comparison.held_out import INSIDE, Prediction, Split, predict, splits
-from uwlts.calibration.model_comparison.scores import (
-    PolynomialScore,
-    Score,
-    Tally,
-    polynomial_score,
-    tally,
-)
+from uwlts.calibration.model_comparison.scores import PolynomialScore, Score, Tally, polynomial_score, tally
 from uwlts.calibration.polynomial_evidence import common_header
-from uwlts.calibration.procedure import CalibrationOptions
-from uwlts.capture import Capture
-from uwlts.errors import CalibrationError
-from uwlts.workers import Tell, work_through
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.errors import CalibrationError
+from uwlts.runtime.workers import Tell, work_through
+from uwlts.storage.capture import Capture
 
 Progress = Callable[[int, int], None]
 
@@ -126,9 +120,13 @@ def choose(
 
 
 def _predicted(
-    problem: JointProblem, candidates: Sequence[Candidate], ways: Sequence[Split], *, workers: int | None,
+    problem: JointProblem,
+    candidates: Sequence[Candidate],
+    ways: Sequence[Split],
+    *,
+    workers: int | None,
     progress: Callable[[int], None],
-) -> dict[Candidate, dict[str, Prediction] | str]:  # fmt: skip
+) -> dict[Candidate, dict[str, Prediction] | str]:
     """For each model its predictions by the way of holding out, or why there are none."""
     done = 0
 
@@ -187,9 +185,14 @@ class Comparison:
 
 
 def compare_models(
-    targets: Sequence[Capture], steps: Sequence[Capture] = (), *, options: CalibrationOptions,
-    workers: int | None = None, searched: Searched | None = None, progress: Progress = lambda done, total: None,
-) -> Comparison:  # fmt: skip
+    targets: Sequence[Capture],
+    steps: Sequence[Capture] = (),
+    *,
+    options: CalibrationOptions,
+    workers: int | None = None,
+    searched: Searched | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Comparison:
     """Search the images once and compare all models by images held out.
 
     Parameters

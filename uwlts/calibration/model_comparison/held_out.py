@@ -7,16 +7,15 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from uwlts.calibration.joint.circle_centres import centred
-from uwlts.calibration.joint.contradictions import much_left_out
+from uwlts.calibration.joint.consistency import much_left_out
 from uwlts.calibration.joint.estimate import Estimate, Evidence
+from uwlts.calibration.joint.evidence import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.noise import outlier_limit
-from uwlts.calibration.joint.observations import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.parameters import Parameters, View
-from uwlts.calibration.joint.procedure import JointProblem
+from uwlts.calibration.joint.procedure import JointProblem, centred
 from uwlts.calibration.model_comparison.candidates import Candidate, recast
-from uwlts.calibration.target_placement import Placement
-from uwlts.errors import CalibrationError
+from uwlts.calibration.target_images import Placement
+from uwlts.model.errors import CalibrationError
 
 INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
@@ -108,12 +107,16 @@ def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence
     return replace(
         evidence,
         placement=Placement(
-            placement.points_mm[here], placement.shifts_mm[here], placement.pixels[here], placement.image[here],
+            placement.points_mm[here],
+            placement.shifts_mm[here],
+            placement.pixels[here],
+            placement.image[here],
             placement.along_z,
         ),
-        stripe_pixels=evidence.stripe_pixels[lit], stripe_image=evidence.stripe_image[lit],
+        stripe_pixels=evidence.stripe_pixels[lit],
+        stripe_image=evidence.stripe_image[lit],
         stripe_shifts_mm=evidence.stripe_shifts_mm[lit],
-    )  # fmt: skip
+    )
 
 
 _ROUNDS, _SETTLED_PX = 20, 1e-4
@@ -187,9 +190,14 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
 
 
 def _posed(
-    problem: JointProblem, estimate: Estimate, piece: Evidence, number: int, images: list[int],
-    kept: TargetEvidence | None, local: np.ndarray | None,
-) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:  # fmt: skip
+    problem: JointProblem,
+    estimate: Estimate,
+    piece: Evidence,
+    number: int,
+    images: list[int],
+    kept: TargetEvidence | None,
+    local: np.ndarray | None,
+) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:
     """Evidence held out with its local parameters, and the kinds of residuals to which these are yet to be fitted."""
     if isinstance(piece, StepProfileEvidence):
         return [(piece, problem.local[number], (STEP,))]

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
+from uwlts.calibration.joint.evidence import STRIPE, TARGET
+from uwlts.calibration.joint.gathering import Series
 from uwlts.calibration.joint.noise import outlier_limit
-from uwlts.calibration.joint.observations import STRIPE, TARGET
-from uwlts.calibration.joint.start import Series
-from uwlts.calibration.line_polynomials import fit_line_polynomials
 from uwlts.calibration.model_comparison.held_out import Image, Misses, Prediction
+from uwlts.calibration.polynomial import fit_line_polynomials
 from uwlts.calibration.polynomial_evidence import object_coordinates, stripes_on_plate
-from uwlts.capture import CaptureHeader
+from uwlts.storage.capture import CaptureHeader
 
 POINTS, STRIPES = "points", "stripes"
 """The target's points; stripes on target and steps."""

@@ -6,9 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from uwlts.calibration.camera_poses import CameraSolution
+from uwlts.calibration.camera import CameraSolution
 from uwlts.calibration.guidance.pose_advice import State, Wanted, state_of
-from uwlts.calibration.guidance.quality import (
+from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual
+from uwlts.calibration.image_quality import (
     QualityLimits,
     StripeQuality,
     TargetQuality,
@@ -18,11 +19,10 @@ from uwlts.calibration.guidance.quality import (
     judge_target,
     why_not_found,
 )
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual
-from uwlts.errors import CalibrationError, TargetError
 from uwlts.hardware.rig import START_MS, Rig, settled_exposure
 from uwlts.hardware.scan_plan import Light, ScanPlan
-from uwlts.sensor import Sensor
+from uwlts.model.errors import CalibrationError, TargetError
+from uwlts.model.sensor import Sensor
 from uwlts.targets import TargetView
 
 
@@ -63,9 +63,11 @@ class GuidedImages:
             self._exposure_ms[light] = planned
             return True
         found = settled_exposure(
-            lambda exposure_ms: self._rig.image(light, exposure_ms)[0], sensor=self._sensor, light=light,
+            lambda exposure_ms: self._rig.image(light, exposure_ms)[0],
+            sensor=self._sensor,
+            light=light,
             start_ms=self._exposure_ms.get(light, START_MS),
-        )  # fmt: skip
+        )
         if found is not None:
             self._exposure_ms[light] = found
         return found is not None
@@ -160,9 +162,13 @@ class PoseJudge:
     def stripe(self, image: np.ndarray, view: TargetView) -> StripeQuality:
         """The stripe in a laser image (H, W) on the target where a view shows it."""
         return judge_stripe(
-            image, view, self._setting.target, stripe_along=self._setting.sensor.camera.stripe_along,
-            full_dn=self._full, limits=self.limits,
-        )  # fmt: skip
+            image,
+            view,
+            self._setting.target,
+            stripe_along=self._setting.sensor.camera.stripe_along,
+            full_dn=self._full,
+            limits=self.limits,
+        )
 
     def with_pose(self, before: State, pose: RecordedPose) -> tuple[State | None, tuple[str, ...]]:
         """How far one more pose leads, and why it does not fit the others."""

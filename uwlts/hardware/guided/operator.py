@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.guidance.coverage import Coverage
-from uwlts.live_view import LivePage, small_picture
+from uwlts.hardware.live_view import LivePage, small_picture
 
 _LOOK_S = 0.1
 

@@ -14,16 +14,16 @@ from uwlts.calibration.guidance.pose_advice import (
     missing,
     missing_sheet,
 )
-from uwlts.calibration.guidance.quality import judge_novelty, way_px
 from uwlts.calibration.guidance.solution import RecordedPose, Setting, pose_of
 from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
-from uwlts.calibration.model import Calibration, WindowModel
-from uwlts.capture import Capture, CaptureWriter, Frame
+from uwlts.calibration.image_quality import judge_novelty, way_px
 from uwlts.hardware.guided.attempt import Accepted, Attempt, Attempts, Found, GuidedImages, PoseJudge, Refused
 from uwlts.hardware.guided.operator import GuidedPage, Operator
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
-from uwlts.metrology.artefact_descriptions import StepStandard
-from uwlts.sensor import Sensor
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, CaptureWriter, Frame
 from uwlts.targets import TargetView
 
 _TRIES = 3
@@ -171,9 +171,12 @@ class TargetPhase:
         self._operator.hint(f"next: {request if wish is None or sheet else format_pose_advice(wish, state, None)}")
         points = None if found.view is None else found.view.pixels
         self._page.live(
-            found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=None,
+            found.image,
+            full_dn=self._writer.header.saturation_dn,
+            points=points,
+            stripe=None,
             remark="; ".join(reasons) or "good",
-        )  # fmt: skip
+        )
 
     def _improve_light(self, reasons: tuple[str, ...]) -> bool:
         """Settle the lamp's exposure again where an image was too bright or too dark, but not all the time."""
@@ -254,9 +257,13 @@ class StepJudge:
     def judge(self, image: np.ndarray) -> StepQuality:
         """What an image (H, W) shows."""
         return judge_step(
-            image, self._calibration, self._window, self._standard, medium_index=self._index,
+            image,
+            self._calibration,
+            self._window,
+            self._standard,
+            medium_index=self._index,
             full_dn=self.sensor.detector.full_scale_dn(),
-        )  # fmt: skip
+        )
 
     def depths_mm(self, capture: Capture) -> list[float]:
         """Depths outside the window at which a recording shows the standard."""

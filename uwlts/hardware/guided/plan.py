@@ -7,15 +7,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.calibration.camera_poses import Poses
+from uwlts.calibration.camera import Poses
 from uwlts.calibration.guidance.pose_advice import Wanted
 from uwlts.calibration.guidance.solution import Setting, without_window
-from uwlts.capture import CaptureHeader
-from uwlts.errors import DescriptionError, RangeError
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, plan_table
-from uwlts.library import load_sensor, validated
-from uwlts.metrology.artefact_descriptions import StepStandard
-from uwlts.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.model.library import load_sensor, validated
+from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
 
@@ -83,9 +83,12 @@ class WantedPlan(Description):
     def wanted(self) -> Wanted:
         """The same in rad."""
         return Wanted(
-            focal_std_px=self.focal_std_px, centre_std_px=self.centre_std_px, coverage=self.coverage,
-            tilt_rad=float(np.radians(self.tilt_deg)), fewest_images=self.fewest_images,
-        )  # fmt: skip
+            focal_std_px=self.focal_std_px,
+            centre_std_px=self.centre_std_px,
+            coverage=self.coverage,
+            tilt_rad=float(np.radians(self.tilt_deg)),
+            fewest_images=self.fewest_images,
+        )
 
 
 class GuidedPlan(Description):
@@ -154,9 +157,12 @@ class GuidedPlan(Description):
         mounted = medium.kind != "air" if self.window_mounted is None else self.window_mounted
         approaching = self.stage is None or self.stage.direction[2] > 0
         return Setting(
-            sensor=sensor if mounted else without_window(sensor), target=parse_target(self.target), medium=medium,
-            poses=self.poses, approaching=approaching,
-        )  # fmt: skip
+            sensor=sensor if mounted else without_window(sensor),
+            target=parse_target(self.target),
+            medium=medium,
+            poses=self.poses,
+            approaching=approaching,
+        )
 
     def target_header(self, name: str, *, provenance: dict[str, Any]) -> CaptureHeader:
         """Header of the capture of the target; errors as `setting`."""
@@ -174,9 +180,14 @@ class GuidedPlan(Description):
     ) -> CaptureHeader:
         unit = StagePlan(start_mm=0.0, direction=direction).direction
         table = {
-            "name": name, "sensor": sensor, "medium_name": medium, "medium": sensor.medium(medium),
-            "stage_direction": unit, "saturation_dn": sensor.detector.full_scale_dn(), "provenance": provenance,
-        }  # fmt: skip
+            "name": name,
+            "sensor": sensor,
+            "medium_name": medium,
+            "medium": sensor.medium(medium),
+            "stage_direction": unit,
+            "saturation_dn": sensor.detector.full_scale_dn(),
+            "provenance": provenance,
+        }
         return validated(CaptureHeader, table | shown, f"the plan '{self.title}'")
 
     def scan_plan(self, *, medium: str, positions_mm: list[float]) -> ScanPlan:
@@ -184,13 +195,21 @@ class GuidedPlan(Description):
         stage = self.stage or GuidedStage()
         first, last = (positions_mm[0], positions_mm[-1]) if positions_mm else (0.0, 0.0)
         return ScanPlan(
-            title=self.title, sensor=self.sensor, medium=medium, lights=("lamp", "laser"), laser_ms=self.laser_ms,
-            lamp_ms=self.lamp_ms, gain_db=self.gain_db, laser_power=self.laser_power,
+            title=self.title,
+            sensor=self.sensor,
+            medium=medium,
+            lights=("lamp", "laser"),
+            laser_ms=self.laser_ms,
+            lamp_ms=self.lamp_ms,
+            gain_db=self.gain_db,
+            laser_power=self.laser_power,
             stage=StagePlan(
-                start_mm=first, step_mm=1.0 if last >= first else -1.0, feed_mm_per_min=stage.feed_mm_per_min,
+                start_mm=first,
+                step_mm=1.0 if last >= first else -1.0,
+                feed_mm_per_min=stage.feed_mm_per_min,
                 settle_s=stage.settle_s,
             ),
-        )  # fmt: skip
+        )
 
 
 def load_guided_plan(path: Path) -> GuidedPlan:

@@ -18,9 +18,7 @@ from uwlts.calibration.guidance.pose_advice import State
 from uwlts.calibration.guidance.solution import RecordedPose, Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.procedure import CalibrationOptions, calibrate_sequentially, nominal_window
-from uwlts.capture import Capture, CaptureHeader, CaptureWriter, part_path
-from uwlts.errors import DescriptionError, RangeError
+from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially, nominal_window
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.attempt import Attempts, GuidedImages, PoseJudge
@@ -30,6 +28,8 @@ from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep, check_positions
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light
 from uwlts.hardware.scanning import check_camera
+from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, part_path
 
 
 @dataclass(frozen=True)
@@ -140,9 +140,15 @@ class _Phases:
             state = judge.state(self._before(path, judge))
             with self._writer(path, header, dtype) as writer:
                 phase = TargetPhase(
-                    self.plan, self.setting, images=images, attempts=attempts, operator=self.operator, page=self.page,
-                    writer=writer, before_s=before_s,
-                )  # fmt: skip
+                    self.plan,
+                    self.setting,
+                    images=images,
+                    attempts=attempts,
+                    operator=self.operator,
+                    page=self.page,
+                    writer=writer,
+                    before_s=before_s,
+                )
                 return phase.run(state)
 
     def _to_go_on(self, state: State) -> bool:
@@ -180,9 +186,8 @@ class _Phases:
             images = GuidedImages(rig, scan, judge.sensor, dtype=dtype, known_ms=known)
             with self._writer(path, header, dtype) as writer:
                 phase = StepPhase(
-                    step, judge, images=images, operator=self.operator, page=self.page, writer=writer,
-                    before_s=before_s,
-                )  # fmt: skip
+                    step, judge, images=images, operator=self.operator, page=self.page, writer=writer, before_s=before_s
+                )
                 seen = phase.run(seen)
         count = len(apart_mm(seen, judge.sensor))
         return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
@@ -197,11 +202,13 @@ class _Phases:
         with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
             check_camera(camera, sensor)
             provenance = {
-                "source": "guided calibration", "title": self.plan.title,
+                "source": "guided calibration",
+                "title": self.plan.title,
                 "camera": f"{camera.info.name} {camera.info.serial}".strip(),
                 "stage": f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none",
-                "laser_power": self.plan.laser_power, "uwlts": uwlts.__version__,
-            }  # fmt: skip
+                "laser_power": self.plan.laser_power,
+                "uwlts": uwlts.__version__,
+            }
             dtype = np.dtype(np.uint16) if camera.info.bits > 8 else np.dtype(np.uint8)
             scan = self.plan.scan_plan(medium=medium, positions_mm=positions_mm)
             yield Rig(scan, sensor, camera, stage), provenance, dtype

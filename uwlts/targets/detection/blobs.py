@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.errors import ImageError
+from uwlts.model.errors import ImageError
 
 # Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
 # to three quarters of its side, so factors of four cover 4 px to 380 px with overlap.

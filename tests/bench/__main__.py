@@ -1,0 +1,236 @@
+"""Measures speed and memory against the project's limits: ``python -m tests.bench``; writes ``runs/bench.json``.
+
+Medians after a warm-up, so without compilation. Limits are for two cores.
+"""
+
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+RESULT = Path("runs/bench.json")
+CORES = 2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured value and its limit; ``ok`` tells whether it is kept."""
+
+    name: str
+    value: float
+    unit: str
+    limit: float
+    ok: bool
+
+
+def at_most(name: str, value: float, unit: str, limit: float) -> Row:
+    """A row whose value must not exceed the limit."""
+    return Row(name, round(float(value), 4), unit, limit, bool(value <= limit))
+
+
+def at_least(name: str, value: float, unit: str, limit: float) -> Row:
+    """A row whose value must reach the limit."""
+    return Row(name, round(float(value), 4), unit, limit, bool(value >= limit))
+
+
+def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: int = 15) -> float:
+    """Median duration of ``action(k)`` after a warm-up."""
+    seconds = []
+    for k in range(warm_up + runs):
+        start = time.perf_counter()
+        action(k)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[warm_up:])
+
+
+def rendering() -> list[Row]:
+    """Time of a full-size laser frame and a lamp frame of the thesis's sensor."""
+    from twin.options import NONE, use_variant
+
+    use_variant()
+    from twin.light.renderer import Renderer
+    from twin.scene.description import load_scene
+    from uwlts.model.library import load_sensor
+
+    sensor = load_sensor("thesis-as-built")
+
+    def pose(k: int) -> np.ndarray:
+        transform = np.eye(4)
+        transform[0, 3] = 0.5 * (k - 8)
+        return transform
+
+    spheres, pipe = (
+        Renderer(sensor, sensor.media["water"], load_scene(name), effects=replace(NONE, haze=True))
+        for name in ("spheres", "pipe")
+    )
+    limit = 0.25
+    return [
+        at_most(
+            "sharp laser frame 1280 x 1024, 64 samples per lit pixel, spheres in water",
+            median_seconds(lambda k: spheres.irradiance("laser", pose(k), spp=64)),
+            "s",
+            limit,
+        ),
+        at_most(
+            "sharp laser frame 1280 x 1024, 64 samples per lit pixel, pipe across the whole image in water",
+            median_seconds(lambda k: pipe.irradiance("laser", pose(k), spp=64)),
+            "s",
+            limit,
+        ),
+    ]
+
+
+def light() -> list[Row]:
+    """Time and noise of frames with all effects, the advantage over stock Mitsuba, and a campaign."""
+    from tests.bench import light as bench_light
+
+    rows = []
+    for water, limit in (("clear", 0.5), ("coastal", 1.5)):
+        seconds, noise = bench_light.full_physics(water)
+        rows.append(at_most(f"laser frame with all effects, spheres in {water} water", seconds, "s", limit))
+        rows.append(at_most(f"noise of its stripe before speckle, {water} water", 100 * noise, "% of peak", 1.0))
+    advantage, how = bench_light.equal_noise_advantage()
+    rows.append(at_least(f"advantage over volpath at equal noise ({how})", advantage, "times", 1000))
+    frames, seconds, peak, growth = bench_light.campaign()
+    rows.append(at_most(f"campaign of {frames} frames", seconds, "s", 300))
+    rows.append(at_most("campaign, peak memory", peak, "GiB", 3))
+    rows.append(at_most("campaign, time of the last frames over that of earlier ones", growth, "times", 1.3))
+    return rows
+
+
+def pipeline() -> list[Row]:
+    """Time of stripe extraction and reconstruction on one core: the default method, and the fastest one."""
+    from twin.options import Options
+    from twin.recording.studio import Studio
+    from twin.scene.description import load_scene
+    from uwlts.model.library import load_sensor
+    from uwlts.optics.nominal import nominal_calibration
+    from uwlts.optics.reconstruction import reconstruct_pixels
+    from uwlts.stripe import StripeOptions, extract_stripe
+
+    rows = []
+    cv2.setNumThreads(1)
+    # Dark lines are searched for a dim stripe, which takes longer than measuring a bright one.
+    default, fastest, limit_ms = StripeOptions().method, "zero-crossing", 1e3 / 300
+    for along, scene, stripe, method, limit in (
+        ("width", load_scene("pipe"), "stripe on every column", default, limit_ms),
+        ("width", load_scene("pipe"), "stripe on every column", fastest, 1.0),
+        ("height", load_scene("pipe"), "stripe on every row", default, limit_ms),
+        ("height", load_scene("pipe"), "stripe on every row", fastest, 1.0),
+        ("width", load_scene("spheres"), "two spheres, a third of the columns dark", default, limit_ms),
+    ):
+        sensor = load_sensor("thesis")
+        sensor = sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"stripe_along": along})})
+        medium = sensor.media[scene.medium]
+        calibration = nominal_calibration(sensor, medium)
+        index = medium.refractive_index(sensor.laser.wavelength_nm)
+        shots = list(scene.motion.shots())
+        image = Studio(sensor, scene, Options()).image(shots[len(shots) // 2], 0)
+        extract = partial(
+            extract_stripe,
+            image,
+            stripe_along=along,
+            saturation=sensor.detector.full_scale_dn(),
+            options=StripeOptions(method=method),
+        )
+        reconstruct = partial(
+            reconstruct_pixels, calibration, medium_index=index, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
+        )
+        extraction = median_seconds(lambda k, extract=extract: extract(), runs=101)
+        both = median_seconds(lambda k, extract=extract, then=reconstruct: then(extract().pixels()), runs=101)
+        rows.append(at_most(f"{method}, {stripe}", 1e3 * extraction, "ms/frame", limit))
+        rows.append(at_least(f"{method} and reconstruction on one core, {stripe}", 1 / both, "frames/s", 300))
+    return rows
+
+
+def reproduction() -> list[Row]:
+    """Time per image of the thesis's campaign, its scans thinned: 3,000 images in half an hour are 600 ms."""
+    from twin.recording.reproduce import record_campaigns
+    from twin.scene.campaign import load_campaign
+
+    images = 0
+
+    def count(done: int, total: int) -> None:
+        nonlocal images
+        images = total
+
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        record_campaigns(load_campaign("thesis"), Path(folder), seeds=range(1), every=30, progress=count)
+        seconds = time.perf_counter() - start
+    return [at_most(f"the thesis's campaign, thinned to {images} images", 1e3 * seconds / images, "ms/image", 500)]
+
+
+def studies() -> list[Row]:
+    """Speed of design studies."""
+    from tests.bench.study import screening, verification
+
+    rate, engine = screening()
+    return [
+        at_least("designs judged by formulas, two workers", rate, "designs/s", 2000),
+        at_most("the engine's share of two workers' time", 100 * engine, "%", 5),
+        at_most("one design verified by rendering", verification(), "s", 30),
+    ]
+
+
+def hardware() -> list[Row]:
+    """Frames per second from a camera to the disk, alone and with stripe and points found meanwhile."""
+    from tests.bench.recording import RATE_HZ, SERVED, TAKEN, gige_recording, recording
+
+    alone, live, gige = recording(), recording(live=True), gige_recording()
+    return [
+        at_least(f"camera to disk, {TAKEN} frames at {RATE_HZ:g}/s", alone.rate_hz, "frames/s", 0.99 * RATE_HZ),
+        at_most("the same: lost", alone.lost, "frames", 0),
+        at_least("the same, followed by extraction and reconstruction", live.rate_hz, "frames/s", 0.99 * RATE_HZ),
+        at_most("the same: lost", live.lost, "frames", 0),
+        at_least("the same: followed", live.followed, "frames", TAKEN),
+        at_most("the same: behind at the end", live.behind_s, "s", 5),
+        at_least(f"GigE Vision on loopback to disk, {SERVED} frames", gige.rate_hz, "frames/s", 0.98 * RATE_HZ),
+        at_most("the same: lost", gige.lost, "frames", 0),
+    ]
+
+
+def demo() -> list[Row]:
+    """Duration and peak memory of the demo, in a folder of its own."""
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        command = [sys.executable, "-m", "twin.cli", "demo"]
+        subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+        seconds = time.perf_counter() - start
+    # ru_maxrss of the children is the largest single process; the demo runs two at a time.
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+    return [at_most("demo", seconds, "s", 120), at_most("demo, peak memory of a process", peak, "GiB", 1.5)]
+
+
+def main() -> int:
+    """Measure, print a table, write the result; exit code 1 if a limit is broken."""
+    if (count := len(os.sched_getaffinity(0))) > CORES:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
+        print(f"{count} cores found, measuring on {CORES}")
+    rows = [*demo(), *reproduction(), *rendering(), *light(), *pipeline(), *studies(), *hardware()]
+    table = Table("what", "value", "limit", "unit", "")
+    for row in rows:
+        table.add_row(row.name, f"{row.value:.3f}", f"{row.limit:.4g}", row.unit, "ok" if row.ok else "MISSED")
+    Console(width=130).print(table)
+    RESULT.parent.mkdir(parents=True, exist_ok=True)
+    RESULT.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
+    print(f"wrote {RESULT}")
+    return 0 if all(row.ok for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

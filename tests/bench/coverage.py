@@ -1,0 +1,180 @@
+"""How often stated 95 % intervals hold the truth: ``python -m tests.bench.coverage [campaigns]``.
+
+Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
+standard is scanned and measured with each calibration.
+"""
+
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from tests.uwlts.simulated_campaign import PLACES_MM, SPHERES, Reality, drawn_reality, evidence, scan_of_spheres
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.measurement.figure_uncertainty import figure_uncertainties
+from uwlts.measurement.reconstruction import reconstruct_stripes
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.model.calibration import Calibration
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.runtime.workers import work_through
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.stripe import FoundStripes
+
+CAMPAIGNS = 200
+NORMAL_95 = 1.96
+OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
+KNOWN_BETTER = {"drift_k": 0.05, "stage_alignment_deg": 0.005}
+"""A scan in the same water, on an aligned stage: what is left is mostly the calibration's own uncertainty."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One figure of one scan: its error, what is stated of it by noise and by the calibration, mm."""
+
+    scan: str
+    place: str
+    figure: str
+    error_mm: float
+    random_mm: float
+    systematic_mm: float
+
+    @property
+    def std_mm(self) -> float:
+        """Standard uncertainty of the figure."""
+        return float(np.hypot(self.random_mm, self.systematic_mm))
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A seed, and whether the target is seen in water as well as in air."""
+
+    seed: int
+    wet: bool
+    step_mm: float = 3.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a campaign measured, and the seconds that its calibration and its figures' uncertainties took."""
+
+    measured: list[Measured]
+    solve_s: float
+    figures_s: float
+
+
+def run_campaign(campaign: Campaign, tell: Any = None) -> Outcome:
+    """Calibrate, scan spheres at one of three places in turn, measure them; CalibrationError as `solve_jointly`."""
+    described = load_sensor("thesis")
+    real = drawn_reality(described, np.random.default_rng(campaign.seed))
+    gathered = evidence(real, described, wet=campaign.wet)
+    start = time.perf_counter()
+    calibration = solve_jointly(gathered, options=OPTIONS).calibration
+    solve_s = time.perf_counter() - start
+    scans = [_scan(real, described, calibration, campaign)]
+    uncertainty = described.uncertainty.model_copy(update=KNOWN_BETTER)
+    better = described.model_copy(update={"uncertainty": uncertainty})
+    scans.append(_scan(real, better, calibration, campaign, " known better"))
+    return Outcome([*scans[0][0], *scans[1][0]], solve_s, scans[0][1] + scans[1][1])
+
+
+def _scan(
+    real: Reality, sensor: Sensor, calibration: Calibration, campaign: Campaign, how: str = ""
+) -> tuple[list[Measured], float]:
+    """Figures of a scan whose stage and water differ as the sensor says, and the seconds for their uncertainties."""
+    known, medium = sensor.uncertainty, "water" if campaign.wet else "air"
+    place = list(PLACES_MM)[campaign.seed % len(PLACES_MM)]
+    positions = np.arange(-18.0, 18.5, campaign.step_mm)
+    stripes = scan_of_spheres(
+        real,
+        index=real.index(sensor.media[medium], drift_k=real.rng.normal(0, known.drift_k)),
+        place=place,
+        positions=positions,
+        lean=np.tan(np.radians(known.stage_alignment_deg)) * real.rng.standard_normal(2),
+    )
+    bright, wide = np.full(len(stripes.line), 100.0), np.full(len(stripes.line), 4.0)
+    found = FoundStripes(stripes.frame, stripes.line, stripes.centre_px, bright, wide, {})
+    with tempfile.TemporaryDirectory() as folder, _empty_capture(Path(folder), sensor, medium, positions) as capture:
+        cloud = reconstruct_stripes(capture, found, calibration, with_uncertainty=True)
+    evaluation = evaluate_cloud(cloud, SPHERES)
+    start = time.perf_counter()
+    stated = figure_uncertainties(cloud, evaluation)
+    seconds = time.perf_counter() - start
+    return [
+        Measured(
+            f"{medium}{how}",
+            place,
+            figure,
+            evaluation.figures_mm[figure],
+            stated[figure].random_mm,
+            stated[figure].systematic_mm,
+        )
+        for figure in (SPACING, *DIAMETERS)
+    ], seconds
+
+
+def _empty_capture(folder: Path, sensor: Sensor, medium: str, positions: np.ndarray) -> Capture:
+    """A capture that tells sensor, medium and stage; what its images would show is given."""
+    header = CaptureHeader(
+        name="spheres",
+        sensor=sensor,
+        medium_name=medium,
+        medium=sensor.media[medium],
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+    )
+    image = np.zeros((sensor.camera.height_px, sensor.camera.width_px), np.uint8)
+    with CaptureWriter(folder / "spheres.h5", header, dtype=np.uint8) as writer:
+        for number, position in enumerate(positions):
+            writer.append(Frame(image, float(position), True, 1.0, float(number)))
+    return Capture(folder / "spheres.h5")
+
+
+def judged(outcomes: Sequence[Outcome]) -> dict[tuple[str, str], list[Measured]]:
+    """All that was measured, by scan and by quantity."""
+    found: dict[tuple[str, str], list[Measured]] = {}
+    for measured in (m for outcome in outcomes for m in outcome.measured):
+        quantity = "spacing" if measured.figure == SPACING else "diameter"
+        found.setdefault((measured.scan, quantity), []).append(measured)
+    return found
+
+
+def within(measured: Sequence[Measured]) -> float:
+    """Share of the errors that the stated 95 % interval holds."""
+    return float(np.mean([abs(m.error_mm) <= NORMAL_95 * m.std_mm for m in measured]))
+
+
+def main() -> int:
+    """Run all campaigns and print how often the truth is where it is said to be."""
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else CAMPAIGNS
+    jobs = [Campaign(seed, wet) for seed in range(count) for wet in (True, False)]
+    outcomes = work_through(run_campaign, jobs)
+    table = Table("scan", "quantity", "number", "within 95 %", "rms error / std", "mean |error|", "mean std")
+    for (scan, quantity), measured in judged(outcomes).items():
+        error, std = np.array([(m.error_mm, m.std_mm) for m in measured]).T
+        table.add_row(
+            scan,
+            quantity,
+            str(len(measured)),
+            f"{100 * within(measured):.1f} %",
+            f"{np.sqrt(np.mean((error / std) ** 2)):.2f}",
+            f"{1e3 * np.mean(np.abs(error)):.1f} µm",
+            f"{1e3 * np.mean(std):.1f} µm",
+        )
+    Console(width=120).print(table)
+    solve, figures = (np.median([getattr(o, name) for o in outcomes]) for name in ("solve_s", "figures_s"))
+    print(f"medians: {solve:.2f} s for a calibration, {figures:.2f} s for the uncertainties of two scans")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""Speed of the rendered light: frames with everything on, stock Mitsuba at equal noise, and a whole campaign."""
+
+import itertools
+import resource
+import statistics
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from tests.stock_mitsuba import fog, stock_scene
+from tests.virtual_sensors import altered
+from twin.light.renderer import Renderer
+from twin.options import NONE, Options
+from twin.recording.studio import record_scene
+from twin.scene.description import load_scene
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Medium
+
+SPP = 64
+SEEDS = 12
+STRIPE_SHARE = 0.05
+"""Pixels brighter than this share of the peak count as the stripe's."""
+
+
+def stripe_noise(images: np.ndarray, truth: np.ndarray) -> float:
+    """Rms error of the stripe's pixels of runs (K, H, W) as a share of the stripe's peak, from the truth (H, W)."""
+    stripe = truth > STRIPE_SHARE * truth.max()
+    return float(np.sqrt(np.mean((images - truth)[:, stripe] ** 2)) / truth.max())
+
+
+def full_physics(water: str) -> tuple[float, float]:
+    """Median seconds of a frame of two spheres with all effects, and the noise of its light as a share of the peak.
+
+    The truth is the mean of all frames, so the error is a little understated and then corrected for it.
+    """
+    sensor = load_sensor("thesis-as-built")
+    table = sensor.media["water"].model_dump(include={"kind", "temperature_c"})
+    renderer = Renderer(sensor, Medium.model_validate(table | {"water": water}), load_scene("spheres"))
+    images, seconds = [], []
+    for seed in range(SEEDS + 2):
+        start = time.perf_counter()
+        images.append(renderer.irradiance("laser", np.eye(4), spp=SPP, seed=seed))
+        seconds.append(time.perf_counter() - start)
+    kept = np.stack(images[2:])
+    noise = stripe_noise(kept, kept.mean(axis=0)) * np.sqrt(SEEDS / (SEEDS - 1))
+    return statistics.median(seconds[2:]), noise
+
+
+def equal_noise_advantage() -> tuple[float, str]:
+    """How many times longer stock `volpath` takes to the same noise on the same scene, and how that was found.
+
+    The scene is one that stock can render: no windows, a fog with coastal water's coefficients, a plate, and a
+    projector that throws the sheet, 0.15 mm wide at the stand-off. Noise is the rms error of the stripe's pixels; what
+    stock would need is extrapolated by its own 1 / sqrt(N), and the twin is held against a mean of many more samples.
+    """
+    bare = {"window": {"mounted": False}}
+    sensor = altered(load_sensor("thesis"), {"camera": bare, "laser": bare})
+    # A projector's light opens from a point: as wide at the stand-off as the sheet, whose waist is there.
+    sigma = 0.5 * sensor.laser.waist_radius_mm / sensor.laser.waist_distance_mm
+    waist = 1e-6 * sensor.laser.wavelength_nm / (2 * np.pi * sigma)
+    thrown = altered(sensor, {"laser": {"waist_radius_mm": waist, "beam_quality_m2": 1.0}})
+    coastal = Medium(kind="fresh", water="coastal")
+    a, b = (1e3 * f(635.0) for f in (coastal.absorption_per_mm, coastal.scattering_per_mm))
+    medium = fog(absorption_per_m=a, scattering_per_m=b, phase="henyey-greenstein", asymmetry=0.924)
+    scene = load_scene("plane", medium="air")
+    effects = replace(NONE, haze=True, multiple_scattering=True, secondary_light=True)
+    renderer = Renderer(sensor, medium, scene, effects=effects)
+    for seed in range(2):
+        renderer.irradiance("laser", np.eye(4), spp=SPP, seed=seed)
+    start = time.perf_counter()
+    ours = np.stack([renderer.irradiance("laser", np.eye(4), spp=SPP, seed=seed) for seed in range(SEEDS)])
+    our_seconds = (time.perf_counter() - start) / SEEDS
+    truth = np.mean([renderer.irradiance("laser", np.eye(4), spp=8 * SPP, seed=100 + k) for k in range(8)], axis=0)
+    our_noise = stripe_noise(ours, truth)
+    stock = stock_scene(thrown, medium, scene, across_texels=64)
+    volpath = mi.load_dict({"type": "volpath", "max_depth": -1})
+    start = time.perf_counter()
+    theirs = np.stack([np.array(mi.render(stock, integrator=volpath, spp=SPP, seed=k))[..., 0] for k in range(3)])
+    their_seconds = (time.perf_counter() - start) / len(theirs)
+    mean = theirs.mean(axis=0)
+    scale = truth.max() / np.quantile(mean[truth > 0.9 * truth.max()], 0.5)
+    spread = stripe_spread(theirs * scale, truth)
+    ratio = (spread / our_noise) ** 2 * their_seconds / our_seconds
+    how = (
+        f"stock {their_seconds:.1f} s at noise {100 * spread:.1f} % of the peak, "
+        f"twin {our_seconds:.2f} s at {100 * our_noise:.2f} %, both {SPP} samples"
+    )
+    return ratio, how
+
+
+def stripe_spread(images: np.ndarray, truth: np.ndarray) -> float:
+    """Rms scatter of the stripe's pixels among runs (K, H, W), as a share of the stripe's peak."""
+    stripe = truth > STRIPE_SHARE * truth.max()
+    return float(np.sqrt(images.var(axis=0, ddof=1)[stripe].mean()) / truth.max())
+
+
+def campaign() -> tuple[int, float, float, float]:
+    """The thesis's spheres in air and water and its calibration: frames, seconds, GiB, and late over early frames."""
+    as_built = load_sensor("thesis-as-built")
+    recordings = [("target", {}, 0), *(("step", {"placement": place}, 0) for place in ("near", "standoff", "far"))]
+    recordings.append(("target", {"medium": "water", "window_mounted": True, "motion": _in_water()}, 0))
+    for medium, place, seed in itertools.product(("air", "water"), ("near", "standoff", "far"), (1, 2)):
+        recordings.append(("spheres", {"medium": medium, "placement": place}, seed))
+    moments: list[float] = []
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (name, changes, seed) in enumerate(recordings):
+            record_scene(
+                load_scene(name, **changes),
+                load_sensor("thesis"),
+                Path(folder, f"{number}.h5"),
+                as_built=as_built,
+                options=Options(seed=seed),
+                progress=lambda done, total: moments.append(time.perf_counter()),
+            )
+    seconds = time.perf_counter() - start
+    steps = np.diff(moments)
+    # The spheres in water are the last half of the campaign; both thirds hold near, stand-off and far.
+    late, early = (np.median(part) for part in (steps[-38:], steps[-6 * 38 : -5 * 38]))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return len(moments), seconds, peak, float(late / early)
+
+
+def _in_water() -> dict[str, object]:
+    """The plate's 23 places in water, as the thesis takes them for its polynomial."""
+    return {"direction": (0.0, 0.0, 1.0), "start_mm": -120.0, "step_mm": 10.0, "count": 23, "lights": ("lamp", "laser")}

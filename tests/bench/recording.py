@@ -1,0 +1,128 @@
+"""From a camera to the disk: a thousand full frames at 60 per second, none lost, and followed live meanwhile."""
+
+import multiprocessing
+import multiprocessing.connection
+import multiprocessing.synchronize
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from twin.devices.gige_camera import GigeCamera
+from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.live_view import images_of
+from uwlts.hardware.replay import ReplayCamera
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+
+SHOWN, TAKEN, RATE_HZ = 50, 1000, 60.0
+# A cable of 1 Gbit/s takes 11 ms for a frame, to which the served camera adds its own time.
+SERVED, SERVED_HZ = 300, 60.0
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Frames per second that reached the disk, and how many were lost.
+
+    ``followed`` of them were read from the growing file, their stripe found and turned into points, by a second
+    process; it was done ``behind_s`` after the recording.
+    """
+
+    rate_hz: float
+    lost: int
+    followed: int = 0
+    behind_s: float = 0.0
+
+
+def recording(*, live: bool = False) -> Recorded:
+    """A camera that gives 60 frames per second: it repeats a capture of frames with a stripe and noise.
+
+    What nobody fetches in time is lost, as with a real one.
+    """
+    sensor = load_sensor("thesis")
+    with tempfile.TemporaryDirectory() as folder:
+        source, out = Path(folder) / "source.h5", Path(folder) / "out.h5"
+        with CaptureWriter(source, _header(sensor), dtype=np.uint8) as writer:
+            for k, image in enumerate(_images(sensor)):
+                writer.append(Frame(image, float(k), True, 1.0, float(k)))
+        with ReplayCamera(source, repeat=True) as camera:
+            if live:
+                return _followed(out, lambda: _record(camera, sensor, out, TAKEN))
+            return _record(camera, sensor, out, TAKEN)
+
+
+def gige_recording() -> Recorded:
+    """A GigE Vision camera on the loopback interface, its images sent at the speed of a 1 Gbit/s cable."""
+    sensor = load_sensor("thesis")
+    images = _images(sensor)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        GigeCamera(lambda exposure_ms: images[int(time.monotonic() * SERVED_HZ) % SHOWN]) as served,
+        open_camera(served.address) as camera,
+    ):
+        return _record(camera, sensor, Path(folder) / "out.h5", SERVED)
+
+
+def _images(sensor: Sensor) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    height, width = sensor.camera.height_px, sensor.camera.width_px
+    rows = np.arange(height)[:, None]
+    stripes = (150 * np.exp(-0.5 * ((rows - height / 2 - k) / 1.5) ** 2) for k in range(SHOWN))
+    return [np.clip(stripe + rng.normal(4, 1, (height, width)), 0, 255).astype(np.uint8) for stripe in stripes]
+
+
+def _header(sensor: Sensor) -> CaptureHeader:
+    return CaptureHeader(
+        name="bench",
+        sensor=sensor,
+        medium_name="air",
+        medium=sensor.medium("air"),
+        stage_direction=(1, 0, 0),
+        saturation_dn=255,
+    )
+
+
+def _record(camera: Camera, sensor: Sensor, out: Path, count: int) -> Recorded:
+    with CaptureWriter(out, _header(sensor), dtype=np.uint8) as writer:
+        camera.configure(frame_rate_hz=RATE_HZ)
+        camera.start(faults="skip")
+        start = time.perf_counter()
+        for k in range(count):
+            frame = camera.grab(2.0)
+            writer.append(Frame(frame.image, float(k), True, 1.0, frame.time_s))
+        seconds = time.perf_counter() - start
+        counts = camera.counts
+    return Recorded(count / seconds, counts.dropped + counts.short)
+
+
+def _followed(out: Path, record: Callable[[], Recorded]) -> Recorded:
+    context = multiprocessing.get_context("spawn")
+    ready, (ours, theirs) = context.Event(), context.Pipe()
+    follower = context.Process(target=_follow, args=(out, ready, theirs))
+    follower.start()
+    ready.wait()
+    recorded = record()
+    start = time.perf_counter()
+    followed = ours.recv()
+    behind_s = time.perf_counter() - start
+    follower.join()
+    return Recorded(recorded.rate_hz, recorded.lost, followed, behind_s)
+
+
+def _follow(out: Path, ready: multiprocessing.synchronize.Event, told: multiprocessing.connection.Connection) -> None:
+    """What `uwlts watch` does, without a browser."""
+    sensor = load_sensor("thesis")
+    calibration, count = nominal_calibration(sensor, sensor.medium("air")), 0
+    ready.set()
+    for seen in images_of(out, calibration):
+        if seen is None:
+            time.sleep(0.25)
+        else:
+            count += len(seen.points_mm) > 0
+    told.send(count)

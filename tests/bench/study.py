@@ -1,0 +1,65 @@
+"""Speed of design studies: designs judged by formulas, what the engine costs, and one design verified by rendering."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from twin.design.description import Study, load_study
+from twin.design.screening import Batch, judged_part, read_parts, write_part
+from uwlts.runtime.workers import open_workers
+
+WORKERS = 2
+BATCHES, BATCH = 40, 1000
+ALONE = """
+import sys
+from pathlib import Path
+
+from twin.design.verification import verify
+from uwlts.model.library import load_sensor
+
+if __name__ == "__main__":
+    verify(load_sensor("thesis"), "water", Path(sys.argv[1]) / "verified")
+"""
+
+
+def timed(batch: Batch) -> tuple[float, bytes]:
+    """Seconds of a processor that judging a batch takes, and the part."""
+    start = time.process_time()
+    content = judged_part(batch)
+    return time.process_time() - start, content
+
+
+def screening() -> tuple[float, float]:
+    """Designs per second of the thesis's baseline and angle, by two workers, and the engine's share of their time.
+
+    The engine is all that is not judging: handing out work, taking results back, writing the parts. Starting the
+    workers is left out.
+    """
+    study = load_study("baseline-angle")
+    sampling = {"kind": "sobol", "designs": BATCHES * BATCH, "batch": BATCH}
+    study = Study.model_validate(study.model_dump() | {"sampling": sampling})
+    batches = [Batch(study, None, first, BATCH) for first in range(0, BATCHES * BATCH, BATCH)]
+    with tempfile.TemporaryDirectory() as folder, open_workers(workers=WORKERS) as pool:
+        list(pool.completed(timed, batches[: 2 * WORKERS]))
+        start, judging = time.perf_counter(), 0.0
+        for batch, (seconds, content) in pool.completed(timed, batches):
+            write_part(Path(folder), batch.first, content)
+            judging += seconds
+        wall = time.perf_counter() - start
+        assert len(read_parts(Path(folder))["design"]) == BATCHES * BATCH
+    return BATCHES * BATCH / wall, 1 - judging / (WORKERS * wall)
+
+
+def verification() -> float:
+    """Seconds to verify the thesis's sensor by rendering, with the start of Python."""
+    with tempfile.TemporaryDirectory() as folder:
+        # A file, since the processes that render begin by reading it.
+        script = Path(folder) / "alone.py"
+        script.write_text(ALONE, encoding="utf-8")
+        environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+        start = time.perf_counter()
+        subprocess.run([sys.executable, str(script), folder], check=True, env=environment)
+        return time.perf_counter() - start

@@ -1,0 +1,292 @@
+"""The choice of a libLLVM for Dr.Jit: what is refused, what is reported, and that a kernel runs with what is chosen.
+
+Real shared libraries stand in for broken ones: a copy of a small library from Mitsuba's wheel, in which the name of a
+library it needs is overwritten with one of the same length that no system has.
+"""
+
+import ctypes
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from twin.backend import llvm, packages
+from twin.backend.llvm import (
+    LlvmLibrary,
+    Unsuitable,
+    examine,
+    find_llvm,
+    install_llvm,
+    judge,
+    list_candidates,
+    main,
+    named_version,
+)
+from uwlts.model.errors import SetupError
+
+NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"
+
+
+@pytest.fixture(autouse=True)
+def no_choice_by_the_user(monkeypatch):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+
+
+@pytest.fixture(scope="module")
+def machine_library():
+    """The libLLVM that the installation provides; the tests' command sees to it that there is one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+        return find_llvm()
+
+
+@pytest.fixture(scope="module")
+def foreign_library():
+    """A small shared library that loads but is no libLLVM."""
+    return Path(importlib.util.find_spec("mitsuba").origin).with_name("libpugixml.so")
+
+
+def overwrite_name(source, target):
+    content = source.read_bytes()
+    assert NEEDED in content and len(NEEDED) == len(ABSENT)
+    target.write_bytes(content.replace(NEEDED, ABSENT))
+    return target
+
+
+def run_child(script, **environment):
+    """Run a script in a fresh interpreter, in which neither drjit nor mitsuba is imported."""
+    root = Path(__file__).parents[3]
+    variables = {key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"} | environment
+    return subprocess.run(
+        [sys.executable, "-c", script], cwd=root, env=variables, capture_output=True, text=True, timeout=120
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM-19.so", (19,)),
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-14.0.6.so.1", (14, 0)),
+        ("libLLVM.so.22.1-rust-1.95.0-stable", (22, 1)),
+        ("libLLVM.so", (float("inf"),)),
+        ("libLLVM.so.1", (float("inf"),)),
+    ],
+)
+def test_version_claimed_by_the_name(name, version):
+    assert named_version(Path("/usr/lib", name)) == version
+
+
+def test_candidates_are_shared_libraries_named_llvm_each_once(tmp_path):
+    for name in ("libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM.so.20.1-custom"):
+        (tmp_path / name).touch()
+    (tmp_path / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
+    for other in ("libLLVMCore.so.19.1", "libLLVMSupport.a", "libLTO.so.19.1", "libLLVM.sock"):
+        (tmp_path / other).touch()
+    (tmp_path / "libLLVM.so").mkdir()
+    found = list_candidates([tmp_path, tmp_path / "missing", tmp_path])
+    assert sorted(path.name for path in found) == ["libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1-custom"]
+
+
+@pytest.mark.parametrize("major", [14, 15, 16])
+def test_versions_that_abort_are_refused(major):
+    refused = judge(Path("libLLVM.so"), version=[major, 0, 6])
+    assert isinstance(refused, Unsuitable)
+    assert f"{major}.0.6" in str(refused) and "17 or newer" in str(refused)
+
+
+def test_library_without_version_function_is_refused_as_too_old():
+    refused = judge(Path("libLLVM.so"), version=None)
+    assert isinstance(refused, Unsuitable) and "too old" in refused.fault
+
+
+@pytest.mark.parametrize("major", [17, 19, 22, 23])
+def test_newer_versions_are_accepted(major):
+    assert judge(Path("libLLVM.so"), version=[major, 1, 2]) == LlvmLibrary(Path("libLLVM.so"), (major, 1, 2))
+
+
+def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypatch):
+    true_versions = {
+        "libLLVM.so": (18, 1, 8),
+        "libLLVM.so.22.1": (15, 0, 7),
+        "libLLVM.so.20.1": (20, 1, 0),
+        "libLLVM.so.19.1": (19, 1, 7),
+        "libLLVM-16.so.1": (16, 0, 6),
+    }
+    for name in true_versions:
+        (tmp_path / name).touch()
+    looked_at = []
+
+    def state(path):
+        looked_at.append(path.name)
+        return judge(path, version=list(true_versions[path.name]))
+
+    monkeypatch.setattr(llvm, "examine", state)
+    assert find_llvm([tmp_path]).path.name == "libLLVM.so.20.1"
+    # Those that cannot be newer than 20.1 by their own claim are left alone: loading one takes about 0.1 s.
+    assert looked_at == ["libLLVM.so", "libLLVM.so.22.1", "libLLVM.so.20.1"]
+
+
+def test_message_lists_what_was_found_and_how_to_install(tmp_path, monkeypatch):
+    (tmp_path / "libLLVM-15.so.1").touch()
+    (tmp_path / "libLLVM-14.so.1").touch()
+    monkeypatch.setattr(llvm, "examine", lambda path: judge(path, version=[15, 0, 7]))
+    with pytest.raises(SetupError) as caught:
+        find_llvm([tmp_path])
+    message = str(caught.value)
+    expected = (
+        f"{tmp_path / 'libLLVM-15.so.1'}: version 15.0.7",
+        f"{tmp_path / 'libLLVM-14.so.1'}: version",
+        "LLVM 17 or newer",
+        "apt-get install libllvm19",
+        "dnf install llvm-libs",
+        "python -m twin.backend.llvm --install",
+        "DRJIT_LIBLLVM_PATH",
+    )
+    assert [part for part in expected if part not in message] == []
+
+
+def test_message_says_none_where_there_is_none(tmp_path):
+    with pytest.raises(SetupError, match="Found:\n  none\n"):
+        find_llvm([tmp_path])
+
+
+def test_version_comes_from_the_library_not_from_its_name(tmp_path, machine_library, foreign_library):
+    # A hard link or a copy keeps the false name, a symbolic link would be resolved to the true one.
+    for companion in machine_library.companions:
+        shutil.copyfile(companion, tmp_path / companion.name)
+    shutil.copyfile(machine_library.path, tmp_path / "libLLVM-15.so.1")
+    shutil.copyfile(foreign_library, tmp_path / "libLLVM.so.99.1")
+    chosen = find_llvm([tmp_path])
+    assert chosen.path.name == "libLLVM-15.so.1"
+    assert chosen.version == machine_library.version
+    assert chosen.version[0] >= 17
+
+
+def test_foreign_library_and_text_file_are_refused(tmp_path, foreign_library):
+    assert "no libLLVM" in examine(foreign_library).fault
+    script = tmp_path / "libLLVM.so"
+    script.write_text("INPUT(libLLVM.so.19.1)\n")
+    assert "does not load" in examine(script).fault
+
+
+def test_missing_dependency_is_reported_by_name(tmp_path, foreign_library):
+    overwrite_name(foreign_library, tmp_path / "libLLVM.so.19.1")
+    with pytest.raises(SetupError, match=r"libLLVM\.so\.19\.1: it does not load: libQ\.so\.6"):
+        find_llvm([tmp_path])
+
+
+def test_dependency_is_taken_from_the_same_folder(tmp_path, foreign_library):
+    """A copy of the mathematics library, its own name in it overwritten too, serves as the one that is missing."""
+    ctypes.CDLL("libm.so.6")
+    maps = Path("/proc/self/maps").read_text().splitlines()
+    original = next(Path(line[line.index("/") :]) for line in maps if line.endswith("/libm.so.6"))
+    lacking = overwrite_name(foreign_library, tmp_path / "liblacking.so")
+    supplied = overwrite_name(original, tmp_path / "libQ.so.6.1")
+    script = (
+        "import sys; sys.path.insert(0, 'twin'); import llvm_probe; companions = []\n"
+        f"llvm_probe.load_with_companions({str(lacking)!r}, companions); print(companions)"
+    )
+    child = run_child(script)
+    assert child.stdout.strip() == str([str(supplied)]), child.stderr
+
+
+def test_library_that_ends_its_process_is_refused(tmp_path, machine_library):
+    """The loader maps a truncated file and touches pages beyond its end, which ends the process or fails to load."""
+    truncated = tmp_path / "libLLVM.so.19.1"
+    with machine_library.path.open("rb") as whole:
+        truncated.write_bytes(whole.read(4096))
+    assert isinstance(examine(truncated), Unsuitable)
+
+
+def test_users_unsuitable_choice_is_refused_and_not_replaced(monkeypatch, foreign_library):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(foreign_library))
+    with pytest.raises(SetupError, match="DRJIT_LIBLLVM_PATH") as caught:
+        find_llvm()
+    assert str(foreign_library) in str(caught.value)
+    with pytest.raises(SetupError, match="DRJIT_LIBLLVM_PATH"):
+        install_llvm()
+    assert os.environ["DRJIT_LIBLLVM_PATH"] == str(foreign_library)
+
+
+def test_users_suitable_choice_is_used(monkeypatch, machine_library, tmp_path):
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(machine_library.path))
+    assert find_llvm([tmp_path]) == machine_library
+
+
+def test_missing_runtime_library_of_drjit_is_reported(monkeypatch, machine_library):
+    monkeypatch.setattr(llvm, "RUNTIME_LIBRARY", "libabsent.so.1")
+    with pytest.raises(SetupError, match=r"Dr\.Jit needs libabsent\.so\.1.*\n(.*\n)*.*libatomic1"):
+        find_llvm([machine_library.path.parent])
+
+
+def test_install_leaves_a_suitable_library_alone(machine_library, tmp_path, monkeypatch):
+    monkeypatch.setattr(packages, "run_command", lambda command, folder=None: pytest.fail(f"ran {command}"))
+    steps = []
+    assert install_llvm(target=tmp_path / "unused", report=steps.append) == machine_library
+    assert steps == [] and not (tmp_path / "unused").exists()
+
+
+def test_install_gives_the_reason_of_every_way_that_failed(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(llvm, "WHEEL", "")
+    with pytest.raises(SetupError) as caught:
+        install_llvm(folders=[tmp_path], target=tmp_path / "unpacked")
+    message = str(caught.value)
+    expected = ("Tried without success", "apt-get install: ", "apt-get download: ", " -m pip ", "Found:\n  none")
+    assert [part for part in expected if part not in message] == []
+
+
+def test_debian_package_offered_by_the_lists_is_taken(monkeypatch):
+    policy = (
+        "libllvm19:\n  Installed: (none)\n  Candidate: (none)\n  Version table:\n"
+        "libllvm18:\n  Installed: (none)\n  Candidate: 1:18.1.8-1\n  Version table:\n"
+        "libllvm17:\n  Installed: 1:17.0.6-1\n  Candidate: 1:17.0.6-1\n  Version table:\n"
+    )
+    monkeypatch.setattr(packages, "run_command", lambda command: policy)
+    assert llvm._offered([]) == ["libllvm18", "libatomic1"]
+    monkeypatch.setattr(packages, "run_command", lambda command: "")
+    with pytest.raises(SetupError, match="there is none of libllvm19"):
+        llvm._offered([])
+
+
+def test_command_line_shows_what_is_there_and_fails_without(capsys, monkeypatch, machine_library, foreign_library):
+    assert main([]) == 0
+    assert f"chosen: {machine_library}" in capsys.readouterr().out
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(foreign_library))
+    assert main([]) == 2
+    assert "DRJIT_LIBLLVM_PATH" in capsys.readouterr().err
+
+
+def test_prepared_machine_runs_a_mitsuba_kernel(machine_library):
+    script = (
+        "import os, sys, twin.backend.llvm\n"
+        "assert not {'mitsuba', 'drjit', 'numpy'} & set(sys.modules)\n"
+        "library = twin.backend.llvm.prepare_llvm()\n"
+        "assert os.environ['DRJIT_LIBLLVM_PATH'] == str(library.path)\n"
+        "import mitsuba as mi; mi.set_variant('llvm_ad_mono')\n"
+        "import drjit as dr\n"
+        "assert tuple(dr.detail.llvm_version()) == library.version\n"
+        "assert twin.backend.llvm.prepare_llvm().version == library.version\n"
+        "print(list(dr.arange(mi.Float, 3) + 1), library)"
+    )
+    child = run_child(script)
+    assert child.stdout.strip() == f"[1.0, 2.0, 3.0] {machine_library}", child.stderr
+
+
+def test_drjit_imported_too_early_without_llvm_is_reported(machine_library):
+    script = (
+        "import ctypes, os\n"
+        f"[ctypes.CDLL(path) for path in {[str(path) for path in machine_library.companions]}]\n"
+        "import drjit\n"
+        "os.environ.pop('DRJIT_LIBLLVM_PATH')\n"
+        "from twin.backend.llvm import prepare_llvm; prepare_llvm()"
+    )
+    child = run_child(script, DRJIT_LIBLLVM_PATH="/no/such/libLLVM.so")
+    assert child.returncode == 1
+    assert "SetupError" in child.stderr and "no libLLVM" in child.stderr and "before the first import" in child.stderr

@@ -1,0 +1,153 @@
+"""Where designs see their sheet, by formulas: held against least time, the design equations and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.oracles import fermat
+from tests.virtual_sensors import altered
+from twin.design import geometry as g
+from twin.design.figures import FIGURES, figures_of, scatter_at
+from twin.design.parameters import followed, parameters_of
+from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
+from uwlts.model.sensor import Sensor
+from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, pixel_of_depth
+from uwlts.report.inventory import nominal_setup
+
+TILTED = {"camera": {"window": {"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}}}
+
+
+def numbers(sensor: Sensor, medium: str = "water"):
+    return parameters_of([sensor], [sensor.media[medium]])
+
+
+def column(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return tuple(points[:, k] for k in range(3))
+
+
+def points_of_sheet(sensor: Sensor, count: int = 200) -> np.ndarray:
+    """Random points of the sheet in the camera frame, before the window."""
+    rng = np.random.default_rng(3)
+    own = np.stack([np.zeros(count), rng.uniform(-80, 80, count), rng.uniform(-60, 90, count)], axis=1)
+    transform = camera_from_object(sensor)
+    return own @ transform[:3, :3].T + transform[:3, 3]
+
+
+@pytest.mark.parametrize("changes", [{}, TILTED, {"camera": {"stripe_along": "height"}}, {"laser": {"roll_deg": 12.0}}])
+def test_the_pose_is_that_of_the_placement(thesis, changes):
+    sensor = altered(thesis, changes)
+    found, expected = numbers(sensor).pose(np), laser_pose(sensor)
+    for ours, theirs in (
+        (found.origin, expected.origin_mm),
+        (found.axis, expected.axis),
+        (found.fan, expected.fan),
+        (found.normal, expected.normal),
+    ):
+        np.testing.assert_allclose(np.ravel(ours), theirs, atol=1e-12 * max(1, np.abs(theirs).max()))
+    assert g.standoff_mm(found).item() == pytest.approx(camera_from_object(sensor)[2, 3], rel=1e-12)
+
+
+@pytest.mark.parametrize("changes", [{}, TILTED, {"camera": {"stripe_along": "height"}}])
+def test_points_appear_where_light_of_least_time_comes_from(thesis_as_built, changes):
+    sensor = altered(thesis_as_built, changes)
+    points, p = points_of_sheet(sensor), numbers(sensor)
+    window, index = sensor.camera.window, sensor.media["water"].refractive_index(635.0)
+    faces = fermat.plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
+    rays = fermat.directions_seen(points, faces, [1.0, window.index(635.0), index])
+    view = g.seen(np, p.lens(), p.window(np), column(points))
+    # The oracle ends its search at 1e-10 mm or so of path; Newton's last step here is far below that.
+    np.testing.assert_allclose(view.slopes[0].ravel(), rays[:, 0] / rays[:, 2], atol=1e-8)
+    np.testing.assert_allclose(view.slopes[1].ravel(), rays[:, 1] / rays[:, 2], atol=1e-8)
+
+
+@pytest.mark.parametrize("changes", [{}, TILTED])
+def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
+    sensor = altered(thesis_as_built, changes)
+    points, p, step = points_of_sheet(sensor), numbers(sensor), 1e-3
+    window = p.window(np)
+    view = g.seen(np, p.lens(), window, column(points))
+    rng = np.random.default_rng(5)
+    for direction in rng.normal(size=(4, 3)):
+        direction /= np.linalg.norm(direction)
+        ahead, behind = (g.seen(np, p.lens(), window, column(points + s * step * direction)) for s in (1, -1))
+        dx, dy = g.pixels_per_mm(view, window, tuple(direction))
+        # Central differences leave f''' step^2 / 6, below 1e-9 px/mm here, and 1e-13 * 1000 px / step of rounding.
+        np.testing.assert_allclose(dx, (ahead.x - behind.x) / (2 * step), atol=1e-6)
+        np.testing.assert_allclose(dy, (ahead.y - behind.y) / (2 * step), atol=1e-6)
+        assert np.abs(dx).max() > 0.1
+
+
+@pytest.mark.parametrize("medium", ["water", "air"])
+def test_figures_agree_with_the_design_equations(thesis, medium):
+    sensor = altered(thesis, {"volume": {"near_mm": 250.0, "far_mm": 400.0}})
+    p = numbers(sensor, medium)
+    found, (reason,) = figures_of(p, reflectance=0.5, water_depth_m=100.0)
+    assert reason == ""
+    setup, leaning = nominal_setup(sensor, sensor.media[medium])
+    middle = 325.0 + setup.window.outer_mm
+    per_pixel = float(depth_per_pixel_mm(setup, pixel_of_depth(setup, middle)))
+    assert found.depth_per_px_mm.item() == pytest.approx(per_pixel * leaning, rel=1e-9)
+    for name, depth in (("line_near_mm", 250.0), ("line_mm", 325.0), ("line_far_mm", 400.0)):
+        expected = float(line_length_mm(setup, depth + setup.window.outer_mm, side_px=1280))
+        # The edge lies half a pixel outside the last pixel's centre for both.
+        assert getattr(found, name).item() == pytest.approx(expected, rel=1e-6)
+    assert found.standoff_mm.item() == pytest.approx(view_of_sheet(sensor, sensor.media[medium]).standoff_mm, rel=1e-9)
+
+
+def test_designs_are_judged_alike_alone_and_together(thesis, thesis_as_built):
+    height = altered(thesis, {"camera": {"stripe_along": "height"}})
+    tabulated = altered(thesis, {"laser": {"fan_profile": ((-20.0, 0.2), (0.0, 1.0), (22.0, 0.5))}})
+    sensors = [thesis, thesis_as_built, height, tabulated]
+    media = [sensor.media["water"] for sensor in sensors]
+    together, reasons = figures_of(parameters_of(sensors, media), reflectance=0.5, water_depth_m=10.0)
+    assert reasons == [""] * len(sensors)
+    for place, (sensor, medium) in enumerate(zip(sensors, media, strict=True)):
+        alone, _ = figures_of(parameters_of([sensor], [medium]), reflectance=0.5, water_depth_m=10.0)
+        for name in FIGURES:
+            np.testing.assert_allclose(getattr(together, name)[place], getattr(alone, name)[0], rtol=1e-12)
+
+
+def test_a_laser_placed_by_its_axis_is_the_same_sensor(thesis):
+    pose = laser_pose(thesis)
+    placed = altered(
+        thesis,
+        {
+            "laser": {
+                "baseline_mm": None,
+                "triangulation_angle_deg": None,
+                "origin_mm": tuple(pose.origin_mm),
+                "axis": tuple(pose.axis),
+            }
+        },
+    )
+    ours, _ = figures_of(numbers(placed), reflectance=0.5, water_depth_m=10.0)
+    theirs, _ = figures_of(numbers(thesis), reflectance=0.5, water_depth_m=10.0)
+    for name in FIGURES:
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-9, equal_nan=True)
+
+
+def test_what_follows_the_standoff(thesis):
+    wide = altered(thesis, {"laser": {"baseline_mm": 300.0}})
+    p = followed(np, numbers(wide), ("focus", "waist", "volume"))
+    standoff = camera_from_object(wide)[2, 3]
+    window, index = wide.camera.window, wide.media["water"].refractive_index(635.0)
+    outside = standoff - window.distance_mm - window.thickness_mm
+    apparent = window.distance_mm + window.thickness_mm / 1.52 + outside / index
+    assert p.focus_mm.item() == pytest.approx(apparent, rel=1e-9)
+    assert p.waist_distance_mm.item() == pytest.approx(math.hypot(300.0, standoff), rel=1e-12)
+    assert (p.near_mm.item() + p.far_mm.item()) / 2 == pytest.approx(outside, rel=1e-12)
+    assert p.far_mm.item() - p.near_mm.item() == pytest.approx(220.0)
+
+
+def test_scatter_at_a_depth_is_what_the_volume_has_there(thesis):
+    sensor = altered(thesis, {"volume": {"near_mm": 250.0, "far_mm": 400.0}})
+    p = numbers(sensor)
+    transform = camera_from_object(sensor)
+    outer = sensor.camera.window.distance_mm + sensor.camera.window.thickness_mm
+    z = (outer + np.array([250.0, 325.0, 400.0]) - transform[2, 3]) / transform[2, 2]
+    scatter = scatter_at(p, z, np.full(3, 1e3), reflectance=0.5)
+    found, _ = figures_of(p, reflectance=0.5, water_depth_m=10.0)
+    expected = [found.sigma_z_near_mm.item(), found.sigma_z_middle_mm.item(), found.sigma_z_far_mm.item()]
+    # Root mean squares over 15 and over 7 places of a curve that changes by some 10 % along the stripe.
+    np.testing.assert_allclose(scatter, expected, rtol=0.05)

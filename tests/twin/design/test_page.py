@@ -1,0 +1,592 @@
+"""The page of a design study: its drawing obeys optics, its charts hold the designs, and no input breaks it."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twin.design.choice import pareto
+from twin.design.description import Study, load_study
+from twin.design.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of
+from twin.design.figures import FIGURES, figures_of
+from twin.design.parameters import parameters_of
+from twin.design.report.charts import Point, bars, curves, map_of, parallel_chart, pareto_chart, sample, trade_off
+from twin.design.report.drawing import views_of
+from twin.design.report.page import page_text, write_study_page
+from twin.design.report.tables import (
+    FIGURE_NAMES,
+    Judged,
+    agreement_text,
+    label_of,
+    misses,
+    number_text,
+    rounded,
+    value_text,
+    without_numbers,
+    words_of,
+)
+from twin.design.verification import Agreement
+from uwlts.model.errors import DesignError, EvaluationError, RangeError
+from uwlts.model.sensor import Sensor
+
+STUDY = load_study("baseline-angle")
+BASE = STUDY.base()
+
+
+def small(**changes) -> Study:
+    """A study of 5 x 6 designs, with values of the Study replaced."""
+    variables = {
+        "laser.baseline_mm": {"least": 150.0, "most": 400.0, "steps": 5},
+        "laser.triangulation_angle_deg": {"least": 15.0, "most": 60.0, "steps": 6},
+    }
+    given = {"title": "small", "variables": variables, "follow": ("focus", "waist", "volume")} | {
+        "objectives": ({"figure": "sigma_z_rms_mm"}, {"figure": "line_mm", "goal": "maximise"}),
+        "constraints": {"line_mm": {"least": 160.0}},
+    }
+    return Study.model_validate(given | changes)
+
+
+def grid(study: Study) -> tuple[list[Design], dict[str, np.ndarray]]:
+    names, grids = list(study.free()), [variable.grid() for variable in study.free().values()]
+    mesh = np.stack(np.meshgrid(*(np.arange(len(g)) for g in grids), indexing="ij"), -1).reshape(-1, len(grids))
+    designs = [
+        Design(number, {n: g[k] for n, g, k in zip(names, grids, row, strict=True)})
+        for number, row in enumerate(mesh.tolist())
+    ]
+    return designs, judged(study, designs)
+
+
+def scattered(study: Study, count: int) -> tuple[list[Design], dict[str, np.ndarray]]:
+    rng = np.random.default_rng(5)
+    designs = [Design(k, {name: v.at(rng.random()) for name, v in study.free().items()}) for k in range(count)]
+    return designs, judged(study, designs)
+
+
+def marked_of(study: Study, designs: list[Design], columns: dict[str, np.ndarray]) -> list[Marked]:
+    base = study.base()
+    best = int(Judged(study, columns).best_first[0])
+    return [
+        Marked("base", base, described(study, "base", base)),
+        Marked(f"best (design {best})", built(study, designs[best]), row_of(columns, best)),
+    ]
+
+
+@pytest.fixture(scope="module")
+def swept():
+    study = small()
+    designs, columns = grid(study)
+    return study, designs, columns
+
+
+def changed(**values) -> Sensor:
+    """The thesis's sensor with values at paths (``camera__f_number``) replaced, None to leave one out."""
+    table = BASE.model_dump(exclude_none=True)
+    for path, value in values.items():
+        place = table
+        *parents, key = path.split("__")
+        for parent in parents:
+            place = place[parent]
+        if value is None:
+            del place[key]
+        else:
+            place[key] = value
+    return Sensor.model_validate(table)
+
+
+SLANT = math.radians(30)
+SENSORS = {
+    "thesis": (BASE, "water"),
+    "height": (changed(camera__stripe_along="height"), "water"),
+    "tilted window": (changed(camera__window__tilt_x_deg=-9.0, camera__window__aperture_diameter_mm=90.0), "water"),
+    "placed by its axis": (
+        changed(
+            laser__baseline_mm=None,
+            laser__triangulation_angle_deg=None,
+            laser__origin_mm=(6.0, -220.0, 15.0),
+            laser__axis=(0.0, math.sin(SLANT), math.cos(SLANT)),
+        ),
+        "water",
+    ),
+    "no windows, in air": (
+        changed(
+            camera__window__mounted=False, laser__window__mounted=False, volume={"near_mm": 300.0, "far_mm": 520.0}
+        ),
+        "air",
+    ),
+    "distorted": (changed(camera__distortion={"k1": -0.2, "k2": 0.1}), "water"),
+}
+
+
+# --- the drawing ------------------------------------------------------------------------------------------------------
+
+
+def angle_to(normal: np.ndarray, ray: np.ndarray) -> float:
+    """Angle of a ray to a normal in the plane, another way than the drawing's vectors."""
+    return math.remainder(math.atan2(ray[1], ray[0]) - math.atan2(normal[1], normal[0]), math.tau)
+
+
+@pytest.mark.parametrize("name", ["thesis", "height", "tilted window", "placed by its axis", "distorted"])
+def test_drawn_rays_obey_snell_at_both_faces(name):
+    sensor, medium = SENSORS[name]
+    side, front = views_of(sensor, sensor.medium(medium))
+    indices = [1.0, sensor.camera.window.index(635.0), sensor.medium(medium).refractive_index(635.0)]
+    # Both windows here are tilted within the pictures' planes at most, so that rays stay in them.
+    modules = [(ray, side.camera.window) for ray in side.edges] + [(ray, front.laser.window) for ray in front.fan]
+    checked = 0
+    for ray, window in modules:
+        along = window[1] - window[0]
+        normal = np.array([-along[1], along[0]])
+        normal *= np.sign(normal @ (window[2] - window[1]))
+        inner, outer = (np.cross(np.append(ray[k] - window[c], 0), np.append(along, 0))[2] for k, c in ((1, 0), (2, 2)))
+        # On the faces: rounding of coordinates of some 100 mm, times the window's width, is far below 1e-9 mm2.
+        assert abs(inner) < 1e-9 and abs(outer) < 1e-9
+        sines = [n * math.sin(angle_to(normal, b - a)) for n, a, b in zip(indices, ray[:-1], ray[1:], strict=True)]
+        # Equal up to rounding, and not because the rays run straight through.
+        assert sines == pytest.approx([sines[0]] * 3, abs=1e-12)
+        assert abs(sines[0]) > 0.01
+        checked += 1
+    assert checked == 4
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_drawn_volume_has_the_description_s_ends_and_lies_on_the_sheet(name):
+    sensor, medium = SENSORS[name]
+    side, front = views_of(sensor, sensor.medium(medium))
+    window = sensor.camera.window
+    outer = window.distance_mm + window.thickness_mm / math.cos(math.radians(window.tilt_x_deg))
+    depths = outer + np.array([sensor.volume.near_mm, sensor.volume.far_mm])
+    assert side.volume[:, 1] == pytest.approx(depths, abs=1e-9)
+    # Laser, crossing, volume and its part in view lie on one line, at the angle that is written at it.
+    points = np.vstack([side.laser.origin, side.crossing, side.volume, side.in_view])
+    direction = np.array([math.sin(side.angle_rad), -math.cos(side.angle_rad)])
+    aside = (points - side.crossing) @ np.array([direction[1], -direction[0]])
+    assert aside == pytest.approx(np.zeros(len(points)), abs=1e-9)
+    first, last = side.in_view[:, 1]
+    assert depths[0] - 1e-9 <= first < last <= depths[1] + 1e-9
+    assert front.lines.shape == (3, 2, 2)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_drawn_lines_are_as_long_as_the_figures_say_and_end_at_the_drawn_borders(name):
+    sensor, medium = SENSORS[name]
+    _, front = views_of(sensor, sensor.medium(medium))
+    figures, (reason,) = figures_of(
+        parameters_of([sensor], [sensor.medium(medium)]), reflectance=0.5, water_depth_m=100.0
+    )
+    assert not reason
+    lengths = np.array([figures.line_near_mm[0], figures.line_mm[0], figures.line_far_mm[0]])
+    # The figures leave out 1e-9 of the line at both ends, as the drawing does; the rest is rounding.
+    assert np.ptp(front.lines[:, :, 0], axis=1) == pytest.approx(lengths, rel=1e-8)
+    # Lines end on the image's border, found by tracing rays forward, or on the fan's edge. The border has 40 pieces per
+    # side: between their ends it lies off by less than 0.1 mm even where distortion bends it. In the image's corners,
+    # at near and far end, the line may end a little beyond the border's, as it is bent and the volume's end is not.
+    for line, allowed in zip(front.lines, (2.5, 0.1, 2.5), strict=True):
+        for end in line:
+            assert min(distance_to(end, border) for border in (*front.borders, *front.fan)) < allowed
+
+
+def distance_to(point: np.ndarray, polyline: np.ndarray) -> float:
+    start, step = polyline[:-1], np.diff(polyline, axis=0)
+    share = np.clip(((point - start) * step).sum(1) / (step**2).sum(1), 0, 1)
+    return float(np.nanmin(np.linalg.norm(start + share[:, None] * step - point, axis=1)))
+
+
+def test_a_rolled_laser_is_drawn_with_its_sheet_as_a_line():
+    sensor = changed(laser__roll_deg=10.0)
+    side, _ = views_of(sensor, sensor.medium("water"))
+    assert side.baseline_mm == pytest.approx(265.0)
+    assert 200 < side.laser.origin[0] < 265
+    slope = (side.sheet[-1] - side.laser.origin) / (side.crossing - side.laser.origin)
+    assert slope[0] == pytest.approx(slope[1], rel=1e-9)
+
+
+def test_a_sheet_that_never_crosses_the_axis_ahead_is_refused():
+    sensor = changed(laser__baseline_mm=20.0, laser__triangulation_angle_deg=60.0)
+    with pytest.raises(DesignError, match=r"11\.5 mm from the entrance pupil"):
+        views_of(sensor, sensor.medium("water"))
+
+
+# --- the Pareto front -------------------------------------------------------------------------------------------------
+
+
+def front_by_definition(values: np.ndarray) -> list[bool]:
+    def beats(a, b):
+        return all(x <= y for x, y in zip(a, b, strict=True)) and any(x < y for x, y in zip(a, b, strict=True))
+
+    known = [not any(map(math.isnan, row)) for row in values]
+    return [
+        ok and not any(other and beats(b, a) for b, other in zip(values, known, strict=True))
+        for a, ok in zip(values, known, strict=True)
+    ]
+
+
+numbers = st.one_of(st.integers(-3, 3).map(float), st.sampled_from([math.nan, math.inf, -math.inf]))
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.integers(1, 4).flatmap(lambda m: st.lists(st.lists(numbers, min_size=m, max_size=m), max_size=25)))
+def test_the_front_is_the_one_of_the_definition(rows):
+    values = np.array(rows, dtype=float).reshape(len(rows), len(rows[0]) if rows else 2)
+    assert pareto(values).tolist() == front_by_definition(values.tolist())
+
+
+def test_the_front_of_many_designs():
+    values = np.random.default_rng(1).random((100_000, 2))
+    front = pareto(values)
+    found = values[front][np.argsort(values[front, 0])]
+    # Along the front one value rises while the other falls, and nothing lies below it.
+    assert len(found) > 5 and (np.diff(found[:, 1]) < 0).all()
+    below = np.searchsorted(found[:, 0], values[:, 0], side="right") - 1
+    assert (values[below >= 0, 1] >= found[below[below >= 0], 1]).all()
+
+
+@pytest.mark.parametrize("values", [np.zeros(3), np.zeros((3, 0))])
+def test_values_that_are_no_table_are_refused(values):
+    with pytest.raises(RangeError, match="shape"):
+        pareto(values)
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_figure_has_a_name_of_its_own():
+    assert set(FIGURE_NAMES) == set(FIGURES)
+    assert len({words for words, _ in FIGURE_NAMES.values()}) == len(FIGURES)
+
+
+@pytest.mark.parametrize(
+    ("name", "label"),
+    [
+        ("laser.baseline_mm", "laser baseline (mm)"),
+        ("camera.f_number", "camera f-number"),
+        ("camera.window.tilt_x_deg", "camera window tilt x (°)"),
+        ("laser.beam_quality_m2", "laser beam quality M²"),
+        ("sigma_z_rms_mm", "σ Z, rms over the volume (mm)"),
+        ("my_camera", "my camera"),
+        ("detector.dark_current_e_per_s", "detector dark current (e⁻/s)"),
+    ],
+)
+def test_labels(name, label):
+    assert label_of(name) == label
+
+
+def test_numbers_in_words():
+    assert [number_text(v) for v in (0.0123456, 1234.5678, -2.5, math.nan, 1e-5, 250.0)] == [
+        "0.01235",
+        "1235",
+        "\N{MINUS SIGN}2.5",
+        "\N{EN DASH}",
+        "0.00001",
+        "250",
+    ]
+    assert value_text("laser_class", 4.0) == "3B"
+    assert value_text("laser.triangulation_angle_deg", np.float64(35)) == "35°"
+    assert rounded([1.2345678, math.inf, math.nan, 0.000123456]) == [1.2346, None, None, 0.00012346]
+    assert without_numbers("begins -12.5 mm and 3e-4 mm behind x2") == "begins … mm and … mm behind x2"
+
+
+# --- charts -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_grid_is_shown_as_it_is(swept):
+    study, _, columns = swept
+    found = map_of(Judged(study, columns), *study.variables, ["sigma_z_rms_mm", "line_mm"])
+    assert found.values["line_mm"].shape == (6, 5)
+    checked = 0
+    for place in range(len(columns["design"])):
+        row = row_of(columns, place).table()
+        k = int(np.argmin(abs(found.x - row["laser.baseline_mm"])))
+        i = int(np.argmin(abs(found.y - row["laser.triangulation_angle_deg"])))
+        if row["failure"]:
+            assert math.isnan(found.values["line_mm"][i, k]) and found.reasons[i, k] == row["failure"]
+        else:
+            assert found.values["line_mm"][i, k] == row["line_mm"]
+            assert (found.reasons[i, k] != "") == (row["line_mm"] < 160.0)
+        checked += 1
+    assert checked == 30
+    assert any("line length in the middle is" in text and "at least 160" in text for text in found.reasons.ravel())
+
+
+def test_scattered_designs_are_interpolated():
+    study = small()
+    _, columns = scattered(study, 400)
+    # A figure that is linear in both variables comes back as it was.
+    columns["sigma_z_rms_mm"] = np.where(
+        columns["failure"] == "", columns["laser.baseline_mm"] + 2 * columns["laser.triangulation_angle_deg"], np.nan
+    )
+    found = map_of(Judged(study, columns), *study.variables, ["sigma_z_rms_mm", "line_mm"])
+    expected = found.x[None, :] + 2 * found.y[:, None]
+    known = np.isfinite(found.values["sigma_z_rms_mm"])
+    assert known.mean() > 0.5
+    assert found.values["sigma_z_rms_mm"][known] == pytest.approx(expected[known], rel=1e-9)
+    assert found.smooth and found.dots
+
+
+def test_what_else_varies_is_shown_at_its_best(swept):
+    study, _, _ = swept
+    wider = small(choices={"lens": {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}})
+    _, columns = grid(wider)
+    found = map_of(Judged(wider, columns), *study.variables, ["sigma_z_rms_mm", "line_mm"])
+    sigma = np.where(columns["violation"] == 0, columns["sigma_z_rms_mm"], np.inf).reshape(5, 6, 2).min(axis=2).T
+    assert np.isfinite(sigma).sum() > 5
+    assert found.values["sigma_z_rms_mm"][np.isfinite(sigma)] == pytest.approx(sigma[np.isfinite(sigma)])
+    assert found.caption.startswith("Lens also vary")
+
+
+def test_the_front_in_the_chart_is_that_of_the_designs_that_meet_the_constraints(swept):
+    study, _, columns = swept
+    table = Judged(study, columns)
+    assert trade_off(table) == (("sigma_z_rms_mm", 1), ("line_mm", -1))
+    figure = pareto_chart(table, [Point("base", {"sigma_z_rms_mm": 0.03, "line_mm": 160.0}, 0, True)]).figure
+    front = next(trace for trace in figure.data if trace.name.startswith("Pareto"))
+    meets = columns["violation"] == 0
+    values = np.column_stack([columns["sigma_z_rms_mm"], -columns["line_mm"]])[meets]
+    expected = values[front_by_definition(values.tolist())]
+    assert sorted(front.x) == rounded(np.sort(expected[:, 0]))
+    assert [note.text for note in figure.layout.annotations] == ["<b>base</b>"]
+
+
+def test_parallel_axes_hold_choices_by_name():
+    study = small(choices={"lens": {"<fast>": {"camera.f_number": 4.0}, "slow": {"camera.f_number": 8.0}}})
+    _, columns = grid(study)
+    (trace,) = parallel_chart(Judged(study, columns)).figure.data
+    axis = next(one for one in trace.dimensions if one.label == "lens")
+    assert list(axis.ticktext) == ["<fast>", "slow"] and set(axis["values"]) == {0, 1}
+    assert len(axis["values"]) == (columns["violation"] == 0).sum() > 5
+
+
+def test_sampling_keeps_what_is_to_be_kept():
+    candidates = np.arange(1000) % 2 == 0
+    kept = np.zeros(1000, bool)
+    kept[[0, 10]] = True
+    chosen = sample(candidates, kept, 100)
+    assert chosen.sum() == 100 and chosen[kept].all() and not chosen[~candidates].any()
+
+
+def test_one_variable_gives_curves_and_none_gives_bars():
+    lens = {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}
+    study = small(variables={"laser.power_mw": {"least": 1, "most": 20, "steps": 4}}, choices={"lens": lens}, follow=())
+    _, columns = grid(study)
+    base = Point("base", {"laser.power_mw": 7.0, "line_mm": 9.0}, 0, True)
+    panels = curves(Judged(study, columns), [base], "laser.power_mw").figure.axes
+    assert [line.get_label() for line in panels[0].lines][:2] == ["f/4", "f/8"]
+    assert panels[0].lines[0].get_xdata().tolist() == pytest.approx([1, 22 / 3, 41 / 3, 20])
+    lengths = next(axes for axes in panels if axes.get_title() == "line length in the middle (mm)")
+    (marked,) = (line for line in lengths.lines if line.get_label() == "base")
+    assert (list(marked.get_xdata()), list(marked.get_ydata())) == ([7.0], [9.0])
+    study = small(variables={}, choices={"lens": lens})
+    _, columns = grid(study)
+    axes = bars(Judged(study, columns)).figure.axes[0]
+    best = columns["sigma_z_rms_mm"].argmin()
+    assert axes.get_yticklabels()[0].get_text() == list(lens)[best] and len(axes.patches) == 2
+    assert axes.patches[0].get_width() == columns["sigma_z_rms_mm"][best]
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+class Page(HTMLParser):
+    """What a page holds: text, attributes that load something, and the figures' JSON."""
+
+    VOID = {"meta", "br", "link", "img", "rect", "path", "line", "circle"}
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.loads: list[str] = []
+        self.figures: list[dict] = []
+        self._kind = ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        table = dict(attrs)
+        self.loads += [value for key, value in attrs if key in ("src", "href", "action", "data", "poster", "srcset")]
+        self._kind = table.get("type", "code") if tag == "script" else "style" if tag == "style" else ""
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.loads += [value for key, value in attrs if key in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+        self._kind = ""
+
+    def handle_data(self, data):
+        if self._kind == "application/json":
+            self.figures.append(json.loads(data, parse_constant=lambda name: pytest.fail(f"{name} is no JSON")))
+        elif not self._kind:
+            self.words.append(data)
+
+    def text(self) -> str:
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def verification(**changes) -> Agreement:
+    found = Agreement(
+        "best",
+        3,
+        z_mm=[-50.0, 0.0, 50.0],
+        predicted_mm=[0.01, 0.02, 0.03],
+        rendered_mm=[0.011, 0.022, math.nan],
+        error_mm=[0.001, -0.004, math.nan],
+        line_mm=[150.0, 160.0, 0.0],
+        ratio=1.1,
+        agrees=True,
+        exposure_ms=1.25,
+        predicted_exposure_ms=1.2,
+        seconds=80.0,
+    )
+    return replace(found, **changes)
+
+
+def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
+    study, designs, columns = swept
+    marked = marked_of(study, designs, columns)
+    bad = verification(label="base", design=-1, ratio=2.5, agrees=False, rendered_mm=[0.01, 0.05, 0.03])
+    rows = [verification(), bad]
+    path = tmp_path / "report.html"
+    path.write_text("older")
+    write_study_page(path, study, columns, marked=marked, agreements=rows, notes=["A note & more."])
+    raw = path.read_text(encoding="utf-8")
+    page = Page(raw)
+    assert not page.open
+    text, chosen = page.text(), marked[-1].design.table()
+    assert (columns["violation"] == 0).sum() > 5
+    works = (columns["failure"] == "").sum()
+    assert f"30 judged, all of a grid; {works} work, {(columns['violation'] == 0).sum()} meet all constraints" in text
+    for name in ("laser.baseline_mm", "laser.triangulation_angle_deg", "sigma_z_rms_mm", "line_mm", "standoff_mm"):
+        tile = f"{words_of(name)} {value_text(name, chosen[name])}"
+        assert tile.replace("\N{NO-BREAK SPACE}", " ") in text
+    assert "A note & more." in text and "laser baseline from 150" in text
+    assert "Formulas and rendering disagree by a factor 2.5, more than the 1.5 allowed: most at Z = 0 mm" in text
+    assert "20 µm were predicted and 50 µm rendered" in text
+    assert "the measuring volume would begin … mm behind the window's outer face" in text
+    # Nothing is asked of the network: links lead within the page, and the policy forbids the rest.
+    assert page.loads and all(link.startswith(("#", "data:image/png")) for link in page.loads)
+    styles = raw.split("<script")[0]
+    assert "default-src 'none'" in styles and "@import" not in styles and not re.findall(r"url\((?!#)", styles)
+    # Front and parallel axes; drawing, maps and two verifications.
+    assert len(page.figures) == 2 and styles.count("<svg") == 4
+    assert len(raw) < 7e6
+
+
+def test_figures_hold_rounded_numbers_only(swept):
+    study, designs, columns = swept
+    page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[]))
+    shown = [trace for trace in page.figures[0]["data"] if trace.get("showlegend", True)]
+    numbers = [value for trace in shown for value in (*trace["x"], *trace["y"])]
+    assert len(numbers) == 2 * (columns["failure"] == "").sum()
+    assert all(float(f"{value:.5g}") == value for value in numbers)
+
+
+def test_labels_are_escaped():
+    lens = {'<script>alert("1")</script>': {"camera.f_number": 4.0}, "f & 8": {"camera.f_number": 8.0}}
+    study = small(title="<b>bold</b>", choices={"<i>lens</i>": lens})
+    designs, columns = grid(study)
+    marked = [Marked("<u>me</u>", m.sensor, m.design) for m in marked_of(study, designs, columns)]
+    row = verification(label="<u>me</u>", failure="no <marks>", agrees=False)
+    raw = page_text(study, columns, marked=marked, agreements=[row], notes=["<hr>"])
+    page = Page(raw)
+    assert not page.open
+    before, _, _ = raw.partition('<script type="application/json"')
+    for tag in ("<script>", "<b>bold", "<u>", "<hr>", "<marks>", "<i>lens"):
+        assert tag not in before.split("<body>")[1]
+    assert "<b>bold</b>" in page.text() and "no <marks>" in page.text()
+    notes = [note["text"] for note in page.figures[0]["layout"]["annotations"]]
+    assert "<b>&lt;u&gt;me&lt;/u&gt;</b>" in notes
+
+
+def failing(study: Study) -> dict[str, np.ndarray]:
+    _, columns = grid(study)
+    for name in FIGURES:
+        columns[name] = np.full(30, np.nan)
+    columns["violation"] = np.full(30, np.inf)
+    columns["failure"] = np.array([f"the lens is {k} mm too short" for k in range(30)], dtype=object)
+    return columns
+
+
+def test_a_page_without_designs_says_so():
+    page = Page(page_text(small(), {}, marked=[], agreements=[]))
+    assert "No design has been judged." in page.text() and "0 judged" in page.text() and not page.figures
+
+
+def test_a_page_of_failures_says_why():
+    study = small()
+    page = Page(page_text(study, failing(study), marked=[], agreements=[]))
+    assert "None of the designs works" in page.text()
+    assert "the lens is … mm too short" in page.text() and not page.figures
+
+
+def test_a_page_where_nothing_meets_the_constraints():
+    study = small(constraints={"coverage": {"least": 2.0}})
+    designs, columns = grid(study)
+    page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[]))
+    assert "No design meets all constraints." in page.text()
+    assert "None meets all constraints: the front is that of all that work." in page.text()
+    assert "misses its bound: at least 200 % is asked" in page.text()
+    assert len(page.figures) == 1
+
+
+@pytest.mark.parametrize("kind", ["grid", "scattered"])
+def test_a_page_of_one_design(kind):
+    study = small()
+    designs, columns = grid(study) if kind == "grid" else scattered(study, 40)
+    place = int(np.flatnonzero(columns["violation"] == 0)[0])
+    one = {name: values[place : place + 1] for name, values in columns.items()}
+    marked = [Marked("only", built(study, designs[place]), row_of(columns, place))]
+    page = Page(page_text(study, one, marked=marked, agreements=[]))
+    assert "1 judged" in page.text() and not page.open
+
+
+def test_designs_in_a_row_span_no_area():
+    study = small()
+    designs, _ = scattered(study, 40)
+    for slant in (0.0, 1e-9):
+        angles = [30.0 + slant * design.number for design in designs]
+        row = [
+            Design(design.number, design.values | {"laser.triangulation_angle_deg": angle})
+            for design, angle in zip(designs, angles, strict=True)
+        ]
+        page = Page(page_text(study, judged(study, row), marked=[], agreements=[]))
+        assert not page.open
+    assert "span no area" in page.text()
+
+
+def test_a_chosen_design_that_cannot_be_drawn_is_said():
+    study = small()
+    _, columns = grid(study)
+    sensor = changed(laser__baseline_mm=20.0, laser__triangulation_angle_deg=60.0)
+    marked = [Marked("bad", sensor, EvaluatedDesign(-1, {}, dict.fromkeys(FIGURES, math.nan), 0.0, ""))]
+    page = Page(page_text(study, columns, marked=marked, agreements=[]))
+    assert "The design cannot be drawn: the sheet crosses" in page.text()
+
+
+def test_results_of_another_study_are_refused(swept):
+    _, _, columns = swept
+    other = small(variables={"camera.f_number": {"least": 2, "most": 8}})
+    with pytest.raises(EvaluationError, match=r"no camera\.f_number"):
+        page_text(other, columns, marked=[], agreements=[])
+
+
+def test_verdicts():
+    study = small()
+    assert agreement_text(study, verification()).startswith("Formulas and rendering agree")
+    assert "no marks" in agreement_text(study, verification(failure="no marks", agrees=False))
+    lost = verification(agrees=False, ratio=math.nan, rendered_mm=[math.nan] * 3)
+    assert "could not be compared" in agreement_text(study, lost)
+
+
+def test_missed_bounds_in_words():
+    study = small(constraints={"line_mm": {"least": 100.0, "most": 200.0}})
+    (text,) = misses(study, {"line_mm": 250.0})
+    assert text == "line length in the middle is 250\N{NO-BREAK SPACE}mm, at most 200\N{NO-BREAK SPACE}mm is asked"
+    assert not misses(study, {"line_mm": 150.0})

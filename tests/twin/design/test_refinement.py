@@ -1,0 +1,95 @@
+"""Derivatives of figures by the numbers of a design, held against differences, and designs that they improve."""
+
+import numpy as np
+import pytest
+
+from twin.design.description import Study
+from twin.design.designs import Design, judged
+from twin.design.refinement import PARAMETER_OF, SMOOTH, DerivedFigures, refined
+
+VALUES = {
+    "laser.baseline_mm": 265.0,
+    "laser.triangulation_angle_deg": 35.0,
+    "laser.roll_deg": 0.4,
+    "laser.power_mw": 7.0,
+    "laser.waist_radius_mm": 0.25,
+    "laser.waist_distance_mm": 450.0,
+    "laser.beam_quality_m2": 1.4,
+    "laser.window.distance_mm": 30.0,
+    "laser.window.thickness_mm": 6.0,
+    "camera.focal_length_mm": 12.5,
+    "camera.f_number": 4.0,
+    "camera.focus_distance_mm": 320.0,
+    "camera.window.distance_mm": 60.0,
+    "camera.window.thickness_mm": 6.0,
+    "camera.window.tilt_x_deg": 3.0,
+    "camera.window.tilt_y_deg": -2.0,
+    "volume.near_mm": 250.0,
+    "volume.far_mm": 380.0,
+}
+
+
+def study_of(paths: dict[str, float], **rest: object) -> Study:
+    ranges = {
+        path: {"least": value - 0.3 * abs(value), "most": value + 0.3 * abs(value)} for path, value in paths.items()
+    }
+    return Study.model_validate({"title": "test", "variables": ranges, "sampling": {"kind": "sobol"}} | rest)
+
+
+def test_every_derivative_is_the_limit_of_differences():
+    assert set(VALUES) == set(PARAMETER_OF)
+    study, names = study_of(VALUES), list(SMOOTH)
+    design = Design(0, VALUES)
+    figures = DerivedFigures(study, design, names)
+    start = np.array([VALUES[path] for path in figures.paths])
+    found = figures.at(start)
+    direct = judged(study, [design])
+    for value, name in zip(found.values, names, strict=True):
+        assert value == pytest.approx(direct[name].item(), rel=1e-9), name
+    for k, path in enumerate(figures.paths):
+        step = 1e-5 * abs(start[k])
+        ends = [judged(study, [Design(0, VALUES | {path: start[k] + s * step})]) for s in (1, -1)]
+        for row, name in zip(found.gradient, names, strict=True):
+            difference = (ends[0][name].item() - ends[1][name].item()) / (2 * step)
+            # Rounding leaves 1e-11 of the value over the step's length, 1e-6 of the derivative or less.
+            size = abs(direct[name].item() / start[k])
+            assert row[k] == pytest.approx(difference, rel=1e-5, abs=1e-6 * size), (path, name)
+
+
+def test_a_design_follows_the_gradient_to_the_best_of_its_range():
+    study = study_of(
+        {"laser.baseline_mm": 265.0, "laser.triangulation_angle_deg": 35.0},
+        follow=["focus", "waist", "volume"],
+        constraints={"line_mm": {"least": 160.0}},
+    )
+    start = Design(0, {"laser.baseline_mm": 280.0, "laser.triangulation_angle_deg": 33.0})
+    before = judged(study, [start])
+
+    def better(design: Design) -> bool:
+        found = judged(study, [design])
+        return bool(found["violation"][0] == 0 and found["sigma_z_rms_mm"][0] < before["sigma_z_rms_mm"][0])
+
+    end = refined(study, start, better)
+    assert end is not None
+    after = judged(study, [end])["sigma_z_rms_mm"].item()
+    # A fine grid about the end finds nothing better that keeps all constraints and as much in view.
+    around = [
+        Design(0, {"laser.baseline_mm": b, "laser.triangulation_angle_deg": a})
+        for b in np.linspace(185.5, 344.5, 41)
+        for a in np.linspace(24.5, 45.5, 61)
+    ]
+    columns = judged(study, around)
+    allowed = (columns["violation"] == 0) & (columns["coverage"] >= before["coverage"][0])
+    assert allowed.sum() > 50
+    assert after < 0.995 * before["sigma_z_rms_mm"].item()
+    assert after <= 1.002 * columns["sigma_z_rms_mm"][allowed].min()
+
+
+def test_nothing_to_derive_is_no_refinement():
+    study = Study.model_validate({"title": "t", "variables": {"laser.wavelength_nm": {"least": 500.0, "most": 650.0}}})
+    assert refined(study, Design(0, {"laser.wavelength_nm": 600.0}), lambda design: True) is None
+
+
+def test_a_refinement_that_is_not_accepted_is_none():
+    study = study_of({"laser.power_mw": 7.0})
+    assert refined(study, Design(0, {"laser.power_mw": 7.0}), lambda design: False) is None

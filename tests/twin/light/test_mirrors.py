@@ -1,0 +1,74 @@
+"""Mirrors: the stripe's second image stands where the mirrored geometry says, as bright as the mirror's share."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.virtual_sensors import block, clear, image_of, plate, scene_of, sensor_at
+from twin.light.renderer import Renderer
+from twin.options import NONE
+from twin.recording.truth import true_stripe
+from twin.scene.description import Scene
+from uwlts.model.sensor import Sensor
+from uwlts.storage.truth import TruthStatus
+
+SHARE, MIRROR_Z, TILT = 0.8, 40.0, math.radians(10.0)
+PLATE_Z = 10.0
+EFFECTS = replace(NONE, secondary_light=True, gloss=True)
+BLOCK = block((30.0, 60.0, 20.0), (0.0, 0.0, 10.0), reflectance=0.6)
+"""Its upper face lies at Z = 0, its lower one 20 mm above the mirror."""
+
+
+def mirror(share: float, **rest: object) -> dict[str, object]:
+    return plate(MIRROR_Z, side=300.0, reflectance=0.0) | {"mirror": share} | rest
+
+
+def test_a_perfect_mirror_shows_no_stripe_of_its_own(thesis):
+    renderer = Renderer(thesis, clear(), scene_of(mirror(1.0)), effects=EFFECTS)
+    assert renderer.irradiance("laser", sensor_at(), spp=16).max() == 0
+    assert (true_stripe(renderer, sensor_at()).status != TruthStatus.VISIBLE).all()
+
+
+def hidden(share: float) -> Scene:
+    """A small plate that turns its back to the sensor, before a mirror turned by TILT about Y.
+
+    The sheet X = 0 comes back from the mirror at twice the tilt and meets the plate's face there.
+    """
+    x = -(MIRROR_Z - PLATE_Z) * math.tan(2 * TILT)
+    facing_away = plate(PLATE_Z, side=12.0, x=x, reflectance=0.6) | {"rotation_deg": (180.0, 0.0, 0.0)}
+    return scene_of(facing_away, mirror(share) | {"rotation_deg": (0.0, math.degrees(TILT), 0.0)})
+
+
+def brightness(thesis: Sensor, share: float) -> np.ndarray:
+    return Renderer(thesis, clear(), hidden(share), effects=EFFECTS).irradiance("laser", sensor_at(), spp=64)
+
+
+def test_a_stripe_lit_and_seen_by_way_of_a_mirror_shows_at_its_mirrored_points(thesis):
+    assert brightness(thesis, 0.0).max() == 0, "nothing of it is lit or seen straight"
+    image = brightness(thesis, SHARE)
+    y = np.linspace(-3.0, 3.0, 7)
+    lit = np.stack([np.full_like(y, -(MIRROR_Z - PLATE_Z) * math.tan(2 * TILT)), y, np.full_like(y, PLATE_Z)], axis=1)
+    normal = np.array([-math.sin(TILT), 0.0, -math.cos(TILT)])
+    mirrored = lit - 2 * ((lit - (0.0, 0.0, MIRROR_Z)) @ normal)[:, None] * normal
+    column, row = np.rint(image_of(thesis, clear(), mirrored)).astype(int).T
+    strip = np.stack([image[row + k, column] for k in range(-30, 31)])
+    assert (strip.max(axis=0) > 0).all()
+    assert (np.abs(strip.argmax(axis=0) - 30) <= 1).all()
+
+
+def test_light_by_way_of_a_mirror_twice_goes_with_its_share_squared(thesis):
+    half, whole = (brightness(thesis, share).sum() for share in (SHARE / 2, SHARE))
+    assert whole / half == pytest.approx(4.0, rel=1e-4)
+
+
+def test_the_straight_stripe_is_the_same_with_a_mirror(thesis):
+    scenes = [scene_of(BLOCK, mirror(share)) for share in (SHARE, 0.0)]
+    renderers = [Renderer(thesis, clear(), scene, effects=EFFECTS) for scene in scenes]
+    with_mirror, without = (renderer.irradiance("laser", sensor_at(), spp=64) for renderer in renderers)
+    truth = true_stripe(renderers[1], sensor_at())
+    line = np.flatnonzero(truth.status == TruthStatus.VISIBLE)[20:-20]
+    row = np.rint(truth.centre_px[line]).astype(int)
+    assert len(line) > 200
+    np.testing.assert_allclose(with_mirror[row, line], without[row, line], rtol=1e-3)

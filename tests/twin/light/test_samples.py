@@ -1,0 +1,80 @@
+"""Samples per pixel: evenly placed, they integrate the stripe as well as a thousand random ones would."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
+from twin.light.image_sampling import golden_step
+from twin.light.renderer import Renderer
+from twin.options import NONE
+
+
+@pytest.fixture(scope="module")
+def renderer(thesis):
+    return Renderer(cropped(thesis, 64, 64), clear(0.3), scene_of(plate()), effects=NONE)
+
+
+@pytest.fixture(scope="module")
+def reference(renderer):
+    """Irradiance with 16384 samples per pixel."""
+    return renderer.irradiance("laser", sensor_at(), spp=16384).astype(float)
+
+
+@pytest.fixture(scope="module")
+def stripe(reference):
+    """The stripe's pixels, where brighter than 1 % of its middle."""
+    chosen = reference > 0.01 * reference.max()
+    assert 300 < chosen.sum() < 600
+    return chosen
+
+
+def worst(renderer: Renderer, reference: np.ndarray, stripe: np.ndarray, spp: int) -> float:
+    """Largest error of a stripe's pixel, as a share of the brightest."""
+    image = renderer.irradiance("laser", sensor_at(), spp=spp).astype(float)
+    return np.abs(image - reference)[stripe].max() / reference.max()
+
+
+def test_error_falls_with_the_square_of_the_samples(renderer, reference, stripe):
+    # Midpoint rule with n strips in a Gaussian of sigma 1.1 px and height 1: at most |f''| / (24 n^2) = 1 / (29 n^2).
+    for spp in (4, 8, 16):
+        assert worst(renderer, reference, stripe, spp) < 1 / (24 * spp**2) + 2e-4, spp
+    assert worst(renderer, reference, stripe, 4) > 10 * worst(renderer, reference, stripe, 32)
+    # One sample, the pixel's middle, leaves out the pixel's own width: the test would notice that.
+    assert worst(renderer, reference, stripe, 1) > 0.01
+
+
+def test_stripe_pixels_are_unbiased_in_the_mean(renderer, reference, stripe):
+    for spp in (3, 5, 16):
+        image = renderer.irradiance("laser", sensor_at(), spp=spp).astype(float)
+        assert image[stripe].sum() == pytest.approx(reference[stripe].sum(), rel=1e-3), spp
+
+
+@pytest.mark.parametrize("along", ["width", "height"])
+def test_sixteen_samples_find_the_stripes_centre(thesis, along):
+    # The detector's noise leaves some 0.02 px of a stripe's centre; samples must add far less than that.
+    sensor = altered(thesis, {"camera": {"stripe_along": along, "width_px": 64, "height_px": 64}})
+    renderer = Renderer(sensor, clear(0.3), scene_of(plate()), effects=NONE)
+    images = [renderer.irradiance("laser", sensor_at(), spp=spp).astype(float) for spp in (16, 4096)]
+    if along == "height":
+        images = [image.T for image in images]
+    few, many = (np.arange(64) @ image / image.sum(axis=0) for image in images)
+    assert np.abs(few - many).max() < 0.002
+
+
+def test_equal_arguments_give_equal_images(renderer):
+    first, again = (renderer.irradiance("laser", sensor_at(), spp=4) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 16, 64, 100, 4096])
+def test_lattice_is_even_along_either_side(count):
+    step = golden_step(count)
+    assert math.gcd(step, count) == 1
+    assert sorted(k * step % count for k in range(count)) == list(range(count))
+    if count >= 16:
+        # No two samples closer than a third of what an even spread over the square would give.
+        k = np.arange(1, count)
+        across, along = np.minimum(k, count - k) / count, np.minimum(k * step % count, -k * step % count) / count
+        assert np.hypot(across, along).min() > 0.33 / math.sqrt(count)

@@ -1,0 +1,283 @@
+"""The twin's ground truth: stripe centres by least time, points on their surfaces, shadows where geometry puts them."""
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from tests.virtual_sensors import (
+    altered,
+    block,
+    camera_axes,
+    clear,
+    cropped,
+    laser_origin,
+    oracle_fan,
+    oracle_paths,
+    plate,
+    scene_of,
+    sensor_at,
+)
+from twin.light.renderer import Renderer
+from twin.options import NONE
+from twin.recording.truth import FrameTruth, depth_map, true_stripe
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.storage.truth import TruthStatus
+
+CENTRE_PX = 1e-3
+"""A coordinate of 1000 px is rounded to 6e-5 px, and 1e-4 mm of a ray in 32 bits are 5e-4 px at 0.2 mm per pixel."""
+SURFACE_MM = 1e-3
+"""Ten times the error of a ray in 32 bits: hits on curved and turned surfaces go through the surface's own frame."""
+
+
+def coarse(thesis: Sensor) -> Sensor:
+    """The thesis's view in 320 x 256 pixels."""
+    return altered(thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}})
+
+
+def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
+    """Image points (N, 2) of points (N, 3) of the OCS by least time and OpenCV's lens."""
+    camera, d = sensor.camera, sensor.camera.distortion
+    focal, (cx, cy) = camera.focal_length_px(), camera.principal_point()
+    matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
+    rays = oracle_paths(sensor, medium, points)[0]
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array([d.k1, d.k2, d.p1, d.p2, d.k3]))[0][:, 0]
+
+
+def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where profile lines see the sheet X = 0 on the plane Z = ``z``: y (N,) and the coordinate across the stripe (N,).
+
+    A secant search along the sheet for the y that appears on the line.
+    """
+    along, across = (0, 1) if sensor.camera.stripe_along == "width" else (1, 0)
+
+    def image(y: np.ndarray) -> np.ndarray:
+        return seen_at(sensor, medium, np.stack([0 * y, y, np.full_like(y, z)], axis=1))
+
+    y = np.linspace(-110, 110, len(lines))
+    slope, offset = np.polyfit(y, image(y)[:, along], 1)
+    old, new = (lines - offset) / slope, (lines - offset) / slope + 0.5
+    miss_old = image(old)[:, along] - lines
+    for _ in range(30):
+        miss = image(new)[:, along] - lines
+        if np.abs(miss).max() < 1e-9:
+            return new, image(new)[:, across]
+        change = np.where(miss == miss_old, 0.0, miss * (new - old) / np.where(miss == miss_old, 1.0, miss - miss_old))
+        old, new, miss_old = new, new - change, miss
+    raise ArithmeticError(f"the stripe was not found on every line: {np.abs(miss).max():g} px are left")
+
+
+SENSORS = {
+    "thesis": {},
+    "distorted": {
+        "distortion": {"k1": -0.15, "k2": 0.1, "p1": 0.002, "p2": -0.003},
+        "principal_point_px": (640.3, 519.2),
+    },
+    "upright": {"stripe_along": "height"},
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_true_centres_are_where_light_of_least_time_shows_the_sheet(thesis, name):
+    sensor, medium = altered(thesis, {"camera": SENSORS[name]}), clear(0.3)
+    renderer = Renderer(sensor, medium, scene_of(plate()))
+    for z in (-45.0, 60.0):
+        truth = true_stripe(renderer, sensor_at(-z))
+        lines = np.arange(100, sensor.camera.lines() - 100, 11).astype(float)
+        y, across = stripe_on_plate(sensor, medium, lines, z)
+        chosen = lines.astype(int)
+        assert (truth.status[chosen] == TruthStatus.VISIBLE).all()
+        assert (truth.crossings[chosen] == 1).all()
+        np.testing.assert_allclose(truth.centre_px[chosen], across, rtol=0, atol=CENTRE_PX)
+        expected = np.stack([0 * y, y, 0 * y], axis=1)
+        np.testing.assert_allclose(truth.point_mm[chosen], expected, rtol=0, atol=SURFACE_MM / 2)
+        np.testing.assert_allclose(truth.normal[chosen], [[0.0, 0.0, -1.0]] * len(lines), atol=1e-6)
+        # A window 0.05 mm farther away would be noticed.
+        wrong = altered(sensor, {"camera": {"window": {"distance_mm": 62.85}}})
+        assert np.abs(stripe_on_plate(wrong, medium, lines, z)[1] - across).max() > 3 * CENTRE_PX
+
+
+def test_the_rendered_stripe_lies_about_its_true_centre(thesis):
+    sensor = cropped(thesis, 64, 512)
+    renderer = Renderer(sensor, clear(0.3), scene_of(plate()), effects=NONE)
+    for z in (-40.0, 0.0, 40.0):
+        image = renderer.irradiance("laser", sensor_at(-z), spp=256).astype(float)
+        truth = true_stripe(renderer, sensor_at(-z))
+        assert (truth.status == TruthStatus.VISIBLE).all()
+        centroid = np.arange(512) @ image / image.sum(axis=0)
+        # The sum covers the stripe to 4.5 sigma. Scale and brightness of the picture change by some 5e-3 per mm across
+        # the stripe, which shifts the centroid by that times sigma squared, 1e-4 mm or 7e-4 px; the samples' noise at
+        # 256 per pixel is of the same size.
+        assert np.abs((centroid - truth.centre_px).mean()) < 2e-3
+        np.testing.assert_allclose(centroid, truth.centre_px, rtol=0, atol=0.01)
+
+
+def distance_to_sphere(points: np.ndarray, centre: np.ndarray, diameter: float) -> np.ndarray:
+    return np.abs(np.linalg.norm(points - centre, axis=1) - diameter / 2)
+
+
+def true_points(renderer: Renderer, pose: np.ndarray, at_least: int) -> FrameTruth:
+    """The visible lines of a frame's truth; every point must lie in the plane of the sheet."""
+    truth = true_stripe(renderer, pose)
+    visible = truth.status == TruthStatus.VISIBLE
+    assert visible.sum() >= at_least
+    assert np.isnan(truth.centre_px[~visible]).all()
+    assert np.isnan(truth.point_mm[~visible]).all()
+    assert (truth.crossings[~visible] == 0).all()
+    np.testing.assert_allclose(truth.point_mm[visible][:, 0], pose[0, 3], rtol=0, atol=SURFACE_MM)
+    return FrameTruth(**{name: value[visible] for name, value in vars(truth).items()})
+
+
+def test_true_points_lie_on_a_sphere(thesis):
+    centre = np.array([4.0, -12.0, 20.0])
+    renderer = Renderer(
+        coarse(thesis), clear(), scene_of({"kind": "sphere", "diameter_mm": 50.12, "position_mm": tuple(centre)})
+    )
+    for x in (-6.0, 4.0, 15.0):
+        truth = true_points(renderer, sensor_at(x=x), at_least=40)
+        assert distance_to_sphere(truth.point_mm, centre, 50.12).max() < SURFACE_MM
+        outward = (truth.point_mm - centre) / 25.06
+        np.testing.assert_allclose(truth.normal, outward, rtol=0, atol=1e-4)
+
+
+def test_true_points_lie_on_a_turned_pipe_and_block(thesis):
+    turned = (3.0, 8.0, 25.0)
+    rotation = Rotation.from_euler("xyz", turned, degrees=True)
+    pipe = {
+        "kind": "pipe",
+        "diameter_mm": 60.0,
+        "length_mm": 90.0,
+        "position_mm": (0.0, -45.0, 30.0),
+        "rotation_deg": turned,
+    }
+    box = {"kind": "block", "size_mm": (50.0, 30.0, 20.0), "position_mm": (0.0, 40.0, 0.0), "rotation_deg": turned}
+    renderer = Renderer(coarse(thesis), clear(), scene_of(pipe, box))
+    truth = true_points(renderer, sensor_at(), at_least=120)
+    on_pipe = truth.point_mm[:, 1] < 5
+    in_pipe = rotation.inv().apply(truth.point_mm[on_pipe] - pipe["position_mm"])
+    assert len(in_pipe) > 50
+    assert np.abs(np.hypot(in_pipe[:, 1], in_pipe[:, 2]) - 30.0).max() < SURFACE_MM
+    assert np.abs(in_pipe[:, 0]).max() < 45.0 + SURFACE_MM
+    in_box = rotation.inv().apply(truth.point_mm[~on_pipe] - box["position_mm"])
+    assert len(in_box) > 30
+    beyond = np.abs(in_box) - [25.0, 15.0, 10.0]
+    assert np.abs(beyond.max(axis=1)).max() < SURFACE_MM
+
+
+def test_true_points_lie_on_a_mesh(thesis, tmp_path):
+    surface = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    surface.vertices *= [30.0, 20.0, 10.0]
+    surface.export(tmp_path / "potato.stl")
+    place = {"position_mm": (0.0, 5.0, 10.0), "rotation_deg": (20.0, -10.0, 30.0), "scale": 1.5}
+    renderer = Renderer(
+        coarse(thesis), clear(), scene_of({"kind": "mesh", "path": str(tmp_path / "potato.stl")} | place)
+    )
+    truth = true_points(renderer, sensor_at(x=3.0), at_least=40)
+    local = (
+        Rotation.from_euler("xyz", place["rotation_deg"], degrees=True)
+        .inv()
+        .apply(truth.point_mm - place["position_mm"])
+        / 1.5
+    )
+    pairs = len(local), len(surface.faces)
+    on_faces = trimesh.triangles.closest_point(
+        np.tile(surface.triangles, (pairs[0], 1, 1)), np.repeat(local, pairs[1], axis=0)
+    )
+    distance = np.linalg.norm(on_faces - np.repeat(local, pairs[1], axis=0), axis=1).reshape(pairs)
+    assert distance.min(axis=1).max() * 1.5 < SURFACE_MM
+    assert len(set(distance.argmin(axis=1))) > 20, "the stripe crosses many faces"
+    ellipsoid = np.abs(np.linalg.norm(local / [30.0, 20.0, 10.0], axis=1) - 1).max()
+    assert ellipsoid > 1e-3, "the facets, not the ellipsoid they approximate, are what is seen"
+
+
+def test_the_depth_map_is_the_camera_frame_z_of_what_pixels_see(thesis):
+    sensor, medium = coarse(thesis), clear()
+    renderer = Renderer(sensor, medium, scene_of(plate(25.0, side=100.0)))
+    depth = depth_map(renderer, sensor_at())
+    assert depth.shape == (256, 320)
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(-45, 45, 13), np.linspace(-45, 45, 13)))
+    points = np.stack([x, y, np.full_like(x, 25.0)], axis=1)
+    uv = seen_at(sensor, medium, points)
+    axes, standoff = camera_axes(sensor)
+    z = (points @ axes.T + standoff)[:, 2]
+    column, row = np.rint(uv).astype(int).T
+    # A pixel's centre lies up to half a pixel from the point; the plate's depth runs along the image evenly enough to
+    # go there with the neighbours' slope: its change over half a pixel, 0.1 mm, bends by 1e-3 of that.
+    slope_v, slope_u = np.gradient(depth)
+    there = depth[row, column] + slope_u[row, column] * (uv[:, 0] - column) + slope_v[row, column] * (uv[:, 1] - row)
+    inner = np.isfinite(there)
+    assert inner.sum() > 150
+    np.testing.assert_allclose(there[inner], z[inner], rtol=0, atol=1e-3)
+    corners = seen_at(sensor, medium, np.array([(sx * 50.0, sy * 50.0, 25.0) for sx in (-1, 1) for sy in (-1, 1)]))
+    seen = np.isfinite(depth)
+    assert seen.any(axis=0).sum() == pytest.approx(np.ptp(corners[:, 0]), abs=2.0)
+    assert not seen[:, : int(corners[:, 0].min()) - 1].any()
+
+
+def intervals_overlap(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Signed length (N,) of the parts of segments (N, 3) inside a box, as a share of them: negative if they pass by."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (low - start) / (end - start), (high - start) / (end - start)
+    enter = np.nanmax(np.concatenate([np.minimum(first, second), np.zeros((len(start), 1))], axis=1), axis=1)
+    leave = np.nanmin(np.concatenate([np.maximum(first, second), np.ones((len(start), 1))], axis=1), axis=1)
+    return leave - enter
+
+
+BLOCKS = {
+    # The camera stands on the side of -X: a thin block in the sheet shades the plate, one beside it hides the stripe.
+    "shadow": ((4.0, 30.0, 10.0), (0.0, 15.0, -40.0)),
+    "occlusion": ((6.0, 36.0, 30.0), (-20.0, -10.0, -5.0)),
+}
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
+    sensor, medium, z = coarse(thesis), clear(), 20.0
+    size, position = BLOCKS[name]
+    low, high = (np.array(position) + sign * np.array(size) / 2 for sign in (-1, 1))
+    renderer = Renderer(sensor, medium, scene_of(plate(z), block(size, position)))
+    truth = true_stripe(renderer, sensor_at())
+    lines = np.arange(30.0, 290.0, 2.0)
+    y, _ = stripe_on_plate(sensor, medium, lines, z)
+    on_plate = np.stack([0 * y, y, np.full_like(y, z)], axis=1)
+    fan, origin = oracle_fan(sensor, medium), laser_origin(sensor)
+    leaves = fan.exit_y(fan.angle_through(y, z - origin[2]))
+    exits = np.stack([0 * y, leaves, np.full_like(y, origin[2] + fan.outer_face)], axis=1)
+    shaded = intervals_overlap(on_plate, exits, low, high)
+    hidden = intervals_overlap(on_plate, oracle_paths(sensor, medium, on_plate)[1], low, high)
+    assert ((shaded > 0).sum() > 10, (hidden > 0).sum() > 10) == (name == "shadow", name == "occlusion")
+    blocked = np.maximum(shaded, hidden)
+    clear_cut = np.abs(blocked) > 1e-5  # a part of 4 um of the way; rays are known to 0.1 um
+    assert clear_cut.sum() > 125
+    status = truth.status[lines.astype(int)]
+    expected = np.where(blocked > 0, TruthStatus.NO_STRIPE, TruthStatus.VISIBLE)
+    np.testing.assert_array_equal(status[clear_cut], expected[clear_cut])
+    image = renderer.irradiance("laser", sensor_at(), spp=4)
+    bright = image[:, 30:290:2].max(axis=0) > 0.05 * image.max()
+    # A pixel at the shadow's rim is partly lit, and the stripe's lit half shows at a hidden one's.
+    inner = np.convolve(blocked > 0, np.ones(3), "same")
+    assert not bright[inner == 3].any()
+    assert bright[inner == 0].all()
+    assert truth.crossings[lines.astype(int)].max() == 1
+
+
+def test_of_two_crossings_on_a_line_the_brighter_is_given(thesis):
+    # A thin block stands before another. As the laser stands aside, some of the camera's columns see past
+    # the near block's edge and show both stripes.
+    laser = {
+        "baseline_mm": None,
+        "triangulation_angle_deg": None,
+        "origin_mm": (-150.0, -265.0, 0.0),
+        "axis": (150.0, 265.0, 378.5),
+    }
+    sensor = altered(coarse(thesis), {"laser": laser})
+    for near_reflectance, far_reflectance, brighter_z in ((0.9, 0.05, -20.0), (0.05, 0.9, 20.0)):
+        near = block((6.0, 40.0, 10.0), (0.0, 20.0, -15.0), reflectance=near_reflectance)
+        far = block((200.0, 100.0, 10.0), (0.0, -30.0, 25.0), reflectance=far_reflectance)
+        truth = true_points(Renderer(sensor, clear(), scene_of(near, far)), sensor_at(), at_least=150)
+        z = truth.point_mm[:, 2]
+        faces = np.stack([np.abs(z + 20.0), np.abs(z - 20.0)])
+        assert (faces.min(axis=0) < SURFACE_MM).all()
+        assert (truth.crossings == 2).sum() >= 3
+        np.testing.assert_allclose(z[truth.crossings == 2], brighter_z, rtol=0, atol=SURFACE_MM)

@@ -1,0 +1,312 @@
+"""Sensor and scene descriptions: all that ship are sound, and every mistake in one is refused by name."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.virtual_sensors import altered, plate, scene_of
+from twin.light.renderer import Renderer
+from twin.options import Options
+from twin.recording.studio import check_scene, medium_of
+from twin.scene.description import Motion, Pose, Scene, load_scene, scene_names
+from twin.scene.objects import Objects, build_objects
+from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.model.library import library_folder, load_sensor, names
+from uwlts.model.sensor import Sensor
+
+SENSORS = names("sensors")
+PLACES = [(scene, place) for scene in scene_names() for place in load_scene(scene).placements]
+
+
+def built(scene: Scene) -> Objects:
+    return build_objects(scene, medium_index=1.33, wavelength_nm=635.0)
+
+
+def test_the_library_is_not_empty():
+    assert {"thesis", "thesis-as-built"} <= set(SENSORS)
+    assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(scene_names())
+    assert len(PLACES) > 15
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_shipped_sensor_loads(name):
+    sensor = load_sensor(name)
+    assert sensor.name == name
+    assert {"air", "water"} <= set(sensor.media)
+
+
+@pytest.mark.parametrize(("name", "place"), PLACES)
+def test_every_shipped_scene_stands_before_the_thesis_sensor(thesis, name, place):
+    scene = load_scene(name, placement=place)
+    assert built(scene).scene.bbox().valid()
+    assert len(scene.object_poses()) == len(scene.objects)
+    window = {"mounted": scene.window_mounted}
+    sensor = altered(thesis, {"camera": {"window": window}})
+    check_scene(Renderer(sensor, medium_of(sensor, scene), scene), scene)
+
+
+def written(folder, text: str, *, name: str = "sensor.toml"):
+    """Path of a description in a folder of its own."""
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# What is wrong, and what the message must name.
+BAD_SENSORS = {
+    "unknown key": ("[camera]\nfocal_lenght_mm = 12.5", r"camera\.focal_lenght_mm: unknown key"),
+    "wrong unit": ("[laser]\nbaseline_m = 0.265", r"laser\.baseline_m: unknown key.*unit"),
+    "unknown table": ("[lens]\nk1 = 0.1", r"lens: unknown key"),
+    "not a number": ("[camera]\nfocal_length_mm = nan", r"camera\.focal_length_mm: .*finite.*nan"),
+    "infinite": ("[stage]\ntravel_mm = inf", r"stage\.travel_mm: .*finite.*inf"),
+    "text for a number": ("[laser]\npower_mw = 'strong'", r"laser\.power_mw: .*'strong'"),
+    "negative": ("[laser]\nfan_angle_deg = -45.0", r"laser\.fan_angle_deg: .*-45"),
+    "zero pixels": ("[camera]\nwidth_px = 0", r"camera\.width_px: .*found 0"),
+    "half a pixel": ("[camera]\nwidth_px = 100.5", r"camera\.width_px: .*100\.5"),
+    "unknown glass": ("[camera.window]\nglass = 'N-BK8'", r"unknown glass 'N-BK8'; known are N-BK7"),
+    "glass of air": ("[camera.window]\nglass = 1.0", r"camera\.window\.glass"),
+    "stripe": ("[camera]\nstripe_along = 'depth'", r"camera\.stripe_along: .*'depth'"),
+    "bits": ("[detector]\nbits = 9", r"detector\.bits: .*found 9"),
+    "placed twice": (
+        "[laser]\norigin_mm = [0.0, -265.0, 0.0]\naxis = [0.0, 0.6, 0.8]",
+        r"laser: place the laser by baseline_mm",
+    ),
+    "placed half": ("[laser]\naxis = [0.0, 0.6, 0.8]", r"laser: place the laser by baseline_mm"),
+    "custom without index": ("[media.oil]\nkind = 'custom'", r"media\.oil: a custom medium needs its index"),
+    "salty fresh water": ("[media.lake]\nkind = 'fresh'\nsalinity_g_kg = 3.0", r"media\.lake: .*salinity 3 g/kg"),
+    "unknown kind": ("[media.oil]\nkind = 'oil'", r"media\.oil\.kind: .*'oil'"),
+    "volume": ("[volume]\nnear_mm = 500.0", r"volume: near_mm 500 must be smaller than far_mm 420"),
+}
+
+
+@pytest.mark.parametrize("mistake", BAD_SENSORS)
+def test_a_mistake_in_a_sensor_is_refused_by_name(tmp_path, mistake):
+    text, message = BAD_SENSORS[mistake]
+    path = written(tmp_path, "base = 'thesis'\n" + text)
+    with pytest.raises(DescriptionError, match=message) as refusal:
+        load_sensor(path)
+    assert str(path) in str(refusal.value)
+
+
+def test_all_mistakes_are_named_at_once(tmp_path):
+    path = written(tmp_path, "base = 'thesis'\n[laser]\nbaseline_m = 0.2\npower_mw = -1.0\n[detector]\nbits = 16")
+    with pytest.raises(DescriptionError) as refusal:
+        load_sensor(path)
+    assert all(key in str(refusal.value) for key in ("laser.baseline_m", "laser.power_mw", "detector.bits"))
+
+
+@pytest.mark.parametrize("degrees", [-1.0, 30.5, 80.0])
+def test_water_outside_quan_and_frys_temperatures_is_refused(tmp_path, degrees):
+    path = written(tmp_path, f"base = 'thesis'\n[media.water]\ntemperature_c = {degrees}")
+    with pytest.raises(RangeError, match=rf"temperature_c is {degrees:g}, but .*Quan and Fry.* from 0 to 30"):
+        load_sensor(path)
+
+
+def test_a_missing_key_is_refused_by_name(tmp_path):
+    text = (library_folder() / "sensors" / "thesis.toml").read_text(encoding="utf-8").replace("f_number = 4.0", "")
+    with pytest.raises(DescriptionError, match=r"camera\.f_number: missing"):
+        load_sensor(written(tmp_path, text))
+
+
+def test_a_laser_may_be_placed_by_origin_and_axis_instead(tmp_path, thesis):
+    text = (library_folder() / "sensors" / "thesis.toml").read_text(encoding="utf-8")
+    placed = text.replace("baseline_mm = 265.0", "origin_mm = [0.0, -265.0, 0.0]")
+    placed = placed.replace("triangulation_angle_deg = 35.0", "axis = [0.0, 1.0, 1.4281480067421146]")
+    sensor = load_sensor(written(tmp_path, placed))
+    scene = scene_of(plate())
+    views = [Renderer(which, which.media["water"], scene).design for which in (sensor, thesis)]
+    np.testing.assert_allclose(
+        [views[0].standoff_mm, views[0].line_length_mm], [views[1].standoff_mm, views[1].line_length_mm]
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("base = 'nobody'", "nothing is called 'nobody'; known are .*thesis"), ("name = ", "not valid TOML")],
+)
+def test_what_cannot_be_read_is_refused(tmp_path, text, message):
+    with pytest.raises(DescriptionError, match=message):
+        load_sensor(written(tmp_path, text))
+
+
+def test_a_missing_file_or_name_is_refused(tmp_path):
+    with pytest.raises(DescriptionError, match=r"no description at .*absent\.toml"):
+        load_sensor(tmp_path / "absent.toml")
+    with pytest.raises(DescriptionError, match="nothing is called 'theses'; known are thesis, thesis-as-built"):
+        load_sensor("theses")
+    with pytest.raises(DescriptionError, match="nothing is called 'ball'; known are .*spheres"):
+        load_scene("ball")
+
+
+def test_bases_that_lead_back_to_themselves_are_refused(tmp_path):
+    written(tmp_path, "base = 'b'", name="a.toml")
+    written(tmp_path, "base = 'c'", name="b.toml")
+    path = written(tmp_path, "base = 'a'", name="c.toml")
+    with pytest.raises(DescriptionError, match=r"its own base: c\.toml -> a\.toml -> b\.toml -> c\.toml"):
+        load_sensor(path)
+
+
+def test_a_base_gives_what_a_description_leaves_out(tmp_path):
+    first = written(tmp_path, "base = 'thesis'\nname = 'mine'\n[laser]\npower_mw = 20.0", name="mine.toml")
+    second = written(tmp_path, "base = 'mine'\n[laser.window]\nglass = 'N-BK7'", name="other.toml")
+    thesis, mine, other = load_sensor("thesis"), load_sensor(first), load_sensor(second)
+    assert (mine.laser.power_mw, mine.laser.window) == (20.0, thesis.laser.window)
+    assert (other.laser.power_mw, other.laser.window.glass, other.camera) == (20.0, "N-BK7", thesis.camera)
+
+
+PLATE = "title = 't'\n[[objects]]\nkind = 'plate'\nwidth_mm = 5.0\nheight_mm = 5.0\n"
+HEAD = "title = 't'\n[[objects]]\nkind = 'head'\n"
+WELD = "title = 't'\n[[objects]]\nkind = 'weld'\n"
+
+BAD_SCENES = {
+    "no objects": ("title = 't'\nobjects = []", r"objects: .*at least 1"),
+    "objects as a table": ("title = 't'\n[objects]\nkind = 'plate'", r"\[\[objects\]\]"),
+    "unknown object": ("title = 't'\n[[objects]]\nkind = 'cube'", r"objects\.0: .*'cube'"),
+    "wrong unit": (
+        "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_m = 0.05",
+        r"objects\.0\.sphere\.diameter_m: unknown key",
+    ),
+    "reflectance": (
+        "base = 'plane'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nreflectance = 1.2",
+        r"reflectance: .*1\.2",
+    ),
+    "placement": ("base = 'plane'\nplacement = 'nearby'", r"placement 'nearby' is not one of near, standoff, far"),
+    "direction": (
+        "base = 'plane'\n[motion]\ndirection = [0.0, 0.0, 0.0]",
+        r"motion: direction \(0\.0, 0\.0, 0\.0\) has no length",
+    ),
+    "no light": ("base = 'plane'\n[motion]\nlights = []", r"motion: lights is empty"),
+    "unknown light": ("base = 'plane'\n[motion]\nlights = ['sun']", r"motion\.lights\.0: .*'sun'"),
+    "no frames": ("base = 'plane'\n[motion]\ncount = 0", r"motion\.count: .*found 0"),
+    "step not a number": ("base = 'plane'\n[motion]\nstep_mm = nan", r"motion\.step_mm: .*finite"),
+    "backwards in time": ("base = 'plane'\n[motion]\nspeed_mm_per_s = -1.0", r"motion\.speed_mm_per_s: .*found -1"),
+    "unknown finish": (PLATE + "finish = 'velvet'", r"finish: .*'diffuse', 'painted', 'pvc' or 'metal'.*'velvet'"),
+    "too smooth": (PLATE + "finish = 'metal'\nalpha = 0.001", r"alpha: .*0\.02.*found 0\.001"),
+    "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish 'diffuse' has none: leave alpha out"),
+    "negative height": (PLATE + "roughness_um = -1.0", r"roughness_um: .*found -1"),
+    "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than all light"),
+    "coated mirror": (PLATE + "reflectance = 0.1\nfinish = 'pvc'\nmirror = 0.5", r"mirror 0\.5 under a coat"),
+    "round mirror": (
+        "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nmirror = 0.1",
+        r"objects\.0\.sphere\.mirror: unknown key",
+    ),
+    "texture not a path": (PLATE + "texture = 3", r"texture: .*string.*found 3"),
+    "textured head": (HEAD + "texture = 'skin.png'", r"texture .*skin\.png on a surface without uv coordinates"),
+    "flat head": (HEAD + "height_mm = 0.0", r"objects\.0\.head\.height_mm: .*found 0"),
+    "headless head": (HEAD + "diameter_mm = 90.0", r"objects\.0\.head\.diameter_mm: unknown key"),
+    "textured weld": (WELD + "texture = 'rust.png'", r"texture .*rust\.png on a surface without uv coordinates"),
+    "slanting weld": (WELD + "along = 'z'", r"along: .*'x' or 'y'.*found 'z'"),
+    "beads that touch": (WELD + "spacing_mm = 11.0", r"spacing_mm 11 lets beads touch that may be 11\.8 mm wide"),
+    "beads beyond the plate": (
+        WELD + "beads = 8",
+        r"56 mm along x and 137\.8 mm together across it do not fit on.*80 x 120",
+    ),
+    "a bead too long": (WELD + "length_mm = 90.0", r"90 mm along x .*do not fit on plate_mm 80 x 120"),
+    "beads across the plate": (
+        WELD + "along = 'y'\nlength_mm = 90.0\nspacing_mm = 36.0",
+        r"along y and 83\.8 mm .*not fit",
+    ),
+    "a short bead": (WELD + "length_mm = 9.0", r"length_mm 9 is shorter than its width_mm 10"),
+    "deep ripples": (WELD + "ripple_height_mm = 4.0", r"ripple_height_mm 4 lets troughs dip .* bead of height_mm 2"),
+    "wild beads": (WELD + "irregularity = 0.5", r"irregularity: .*0\.3.*found 0\.5"),
+}
+
+
+@pytest.mark.parametrize("mistake", BAD_SCENES)
+def test_a_mistake_in_a_scene_is_refused_by_name(tmp_path, mistake):
+    text, message = BAD_SCENES[mistake]
+    with pytest.raises(DescriptionError, match=message):
+        load_scene(written(tmp_path, text))
+
+
+def test_a_placement_may_be_chosen_and_must_be_known():
+    assert load_scene("plane", placement="far").placement == "far"
+    with pytest.raises(DescriptionError, match="placement 'further' is not one of"):
+        load_scene("plane", placement="further")
+
+
+def test_a_medium_that_the_sensor_does_not_know_is_refused(thesis):
+    with pytest.raises(DescriptionError, match="'thesis' knows the media air, water, not 'oil'"):
+        medium_of(thesis, scene_of(plate(), medium="oil"))
+
+
+MESH = "title = 't'\n[[objects]]\nkind = 'mesh'\npath = 'part.stl'\n"
+
+
+def test_a_mesh_that_is_missing_or_damaged_is_refused(tmp_path):
+    scene = load_scene(written(tmp_path, MESH))
+    with pytest.raises(DescriptionError, match=rf"no mesh at {tmp_path}/part\.stl"):
+        built(scene)
+    for content in (b"", b"solid nothing\nendsolid nothing\n", b"\x00" * 200):
+        (tmp_path / "part.stl").write_bytes(content)
+        with pytest.raises(DescriptionError, match=r"part\.stl"):
+            built(scene)
+
+
+def test_paths_of_meshes_and_textures_start_at_the_scenes_folder(tmp_path):
+    scene = load_scene(written(tmp_path, MESH + "texture = 'skin/grey.png'\n"))
+    assert (scene.objects[0].path, scene.objects[0].texture) == (f"{tmp_path}/part.stl", f"{tmp_path}/skin/grey.png")
+
+
+def test_a_circle_plate_takes_no_texture():
+    plate = load_scene("target").objects[0].model_dump()
+    with pytest.raises(ValueError, match="texture grey.png on a plate with a printed pattern"):
+        scene_of(plate | {"texture": "grey.png"})
+
+
+def test_what_a_finish_does_not_say_is_usual_for_it():
+    plain, steel, mirror = scene_of(
+        plate(), plate() | {"finish": "metal"}, plate(reflectance=0.1) | {"mirror": 0.8, "roughness_um": 0.01}
+    ).objects
+    assert (plain.finish, plain.mirror_share(), plain.polarisation(), plain.rms_height_um()) == ("diffuse", 0, 0, 5)
+    assert (steel.gloss_alpha(), steel.mirror_share(), steel.polarisation(), steel.rms_height_um()) == (0.3, 0, 1, 1)
+    assert (mirror.mirror_share(), mirror.polarisation(), mirror.rms_height_um()) == (0.8, 1, 0.01)
+    assert Motion().speed_mm_per_s == 0
+
+
+@pytest.mark.parametrize("wrong", [{"spp": 0}, {"spp": 70000}, {"seed": -1}])
+def test_options_outside_their_range_are_refused(wrong):
+    ((key, value),) = wrong.items()
+    with pytest.raises(DescriptionError, match=f"{key} is {value}"):
+        Options(**wrong)
+
+
+def test_a_pose_turns_about_the_scenes_x_then_y_then_z():
+    pose = Pose(position_mm=(1.0, 2.0, 3.0), rotation_deg=(20.0, -30.0, 50.0)).matrix()
+    about_x, about_y, about_z = (
+        Rotation.from_rotvec(np.radians(angle) * axis).as_matrix()
+        for angle, axis in zip((20, -30, 50), np.eye(3), strict=True)
+    )
+    np.testing.assert_allclose(pose[:3, :3], about_z @ about_y @ about_x, atol=1e-15)
+    np.testing.assert_array_equal(pose[:, 3], [1, 2, 3, 1])
+
+
+def test_placements_carry_all_objects_together():
+    far = {"far": {"position_mm": (0.0, 0.0, 80.0), "rotation_deg": (0.0, 0.0, 90.0)}}
+    scene = scene_of(plate(1.0, x=10.0), plate(2.0), placements=far, placement="far")
+    first, second = scene.object_poses()
+    np.testing.assert_allclose(first[:3, 3], [0, 10, 81], atol=1e-12)
+    np.testing.assert_allclose(second[:3, 3], [0, 0, 82], atol=1e-12)
+
+
+def test_a_scan_takes_its_lights_in_turn_at_every_position():
+    motion = Motion(start_mm=-2.0, step_mm=1.5, count=3, direction=(0.0, 3.0, 4.0), lights=("lamp", "laser"))
+    assert [(shot.stage_mm, shot.light) for shot in motion.shots()] == [
+        (-2.0, "lamp"),
+        (-2.0, "laser"),
+        (-0.5, "lamp"),
+        (-0.5, "laser"),
+        (1.0, "lamp"),
+        (1.0, "laser"),
+    ]
+    np.testing.assert_allclose(motion.unit_direction(), [0, 0.6, 0.8])
+    assert motion.recorded_direction() == pytest.approx((0.0, 0.6, 0.8))
+    assert Motion(direction=(1.0, 0.01, 0.0), nominal_direction=(2.0, 0.0, 0.0)).recorded_direction() == (1.0, 0.0, 0.0)
+
+
+def test_descriptions_are_frozen_and_survive_json(thesis):
+    with pytest.raises(ValueError, match="frozen"):
+        thesis.name = "other"
+    assert Sensor.model_validate_json(thesis.model_dump_json()) == thesis
+    scene = load_scene("target")
+    assert Scene.model_validate_json(scene.model_dump_json()) == scene

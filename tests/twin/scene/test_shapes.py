@@ -1,0 +1,159 @@
+"""The procedural shapes: closed or open as they should be, facing the sensor, of the sizes that were asked for."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.signal import argrelmin
+
+from twin.scene.description import Weld
+from twin.scene.shapes import head_depth, head_surface, weld_height, weld_surface
+from uwlts.model.errors import DescriptionError
+
+HEIGHT = 160.0
+
+
+def mesh_of(surface: tuple[np.ndarray, np.ndarray]) -> trimesh.Trimesh:
+    return trimesh.Trimesh(*surface, process=False)
+
+
+def inner_points(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Middles of all faces and of their sides (4, F, 3), where facets deviate most from a smooth surface."""
+    corners = mesh.triangles
+    return np.stack([corners.mean(axis=1), *((corners[:, i] + corners[:, i - 1]) / 2 for i in range(3))])
+
+
+@pytest.fixture(scope="module")
+def head() -> trimesh.Trimesh:
+    return mesh_of(head_surface(height_mm=HEIGHT))
+
+
+def test_a_head_is_closed_and_its_normals_point_outwards(head):
+    assert head.is_watertight
+    assert head.is_winding_consistent
+    assert head.volume > 0
+    assert head.area_faces.min() > 0
+    front = head.triangles_center[:, 2] < -0.2 * HEIGHT
+    assert front.sum() > 10000
+    assert head.face_normals[front, 2].max() < 0.2  # of the nose's underside, which alone may look back
+
+
+def test_a_head_has_the_size_that_was_asked_for(head):
+    low, high = head.bounds
+    np.testing.assert_allclose([low[1], high[1]], [-80, 80], atol=1e-9)
+    np.testing.assert_allclose((high - low)[[0, 2]] / HEIGHT, [0.57, 0.79], atol=0.005)
+    half, _ = head_surface(height_mm=HEIGHT / 2)
+    np.testing.assert_allclose(2 * half, head.vertices, rtol=0, atol=1e-9)
+
+
+def test_a_heads_facets_follow_its_smooth_face(head):
+    lit = (head.face_normals[:, 2] < -0.2) & (head.triangles_center[:, 2] < 0)
+    assert lit.sum() > 500_000
+    corners = head.triangles[lit].reshape(-1, 3)
+    np.testing.assert_allclose(head_depth(*corners.T[:2], height_mm=HEIGHT), corners[:, 2], rtol=0, atol=1e-8)
+    x, y, z = np.moveaxis(inner_points(head)[:, lit], -1, 0)
+    away = np.abs((head_depth(x, y, height_mm=HEIGHT) - z) * head.face_normals[lit, 2])
+    # Facets some 0.25 mm wide, and 0.4 mm along the nose's flanks: over radii of 2 mm h^2 / 8 r is 0.004 to 0.01 mm.
+    assert away.max() < 0.01
+    assert np.quantile(away, 0.99) < 0.003
+
+
+def test_the_profile_is_that_of_a_face():
+    y = np.linspace(-0.4, 0.2, 1201)
+    profile = head_depth(np.zeros_like(y), y * HEIGHT, height_mm=HEIGHT) / HEIGHT
+    summits = y[argrelmin(profile)[0]]
+    chin, lower_lip, upper_lip, nose = summits[:4]
+    assert -0.35 < chin < -0.25 < lower_lip < -0.18 < upper_lip < -0.12 < nose < 0
+    assert profile.argmin() == np.searchsorted(y, nose)
+    sockets = head_depth(np.array([-0.095, 0.095]) * HEIGHT, np.array([0.1, 0.1]) * HEIGHT, height_mm=HEIGHT) / HEIGHT
+    brows = head_depth(np.array([-0.095, 0.095]) * HEIGHT, np.array([0.15, 0.15]) * HEIGHT, height_mm=HEIGHT) / HEIGHT
+    assert (sockets > brows + 0.005).all()
+    # Flanks steeper than the line of sight at 35 deg to the laser's axis hide what lies beside them.
+    x = np.linspace(0, 0.1, 401)
+    flank = np.gradient(head_depth(x * HEIGHT, np.full_like(x, nose * HEIGHT), height_mm=HEIGHT) / HEIGHT, x)
+    assert flank.max() > 1 / np.tan(np.radians(35))
+
+
+def test_beside_a_head_there_is_nothing():
+    x = np.array([0.0, 60.0, 0.0, 0.0])
+    y = np.array([0.0, 0.0, 81.0, -81.0])
+    np.testing.assert_array_equal(np.isnan(head_depth(x, y, height_mm=HEIGHT)), [False, True, True, True])
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_a_weld_is_an_open_sheet_that_faces_the_sensor(along):
+    plate = (80.0, 120.0) if along == "x" else (120.0, 80.0)
+    weld = Weld(kind="weld", along=along, plate_mm=plate)
+    mesh = mesh_of(weld_surface(weld))
+    assert mesh.is_winding_consistent
+    assert mesh.face_normals[:, 2].max() < 0
+    # One closed rim and no hole: V - E + F of a disk is 1.
+    assert mesh.euler_number == 1
+    np.testing.assert_allclose(mesh.bounds[:, :2], [[-plate[0] / 2, -plate[1] / 2], [plate[0] / 2, plate[1] / 2]])
+    assert mesh.bounds[1, 2] == 0
+    # A crown of 2 mm that changes by up to 6 %, and half a ripple of 0.25 mm.
+    assert 0.94 * 2.0 < -mesh.bounds[0, 2] < 1.06 * 2.0 + 0.125
+    x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
+    # 0.004 mm by the second derivatives, and a quarter of it for the fourth ones.
+    assert np.abs(z + weld_height(weld, x, y)).max() < 0.005
+
+
+def test_beads_lie_where_they_should_on_a_flat_plate():
+    weld = Weld(kind="weld", beads=2, spacing_mm=20.0)
+    x, y = np.meshgrid(np.linspace(-40, 40, 401), np.linspace(-60, 60, 601))
+    height = weld_height(weld, x, y)
+    on_bead = height > 0
+    assert on_bead.mean() > 0.1
+    assert (np.abs(x[on_bead]) <= 28.0).all()
+    assert (np.abs(np.abs(y[on_bead]) - 10.0) <= weld.bead_reach_mm()).all()
+    for side in (-1, 1):
+        middle = np.average(y[side * y > 0], weights=height[side * y > 0])
+        assert middle == pytest.approx(side * 10.0, abs=weld.irregularity * weld.width_mm)
+
+
+@pytest.mark.parametrize(("along", "pitch"), [("x", 3.0), ("y", 2.0)])
+def test_ripples_have_their_pitch_and_height(along, pitch):
+    plate = (80.0, 120.0) if along == "x" else (120.0, 80.0)
+    weld = Weld(kind="weld", along=along, plate_mm=plate, ripple_pitch_mm=pitch, irregularity=0.0)
+    place = np.arange(-18, 18, 0.05)  # whole pitches on the even part of the middle bead
+    zero = np.zeros_like(place)
+    crown = weld_height(weld, *((place, zero) if along == "x" else (zero, place)))
+    spectrum = np.abs(np.fft.rfft(crown - crown.mean()))
+    assert 1 / np.fft.rfftfreq(len(place), 0.05)[spectrum.argmax()] == pytest.approx(pitch)
+    assert np.ptp(crown) == pytest.approx(weld.ripple_height_mm)
+    assert crown.mean() == pytest.approx(weld.height_mm)
+    # At half the way to the toes the crescents trail by a third of the width over four, and the envelope is 9/16.
+    beside = weld_height(weld, *((place, zero + 2.5) if along == "x" else (zero + 2.5, place)))
+    shift = np.angle(np.fft.rfft(beside)[spectrum.argmax()] / np.fft.rfft(crown)[spectrum.argmax()])
+    assert np.exp(1j * shift) == pytest.approx(np.exp(2j * np.pi * 10.0 / 12 / pitch))
+    assert np.ptp(beside) == pytest.approx(9 / 16 * weld.ripple_height_mm, rel=2e-3)
+
+
+def test_irregular_beads_follow_their_seed():
+    place = np.linspace(-18, 18, 200)
+
+    def crowns(seed: int, irregularity: float = 0.06) -> np.ndarray:
+        weld = Weld(kind="weld", seed=seed, irregularity=irregularity)
+        return np.stack([weld_height(weld, place, np.full_like(place, middle)) for middle in (-18.0, 0.0, 18.0)])
+
+    first = crowns(1)
+    np.testing.assert_array_equal(first, crowns(1))
+    assert np.abs(first - crowns(2)).max() > 0.01
+    assert np.abs(first[0] - first[1]).max() > 0.01
+    np.testing.assert_array_equal(crowns(1, 0.0), crowns(2, 0.0))
+
+
+def test_surfaces_are_the_same_every_time_and_kept_unharmed():
+    for make in (lambda: head_surface(height_mm=20.0), lambda: weld_surface(Weld(kind="weld", beads=1))):
+        first = make()
+        head_surface.cache_clear()
+        weld_surface.cache_clear()
+        for old, new in zip(first, make(), strict=True):
+            assert old is not new
+            np.testing.assert_array_equal(old, new)
+            with pytest.raises(ValueError, match="read-only"):
+                new[0] = 0
+
+
+def test_a_weld_too_fine_to_be_meshed_is_refused():
+    with pytest.raises(DescriptionError, match=r"a weld in steps of 0\.0\d+ mm needs \d+ vertices"):
+        weld_surface(Weld(kind="weld", ripple_pitch_mm=0.2))

@@ -1,0 +1,94 @@
+"""Poisson numbers for images: every mean gets its own distribution, and pixels know nothing of each other."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from twin.sensor.detector import LARGEST_MEAN, POISSON_STEP, poisson_numbers
+
+MEANS = (
+    *(0.002, 0.06, POISSON_STEP, 0.249, 0.7, 1.0, 2.8, 5.06, 9.99, 16.0, 24.3, LARGEST_MEAN - 0.01),
+    *(LARGEST_MEAN, LARGEST_MEAN + 0.01, 60.0, 900.0),
+)
+DRAWS = 250_000
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[float, np.ndarray]:
+    """Draws of every mean from one image in which the means alternate from pixel to pixel."""
+    image = np.tile(np.array(MEANS, np.float32), (DRAWS, 1))
+    numbers = poisson_numbers(image, np.random.default_rng(5))
+    assert numbers.shape == image.shape
+    assert numbers.dtype == np.float32
+    return dict(zip(MEANS, numbers.T, strict=True))
+
+
+def p_value(numbers: np.ndarray, mean: float) -> float:
+    """Of the chi-square test against Poisson's law; counts of which fewer than 10 are expected share the end bins."""
+    lowest, highest = stats.poisson.ppf([10 / numbers.size, 1 - 10 / numbers.size], mean).astype(int)
+    inner = np.arange(lowest + 1, highest)
+    probability = np.concatenate(
+        [[stats.poisson.cdf(lowest, mean)], stats.poisson.pmf(inner, mean), [stats.poisson.sf(highest - 1, mean)]]
+    )
+    bins = np.clip(numbers.astype(int), lowest, max(highest, lowest + 1)) - lowest
+    observed = np.bincount(bins, minlength=probability.size)
+    return stats.chisquare(observed, probability * numbers.size).pvalue
+
+
+@pytest.mark.parametrize("mean", MEANS)
+def test_every_mean_has_poissons_distribution(drawn, mean):
+    # 16 tests at 1e-4 each: a right generator fails the lot once in 600 seeds, and this seed is fixed.
+    assert p_value(drawn[mean], float(np.float32(mean))) > 1e-4
+
+
+@pytest.mark.parametrize("mean", MEANS)
+def test_mean_and_variance_are_the_same(drawn, mean):
+    # The variance of a Poisson number's squared deviation is 2 m^2 + m.
+    spread = np.sqrt(mean / DRAWS)
+    assert drawn[mean].mean(dtype=float) == pytest.approx(mean, abs=5 * spread)
+    assert drawn[mean].var(dtype=float) == pytest.approx(mean, abs=5 * np.sqrt((2 * mean**2 + mean) / DRAWS))
+    # Half a step of the table would be noticed.
+    assert mean >= LARGEST_MEAN or 5 * spread < POISSON_STEP / 2
+
+
+def test_the_distributions_neighbours_would_be_noticed(drawn):
+    for mean in (0.249, 0.7, 1.0, 2.8):
+        assert p_value(drawn[mean], mean + POISSON_STEP / 2) < 1e-12
+        rounded_normal = np.rint(np.random.default_rng(1).normal(mean, np.sqrt(mean), DRAWS)).clip(0)
+        assert p_value(rounded_normal, mean) < 1e-12
+
+
+def test_the_tail_is_there(drawn):
+    # 250000 draws reach the counts of which 1e-5 of all are expected; means of 2.5 draws exceed 12 once in 2e5 seeds.
+    for mean in (1.0, 2.8, 9.99, 24.3):
+        rare = stats.poisson.isf(1e-5, mean)
+        beyond = np.count_nonzero(drawn[mean] > rare)
+        assert beyond <= 12
+        assert drawn[mean].max() >= stats.poisson.isf(1e-4, mean)
+
+
+def test_pixels_are_independent():
+    # Neighbours, and pixels a row apart: 200 x 5000 products of unit spread scatter by 1e-3.
+    image = np.full((200, 5000), 1.37, np.float32)
+    numbers = poisson_numbers(image, np.random.default_rng(6)).astype(float)
+    standard = (numbers - 1.37) / np.sqrt(1.37)
+    for row, column in ((0, 1), (1, 0), (0, 2), (1, 1)):
+        pairs = standard[row:, column:] * standard[: 200 - row, : 5000 - column]
+        assert abs(pairs.mean()) < 5 / np.sqrt(pairs.size)
+    # Sums of 100 pixels are Poisson's too; 10000 sums give their variance with a spread of 1.4 %.
+    sums = numbers.reshape(-1, 100).sum(axis=1)
+    assert sums.var() == pytest.approx(137.0, rel=0.07)
+
+
+def test_no_electrons_give_none():
+    image = np.zeros((64, 64), np.float32)
+    image[::2] = 3.0
+    numbers = poisson_numbers(image, np.random.default_rng(0))
+    assert not numbers[1::2].any()
+    assert (numbers[::2] > 0).mean() == pytest.approx(1 - np.exp(-3.0), abs=5 * np.sqrt(0.05 / 2048))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (0, 4), (3, 1, 2)])
+def test_any_shape(shape):
+    for mean in (0.0, 2.0, 500.0):
+        assert poisson_numbers(np.full(shape, mean, np.float32), np.random.default_rng(0)).shape == shape

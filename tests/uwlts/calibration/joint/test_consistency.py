@@ -1,0 +1,181 @@
+"""Evidence that contradicts itself or its description: refused, with the images and figures to blame by their names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import Noise, gathered, target_series
+from uwlts.calibration.joint.consistency import format_deviation
+from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import parameter_of
+from uwlts.model.sensor import Medium, Uncertainty
+
+BUILT = built_sensor()
+OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+
+
+@pytest.fixture(scope="module")
+def thesis(thesis):
+    """The drawings, with what is usually known of such."""
+    return thesis.model_copy(update={"uncertainty": Uncertainty()})
+
+
+@pytest.fixture(scope="module")
+def views():
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
+    air = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
+    water = target_series(BUILT, medium=0, positions=np.arange(8) * 25.0 - 120.0, noise=noise, columns=17)
+    return replace(air, names=["air.h5"]), replace(water, names=["water.h5"])
+
+
+def edited(series, edit):
+    """The series with ``edit(number, image)`` in place of each image."""
+    images = [edit(number, image) for number, image in enumerate(series.found.images)]
+    return replace(series, found=replace(series.found, images=images))
+
+
+def stripes_edited(series, edit):
+    """The series with ``edit(number, pixels)`` in place of each stripe."""
+    stripes = [edit(number, pixels.copy()) for number, pixels in enumerate(series.found.stripes)]
+    return replace(series, found=replace(series.found, stripes=stripes))
+
+
+def refusal(evidence):
+    with pytest.raises(CalibrationError) as error:
+        solve_jointly(evidence, options=OPTIONS)
+    return str(error.value)
+
+
+def test_good_evidence_raises_no_doubt(views, thesis):
+    assert not solve_jointly(gathered(thesis, views), options=OPTIONS).warnings
+
+
+def test_a_wrong_spacing_shows_against_the_stage(views, thesis):
+    wide = [edited(part, lambda _, image: replace(image, points_mm=1.02 * image.points_mm)) for part in views]
+    assert "check the target's spacing and the stage's scale" in refusal(gathered(thesis, wide))
+
+
+def test_a_slip_of_the_stage_is_named(views, thesis):
+    air, water = views
+    slipped = edited(air, lambda n, image: replace(image, stage_mm=image.stage_mm + (n == 3)))
+    said = refusal(gathered(thesis, [slipped, water]))
+    assert "air.h5, frame 3: the stage stood -0.9" in said
+    assert all(f"frame {other}: the stage" not in said for other in (0, 1, 2, 4, 5, 6, 7))
+
+
+def test_the_image_that_does_not_fit_is_named(views, thesis):
+    """Moved by 1.5 px and sheared by up to a pixel, as a window that was touched; one of 16 images."""
+    air, water = views
+
+    def touched(number, image):
+        shear = 1e-3 * (image.pixels - image.pixels.mean(axis=0))[:, ::-1]
+        return replace(image, pixels=image.pixels + (1.5, 0.0) + shear) if number == 5 else image
+
+    said = refusal(gathered(thesis, [air, edited(water, touched)]))
+    assert "water.h5, frame 5: the target is" in said
+    assert "air.h5" not in said
+
+
+def test_a_lens_other_than_in_water_is_refused(views, thesis):
+    camera = BUILT.camera.model_copy(update={"focal_length_mm": 12.5})
+    noise = Noise(circles_px=0.03, stripe_px=0.1, rng=np.random.default_rng(1))
+    other = target_series(
+        BUILT.model_copy(update={"camera": camera}),
+        window=False,
+        positions=np.arange(8) * 35.0 - 200.0,
+        noise=noise,
+        columns=17,
+    )
+    assert "contradicts itself" in refusal(gathered(thesis, [other, views[1]]))
+
+
+def test_a_water_image_said_to_be_in_air_shows_in_the_focal_length(views, thesis):
+    said = refusal(gathered(thesis, [replace(views[1], view=View(True, None))]))
+    assert "the focal length is 32" in said
+    assert "the medium in the captures" in said
+
+
+def test_without_a_target_there_is_no_joint_calibration(thesis):
+    assert "no capture shows a target" in refusal(gathered(thesis, []))
+
+
+def test_a_wrong_index_is_refused(views, thesis):
+    evidence = gathered(thesis, views)
+    evidence.media["water"] = Medium(kind="custom", index=1.345)
+    said = refusal(evidence)
+    assert "index of water found 1.33" in said
+    assert "described as 1.34500 +- 0.0001" in said
+
+
+def with_window(sensor, **figures):
+    window = sensor.camera.window.model_copy(update=figures)
+    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
+
+
+def test_a_window_far_from_its_drawing_is_refused_and_one_not_so_far_is_doubted(views, thesis):
+    """It stands at 47.3 mm; its distance is known to 5 mm before, so 85 is 7.5 and 70 is 4.5 times that away."""
+    said = refusal(gathered(with_window(thesis, distance_mm=85.0), views))
+    assert "window distance found 47.3, described as 85.0 +- 5" in said
+    doubts = solve_jointly(gathered(with_window(thesis, distance_mm=70.0), views), options=OPTIONS).warnings
+    assert [doubt for doubt in doubts if doubt.startswith("window distance found 47.3, described as 70.0")]
+
+
+def test_a_noisy_stripe_is_doubted_and_not_refused(views, thesis):
+    """0.6 px of noise in one of 16 stripes: six times the others'; no contradiction, as it varies from line to line."""
+    rng = np.random.default_rng(0)
+
+    def noisy(number, pixels):
+        pixels[:, 1] += rng.normal(0, 0.6, len(pixels)) if number == 2 else 0.0
+        return pixels
+
+    doubts = solve_jointly(gathered(thesis, [stripes_edited(views[0], noisy), views[1]]), options=OPTIONS).warnings
+    assert len(doubts) == 1
+    assert "air.h5, frame 2: the stripe on the target is 0." in doubts[0]
+
+
+def test_reflections_on_a_third_of_the_lines_are_left_out_with_a_word(views, thesis):
+    """All on one side, 15 to 60 px away; the parameters stay within their uncertainties."""
+    rng = np.random.default_rng(0)
+
+    def spoilt(_, pixels):
+        stray = rng.random(len(pixels)) < 0.3
+        pixels[stray, 1] += rng.uniform(15, 60, stray.sum())
+        return pixels
+
+    clean = solve_jointly(gathered(thesis, views), options=OPTIONS).estimate
+    result = solve_jointly(gathered(thesis, [stripes_edited(part, spoilt) for part in views]), options=OPTIONS)
+    assert [doubt for doubt in result.warnings if "% of the stripe on the target was left out as outliers" in doubt]
+    moved = np.abs(result.estimate.values - clean.values) / np.sqrt(np.diag(result.estimate.covariance))
+    assert moved.max() < 2.0
+
+
+def test_a_lens_in_the_water_is_not_mixed_with_one_behind_a_window(views, thesis):
+    bare = replace(views[1], view=View(False, 0))
+    assert "taken without a window and others were not" in refusal(gathered(thesis, [bare, views[1]]))
+
+
+def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
+    noise = Noise(circles_px=0.03, stripe_px=0.1, rng=np.random.default_rng(1))
+    series = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
+    result = solve_jointly(gathered(thesis, [replace(series, view=View(False, 0))]), options=OPTIONS)
+    assert result.calibration.window is None
+    assert result.calibration.medium_kind == "custom"
+    focal = result.estimate.values[0] - BUILT.camera.focal_length_px()
+    assert abs(focal) < 4.5 * result.estimate.std()["f"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("window_slope_x", np.tan(np.radians(3.0)), "window tilt to the right found 3.00, described as 0.00 +- 0.5 °"),
+        ("sheet_bow", np.radians(-4.0), "bow of the sheet found -4.00, described as 0.00 +- 0.5 °"),
+    ],
+)
+def test_angles_are_told_in_degrees(name, value, words):
+    std = np.tan(np.radians(0.5)) if "slope" in name else np.radians(0.5)
+    assert format_deviation(parameter_of(name), value, 0.0, std, sigmas=6.0).startswith(words)

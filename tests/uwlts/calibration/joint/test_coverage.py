@@ -1,0 +1,50 @@
+"""Stated uncertainties of the joint calibration hold the truth as often as they say, over whole simulated campaigns.
+
+200 campaigns of each kind are measured by ``python -m tests.bench.coverage``.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2
+
+from tests.bench.coverage import Campaign, judged, run_campaign, within
+
+WET, DRY = 16, 8
+BY_CHANCE = 1e-4
+"""How often a test of a correct uncertainty fails; where all campaigns are drawn by the same seeds, never again."""
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """Errors over stated standard uncertainties, and shares within 95 %, of all scans together, by quantity."""
+    campaigns = [Campaign(seed, wet=seed < WET) for seed in range(WET + DRY)]
+    found = judged([run_campaign(campaign) for campaign in campaigns])
+    return {
+        quantity: [m for (_, other), some in found.items() if other == quantity for m in some]
+        for quantity in ("spacing", "diameter")
+    }
+
+
+@pytest.mark.parametrize("quantity", ["spacing", "diameter"])
+def test_95_percent_intervals_hold_the_truth(measured, quantity):
+    """Two scans of each campaign: 48 spacings, and as many pairs of diameters, which may err alike.
+
+    Were the standard uncertainties half of what they should be, 67 % would be held, so that 95 of 100 such tests fail.
+    """
+    found = measured[quantity]
+    scans = 2 * (WET + DRY)
+    assert len(found) == (scans if quantity == "spacing" else 2 * scans)
+    assert within(found) >= binom.ppf(BY_CHANCE, scans, 0.95) / scans
+
+
+@pytest.mark.parametrize("quantity", ["spacing", "diameter"])
+def test_errors_are_as_large_as_stated(measured, quantity):
+    """The mean square of error over standard uncertainty is one.
+
+    Uncertainties wrong by a factor of two either way make it 4 or 0.25; the interval reaches from 0.4 to 1.9. That of
+    pairs of diameters scatters no more than that of as many single ones.
+    """
+    scans = 2 * (WET + DRY)
+    square = np.mean([(m.error_mm / m.std_mm) ** 2 for m in measured[quantity]])
+    lowest, highest = chi2.ppf([BY_CHANCE, 1 - BY_CHANCE], scans) / scans
+    assert lowest < square < highest

@@ -1,0 +1,294 @@
+"""The joint calibration on views made by Fermat's principle: derivatives, what it finds, how well it says it does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import WATER, built_sensor
+from tests.uwlts.joint_views import Noise, gathered, lit_points, step_views, target_series
+from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.joint.derivatives import DescribedSheet
+from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.initial import series_start
+from uwlts.calibration.joint.parameters import Parameters, Prior, View
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.calibration import FanModel, SheetModel
+from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import StageParameter, StepHeight, WindowParameter, parameter_of
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.sheet import sheet_surface
+
+BOW = 0.001
+BUILT = built_sensor()
+OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+AIR, IN_WATER = np.arange(10) * 28.0 - 200.0, np.arange(10) * 20.0 - 120.0
+TILTS = np.array([(0, 0), (0.35, 0), (-0.35, 0), (0, 0.35), (0, -0.35), (0.25, 0.25), (-0.25, 0.25), (0.3, -0.2)])
+
+
+@pytest.fixture(scope="module")
+def noise():
+    return Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+
+
+def truth():
+    window, camera = BUILT.camera.window, BUILT.camera
+    normal = window.normal()
+    return {
+        "f": camera.focal_length_px(),
+        "cx": camera.principal_point()[0],
+        "cy": camera.principal_point()[1],
+        "k1": camera.distortion.k1,
+        "k2": camera.distortion.k2,
+        "window_distance": window.distance_mm,
+        "window_slope_x": normal[0] / normal[2],
+        "window_slope_y": normal[1] / normal[2],
+        "index of water": WATER,
+        "sheet_bow": BOW,
+        "laser_window_turn": np.radians(BUILT.laser.window.tilt_y_deg) - BOW,
+        "target_bow": 0.0,
+    }
+
+
+def std_by_text(result):
+    return {key.text: std for key, std in result.estimate.std().items()}
+
+
+def pulls(result):
+    """Errors of the parameters over their stated uncertainties."""
+    estimate, std = result.estimate, std_by_text(result)
+    values = {key.text: value for key, value in zip(estimate.parameters.keys, estimate.values, strict=True)}
+    return {name: (values[name] - true) / std[name] for name, true in truth().items() if name in values}
+
+
+@pytest.mark.parametrize("medium_index", [1.0, WATER])
+@pytest.mark.parametrize(("tilt_deg", "bow"), [(0.15, BOW), (1.0, 0.003), (1.0, -0.003), (-1.0, 0.003)])
+def test_the_sheet_is_where_fermat_sees_the_fan(medium_index, tilt_deg, bow):
+    """Bow and turned window, to the ends of the fan at 22.5 deg.
+
+    The glass shifts the sheet by t d (1 - 1 / g) = 35 um for a degree between beam and normal, a tenth of that more at
+    the ends of the fan.
+    """
+    turn = np.radians(tilt_deg)
+    window = BUILT.laser.window.model_copy(update={"tilt_y_deg": tilt_deg})
+    sensor = BUILT.model_copy(update={"laser": BUILT.laser.model_copy(update={"window": window})})
+    pose = laser_pose(sensor)
+    normal = np.cos(bow) * pose.normal - np.sin(bow) * pose.axis
+    outer = pose.origin_mm + (window.distance_mm + window.thickness_mm) * pose.axis
+    fan = FanModel(
+        apex_mm=tuple(pose.origin_mm),
+        axis=tuple(pose.axis),
+        pivot_mm=tuple(outer),
+        bow_rad=bow,
+        window_turn_rad=turn - bow,
+    )
+    sheet = SheetModel(normal=tuple(normal), offset_mm=float(normal @ pose.origin_mm), fan=fan)
+    lit = np.vstack(
+        [
+            lit_points(sensor, normal=pose.axis, point=pose.origin_mm + reach * pose.axis, index=medium_index, bow=bow)
+            for reach in (300.0, 450.0, 600.0)
+        ]
+    )
+    miss = sheet_surface(sheet, medium_index=medium_index).miss_mm(lit.T)
+    plane = sheet_surface(sheet.model_copy(update={"fan": None}), medium_index=medium_index).miss_mm(lit.T)
+    assert np.ptp(miss) < 0.005 * abs(tilt_deg) + 5e-4
+    assert abs(miss).max() < 0.040 * (abs(tilt_deg) + np.degrees(abs(bow)))
+    assert np.ptp(plane) > 0.03
+
+
+def at_truth(view):
+    """Parameters and a vector at what the views were made with, and the start for the series of a view."""
+    nominal = nominal_calibration(BUILT)
+    pose = laser_pose(BUILT)
+    middle = camera_from_object(BUILT)[:3, 3]
+    sheet = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + 36.0 * pose.axis)
+    series = target_series(BUILT, medium=view.medium, window=view.window, positions=IN_WATER[:4])
+    window = nominal.window
+    start = series_start([series], BUILT, window, [WATER], options=CameraOptions(), free=False, margin_mm=None)
+    normal = np.array(window.normal) / window.normal[2]
+    known = {
+        "window_distance": window.distance_mm,
+        "window_slope_x": normal[0],
+        "window_slope_y": normal[1],
+        "glass_thickness": window.thickness_mm,
+        "glass_index": window.glass_index,
+        "index of water": WATER,
+        "sheet_turn_fan": 0.001,
+        "sheet_turn_axis": -0.002,
+        "sheet_offset": 0.05,
+        "sheet_bow": 0.002,
+        "laser_window_turn": 0.003,
+        "stage_scale": 1e-4,
+        "target_bow": 0.02,
+        "height of the 23 mm step": 23.0,
+    }
+    priors = {parameter_of(text): Prior(value, 1.0) for text, value in known.items()}
+    parameters = Parameters(start.intrinsics, sheet, window, ("water",), priors)
+    return parameters, parameters.start(start.intrinsics.from_model(nominal.camera)), start
+
+
+@pytest.mark.parametrize("view", [View(False, None), View(True, None), View(True, 0)], ids=str)
+@pytest.mark.parametrize("kind", [TargetEvidence, StepProfileEvidence])
+def test_every_derivative_is_what_differences_say(view, kind):
+    """By differences of the residuals' numerators: a residual is scaled by a derivative that is taken as constant.
+
+    Where a residual is r, its scale's change adds r times a relative change: the pixels are therefore moved to where
+    the residuals vanish. Then central differences are exact to the square of the step and to rounding over it.
+    """
+    parameters, global_values, start = at_truth(view)
+    rng = np.random.default_rng(0)
+    if kind is TargetEvidence:
+        evidence, local = start.evidence[0], start.local[0].copy()
+        local[6:] = rng.normal(0, 1e-3, len(local) - 6)
+        keep = np.arange(0, len(evidence.stripe_pixels), 40)
+        evidence = replace(
+            evidence,
+            stripe_pixels=evidence.stripe_pixels[keep],
+            stripe_image=evidence.stripe_image[keep],
+            stripe_shifts_mm=evidence.stripe_shifts_mm[keep],
+        )
+    else:
+        frame = camera_from_object(BUILT)
+        pixels = np.column_stack([np.linspace(200, 1000, 30), np.linspace(450, 550, 30)])
+        evidence = StepProfileEvidence(
+            view=view,
+            pixels=pixels,
+            upper=np.arange(30) % 2 == 0,
+            upward=-frame[:3, 2],
+            along=frame[:3, 1],
+            across=1,
+            height=StepHeight(23.0),
+            image=0,
+        )
+        local = np.array([0.02, -390.0])
+    for _ in range(8):
+        evidence = _without_residuals(evidence, evidence.residuals(parameters, global_values, local))
+    found = evidence.residuals(parameters, global_values, local)
+    assert sum(len(part.values) for part in found) >= 30
+    assert max(np.abs(part.values).max() for part in found) < 1e-8
+    vector = np.concatenate([global_values, local])
+
+    def residuals(values):
+        parts = evidence.residuals(parameters, values[: len(global_values)], values[len(global_values) :])
+        return np.concatenate([part.values for part in parts])
+
+    analytic = np.zeros((sum(len(part.values) for part in found), len(vector)))
+    rows = np.split(np.arange(len(analytic)), np.cumsum([len(part.values) for part in found])[:-1])
+    for place, part in zip(rows, found, strict=True):
+        analytic[np.ix_(place, np.r_[: len(global_values), len(global_values) + part.local_columns])] = np.hstack(
+            [part.by_global, part.by_local]
+        )
+    for place, column in enumerate(analytic.T):
+        reach = 1e-6 * max(1.0, abs(vector[place]))
+        ahead, behind = vector.copy(), vector.copy()
+        ahead[place] += reach
+        behind[place] -= reach
+        numeric = (residuals(ahead) - residuals(behind)) / (2 * reach)
+        assert np.abs(column - numeric).max() <= 1e-5 * np.abs(numeric).max() + 1e-6, place
+
+
+def _without_residuals(evidence, parts):
+    if isinstance(evidence, StepProfileEvidence):
+        return replace(evidence, pixels=evidence.pixels - np.outer(parts[0].values, (0, 1)))
+    pixels, stripe = evidence.placement.pixels.copy(), evidence.stripe_pixels.copy()
+    for part in parts:
+        if part.kind == TARGET:
+            pixels[evidence.placement.image == part.image] -= part.values.reshape(-1, 2)
+        else:
+            stripe[evidence.stripe_image == part.image, 1] -= part.values
+    return replace(evidence, placement=replace(evidence.placement, pixels=pixels), stripe_pixels=stripe)
+
+
+@pytest.fixture(scope="module")
+def in_water(noise):
+    return target_series(BUILT, medium=0, positions=IN_WATER, bow=BOW, noise=noise)
+
+
+@pytest.fixture(scope="module")
+def in_air(noise):
+    return target_series(BUILT, window=False, positions=AIR, bow=BOW, noise=noise)
+
+
+def test_target_images_in_water_alone_give_everything(in_water, thesis):
+    result = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS)
+    found, std = pulls(result), std_by_text(result)
+    assert max(map(abs, found.values())) < 4.5
+    assert std["window_distance"] < 1.0
+    assert std["f"] < 0.0005 * truth()["f"]
+    assert result.estimate.noise["target"].sigma_px == pytest.approx(0.03, rel=0.1)
+    assert result.estimate.noise["stripe on the target"].sigma_px == pytest.approx(0.1, rel=0.15)
+    calibration = result.calibration
+    assert calibration.media[0].index == pytest.approx(WATER, abs=5e-4)
+    assert calibration.index_of(calibration.media[0].medium) == calibration.media[0].index
+
+
+def test_air_and_water_together_are_better_than_either(in_air, in_water, thesis):
+    alone = std_by_text(solve_jointly(gathered(thesis, [in_water]), options=OPTIONS))
+    result = solve_jointly(gathered(thesis, [in_air, in_water]), options=OPTIONS)
+    assert max(map(abs, pulls(result).values())) < 4.5
+    std = std_by_text(result)
+    assert std["f"] < 0.7 * alone["f"]
+    assert std["window_distance"] < 0.2 * alone["window_distance"]
+    assert std["laser_window_turn"] < 0.1 * alone["laser_window_turn"]
+
+
+def test_stated_uncertainties_hold_over_many_calibrations(thesis):
+    found = []
+    for seed in range(6):
+        noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(seed))
+        series = [
+            target_series(BUILT, window=False, positions=AIR[::2], bow=BOW, noise=noise, columns=15),
+            target_series(BUILT, medium=0, positions=IN_WATER[::2], bow=BOW, noise=noise, columns=15),
+        ]
+        found.append(list(pulls(solve_jointly(gathered(thesis, series), options=OPTIONS)).values()))
+    # Some parameters are where their priors say, so the root mean square lies below one; of 72 pulls, many correlated,
+    # it stays below 1.3.
+    assert 0.5 < np.sqrt(np.mean(np.square(found))) < 1.3
+    assert np.abs(found).max() < 4.5
+
+
+def test_a_target_held_by_hand_in_water(noise, thesis):
+    series = target_series(
+        BUILT, medium=0, positions=np.linspace(-60, 60, len(TILTS)), bow=BOW, noise=noise, tilts=TILTS
+    )
+    result = solve_jointly(gathered(thesis, [series]), options=replace(OPTIONS, poses="free"))
+    assert max(map(abs, pulls(result).values())) < 4.5
+    assert StageParameter.SCALE not in result.estimate.parameters.keys
+
+
+def test_steps_add_the_window_to_a_target_in_air(thesis):
+    """The laser's window is square to the sheet here, as the step views need it."""
+    laser = BUILT.laser.model_copy(update={"window": BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.0})})
+    sensor = BUILT.model_copy(update={"laser": laser})
+    noise = Noise(circles_px=0.03, stripe_px=0.1, rng=np.random.default_rng(2))
+    air = target_series(sensor, window=False, positions=AIR, noise=noise)
+    result = solve_jointly(gathered(thesis, [air], step_views(sensor, noise=noise)), options=OPTIONS)
+    found = pulls(result)
+    assert max(abs(found[name]) for name in ("f", "cx", "cy", "k1", "k2", "window_distance", "window_slope_x")) < 4.5
+    assert result.estimate.std()[WindowParameter.DISTANCE] < 0.5 * thesis.uncertainty.window_distance_mm
+    height = next(key for key in result.estimate.parameters.keys if isinstance(key, StepHeight))
+    place = result.estimate.parameters.keys.index(height)
+    assert abs(result.estimate.values[place] - 23.17) < 4.5 * result.estimate.std()[height]
+
+
+def test_strays_do_not_count(in_water, thesis):
+    clean = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS)
+    rng = np.random.default_rng(1)
+    images = []
+    for image in in_water.found.images:
+        pixels = image.pixels.copy()
+        pixels[rng.random(len(pixels)) < 0.02] += 3.0
+        images.append(replace(image, pixels=pixels))
+    spoilt = replace(in_water, found=replace(in_water.found, images=images))
+    result = solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
+    moved = np.abs(result.estimate.values - clean.estimate.values) / np.sqrt(np.diag(clean.estimate.covariance))
+    assert result.estimate.outliers >= 50
+    assert moved.max() < 1.0
+
+
+def test_a_target_without_stripes_is_refused(in_water, thesis):
+    found = replace(in_water.found, stripes=[np.empty((0, 2))] * len(in_water.found.images))
+    with pytest.raises(CalibrationError, match="no stripe was found on the target"):
+        solve_jointly(gathered(thesis, [replace(in_water, found=found)]), options=OPTIONS)

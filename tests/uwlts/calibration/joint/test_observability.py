@@ -1,0 +1,214 @@
+"""What is said of weak directions; what is predicted of a further shot, against calibrations that have that shot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import built_sensor, inside, lattice
+from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, step_views, target_series
+from uwlts.calibration.evidence import AirEvidence
+from uwlts.calibration.joint.gathering import Series
+from uwlts.calibration.joint.next_shot import advice_lines, next_shots
+from uwlts.calibration.joint.observability import (
+    Lengths,
+    estimate_in,
+    format_weaknesses,
+    lengths_over,
+    regions,
+    weaknesses,
+)
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
+from uwlts.targets import parse_target
+
+BUILT = built_sensor()
+OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+
+
+def keys(*texts):
+    return [parameter_of(text) for text in texts]
+
+
+def noise(seed):
+    return Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def in_water():
+    return target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise(4))
+
+
+@pytest.fixture(scope="module")
+def from_water(in_water, thesis):
+    return solve_jointly(gathered(thesis, [in_water]), options=OPTIONS).calibration
+
+
+def from_steps(thesis, *, height_mm):
+    """A target in air and steps in water; the laser's window is square to the sheet, as the step views need it."""
+    laser = BUILT.laser.model_copy(update={"window": BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.0})})
+    sensor = BUILT.model_copy(update={"laser": laser})
+    known = thesis.uncertainty.model_copy(update={"step_height_mm": height_mm, "window_tilt_deg": 0.01})
+    described = thesis.model_copy(update={"uncertainty": known})
+    air = target_series(sensor, window=False, positions=np.arange(6) * 46.0 - 200.0, noise=noise(2), columns=15)
+    steps = step_views(sensor, noise=noise(3))
+    return solve_jointly(gathered(described, [air], steps), options=OPTIONS).calibration
+
+
+def lengths(by_parameters):
+    """Lengths of 100 mm along Z with these derivatives (M, P)."""
+    ends = np.tile([[0.0, 0.0], [0.0, 100.0]], (len(by_parameters), 1, 1))
+    count = len(by_parameters)
+    return Lengths(ends, np.full(count, 100.0), np.array(by_parameters, dtype=float), np.ones(count))
+
+
+def of_calibration(calibration):
+    region = regions(calibration)[0]
+    known = estimate_in(calibration, region)
+    over = lengths_over(calibration, known, region)
+    return known, over, weaknesses(over, known.parameters.keys, known.covariance)
+
+
+def test_two_that_cannot_be_told_apart_are_named_together():
+    """Each alone costs 10 µm, they trade places with a correlation of 0.99, and the third is known well."""
+    names = keys("window_distance", "index of water", "cx")
+    covariance = np.array([[1.0, 0.99, 0.0], [0.99, 1.0, 0.0], [0.0, 0.0, 0.01]])
+    found = weaknesses(lengths([[0.01, 0.01, 0.001], [0.005, 0.005, 0.0]]), names, covariance)
+    assert len(found) == 1
+    assert set(found[0].parameters) == set(names[:2])
+    # The standard uncertainty of their sum: 0.01 sqrt(2 + 2 * 0.99).
+    assert found[0].cost_mm == pytest.approx(0.01 * np.sqrt(3.98), rel=1e-3)
+    said = found[0].words()
+    assert "window distance and index of water cannot be told apart" in said or (
+        "index of water and window distance cannot be told apart" in said
+    )
+    assert "together they cost 0.020 mm in a length of 100 mm along Z" in said
+
+
+def test_what_cancels_in_every_length_is_not_named():
+    """Two parameters known to 1 each trade places without any length changing."""
+    covariance = np.array([[1.0, -0.9999999, 0.0], [-0.9999999, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    found = weaknesses(lengths([[0.01, 0.01, 0.002]]), keys("window_distance", "f", "glass_index"), covariance)
+    assert [each.parameters for each in found] == [(WindowParameter.GLASS_INDEX,)]
+    assert "index of the window's glass is known too little; it costs 0.002 mm" in found[0].words()
+
+
+def test_independent_ones_are_not_called_confused():
+    found = weaknesses(lengths([[0.01, 0.01]]), keys("window_distance", "glass_index"), np.eye(2))
+    assert not found[0].confused
+    assert "are known too little; together they cost 0.014 mm" in found[0].words()
+
+
+def test_less_than_a_micrometre_is_said_to_be_nothing():
+    assert weaknesses(lengths([[0.0009, 0.0]]), keys("window_distance", "f"), np.eye(2)) == []
+    assert "nothing" in format_weaknesses([])[0]
+
+
+def test_a_height_that_is_the_cause_is_named_though_it_moves_no_point():
+    """Knowing the height would leave 0.2 of the window distance's standard uncertainty."""
+    covariance = np.array([[1.0, 0.98], [0.98, 1.0]])
+    names = keys("window_distance", "height of the 23 mm step")
+    found = weaknesses(lengths([[0.01, 0.0]]), names, covariance)
+    assert found[0].parameters == tuple(names)
+    assert found[0].confused
+
+
+def without(known, key):
+    """The covariance where a parameter is known."""
+    place = known.parameters.keys.index(key)
+    column = known.covariance[:, place]
+    return known.covariance - np.outer(column, column) / column[place]
+
+
+@pytest.mark.parametrize(
+    ("height_mm", "pair"),
+    [
+        (0.01, {WindowParameter.DISTANCE, StepHeight(23.17)}),
+        (1e-4, {WindowParameter.DISTANCE, SheetParameter.WINDOW_TURN}),
+    ],
+)
+def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
+    """A step's height follows from window distance and turned sheet alike; knowing one of the pair really helps."""
+    calibration = from_steps(thesis, height_mm=height_mm)
+    known, over, found = of_calibration(calibration)
+    assert set(found[0].parameters[:2]) == pair
+    assert found[0].confused
+    before = np.mean(over.std_mm(known.covariance) ** 2)
+    for key in pair:
+        assert np.mean(over.std_mm(without(known, key)) ** 2) < 0.65 * before
+    assert any("target in air without the window" in outlook.words for outlook in next_shots(calibration))
+
+
+def test_the_cost_is_part_of_the_lengths_uncertainty(from_water):
+    known, over, found = of_calibration(from_water)
+    largest = over.std_mm(known.covariance).max()
+    assert 0.3 * largest < found[0].cost_mm <= 1.0001 * largest
+    assert [line for line in advice_lines(from_water) if line.startswith("next: ")]
+
+
+def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
+    """Another OCS, turned by 2 deg about X and shifted, gives the same uncertainties at the same points."""
+    known, over, _ = of_calibration(from_water)
+    frame = from_water.object_transform()
+    cosine, sine = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
+    turn = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    outline = np.array(from_water.joint.covered[0].outline_mm) @ turn[1:, 1:]
+    frame[:3, :3] = frame[:3, :3] @ turn
+    moved = from_water.model_copy(update={"camera_from_object": tuple(map(tuple, frame.tolist()))})
+    region = replace(regions(from_water)[0], outline_mm=outline)
+    there = lengths_over(moved, known, region).std_mm(known.covariance)
+    # Meshes of a turned outline differ; the largest length runs between the same corners but for the inset of 2 %.
+    assert there.max() == pytest.approx(over.std_mm(known.covariance).max(), rel=0.06)
+
+
+def test_targets_points_are_those_that_are_found():
+    assert np.allclose(TARGET.points_mm[:, :2], lattice()[:, :2])
+    board = parse_target({"kind": "charuco", "columns": 5, "rows": 4, "square_mm": 10.0, "marker_mm": 7.0})
+    assert board.points_mm.shape == (12, 3)
+    assert board.points_mm[0].tolist() == [10.0, 10.0, 0.0]
+
+
+def shot(sensor, pose, view, spoilt):
+    """The image of the target and the stripe that a shot at ``T_camera_target`` really gives."""
+    index = 1.0 if view.medium is None else 1.3312
+    points = lattice()
+    pixels = seen(sensor, points @ pose[:3, :3].T + pose[:3, 3], index=index, window=view.window)
+    here = inside(pixels, sensor)
+    found = pixels[here] + spoilt.draw(spoilt.circles_px, (here.sum(), 2))
+    lit = lit_points(sensor, normal=pose[:3, 2], point=pose[:3, 3], index=index, count=1000)
+    stripe = seen(sensor, lit, index=index, window=view.window)
+    stripe = stripe[inside(stripe, sensor)]
+    stripe = stripe + np.column_stack([np.zeros(len(stripe)), spoilt.draw(spoilt.stripe_px, len(stripe))])
+    evidence = AirEvidence(TARGET, [TargetImage(points[here], found, 0.0)], [(0, 0)], [stripe], [])
+    return Series(view, evidence, None, ["shot"])
+
+
+def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
+    """The uncertainty after it within 20 %, as noise, and so the weights, is estimated anew from all residuals."""
+    outlooks = next_shots(from_water)
+    best = outlooks[0]
+    assert best.pose is not None
+    assert best.after_mm < 0.8 * best.before_mm
+    added = shot(BUILT, best.pose, best.view, noise(9))
+    result = solve_jointly(gathered(thesis, [in_water, added]), options=OPTIONS)
+    known, over, _ = of_calibration(from_water)
+    reached = np.sqrt(np.mean(over.std_mm(result.estimate.covariance) ** 2))
+    assert known.parameters.keys == result.estimate.parameters.keys
+    assert reached == pytest.approx(best.after_mm, rel=0.2)
+    assert [o.after_mm for o in outlooks] == sorted(o.after_mm for o in outlooks)
+    every = " ".join(o.words for o in outlooks)
+    assert all(kind in every for kind in ("target in water", "step in water", "spheres of 30 mm in water"))
+    assert "in air" not in every
+
+
+def test_a_single_line_covers_no_area(thesis):
+    """One stripe alone cannot be solved; of a calibration whose outline is a line nothing is said of lengths."""
+    series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise(4), columns=15)
+    calibration = solve_jointly(gathered(thesis, [series]), options=OPTIONS).calibration
+    joint = calibration.joint
+    line = joint.covered[0].model_copy(update={"outline_mm": ((-50.0, 10.0), (50.0, 10.0))})
+    calibration = calibration.model_copy(update={"joint": joint.model_copy(update={"covered": (line,)})})
+    assert next_shots(calibration) == []
+    assert "cover no area" in advice_lines(calibration)[0]

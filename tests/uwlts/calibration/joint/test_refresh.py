@@ -1,0 +1,367 @@
+"""A joint calibration carried over to new water by steps: views by Fermat's principle, captures of drawn stripes."""
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.system.in_process import uwlts
+from tests.uwlts import drawn_stripes
+from tests.uwlts.calibration_views import STEP_MM, built_sensor
+from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
+from uwlts.calibration.evidence import StepEvidence
+from uwlts.calibration.joint.estimate import estimate
+from uwlts.calibration.joint.evidence import StepProfileEvidence
+from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, View
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.joint.refresh import refresh, solve_refreshed
+from uwlts.calibration.joint.stored_estimate import found_estimate, stored_estimate
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.errors import CalibrationError, DescriptionError, RangeError
+from uwlts.model.parameter_keys import MediumIndex, StepHeight, parameter_of
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Medium
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.report.certificate import certificate_of
+from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.capture import Capture
+
+BUILT = built_sensor()
+OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
+WARM = Medium(kind="fresh", temperature_c=25.0)
+COLD = Medium(kind="fresh", temperature_c=18.0)
+WAVELENGTH = BUILT.laser.wavelength_nm
+INDEX = COLD.refractive_index(WAVELENGTH)
+POORLY_KNOWN = 1e-3
+
+
+def noise(seed):
+    return Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(seed))
+
+
+def calibrated(described, sensor=BUILT, *, seed=4, columns=15):
+    """By a target in water of 25 degC, whose index the views have to 2e-5."""
+    series = target_series(sensor, medium=0, positions=np.arange(8) * 27.0 - 130.0, noise=noise(seed), columns=columns)
+    evidence = gathered(described, [series])
+    evidence.media["water"] = WARM
+    return solve_jointly(evidence, options=OPTIONS).calibration
+
+
+@pytest.fixture(scope="module")
+def earlier(thesis):
+    return calibrated(thesis)
+
+
+@cache
+def tread(depth_mm, *, index, between=None, beyond=None):
+    """Pixels on a plane across the sheet at an OCS depth, where |Y| is less or more than so many mm; without noise."""
+    frame = camera_from_object(BUILT)
+    lit = lit_points(BUILT, normal=frame[:3, 2], point=frame[:3, 3] + depth_mm * frame[:3, 2], index=index, count=600)
+    across = np.abs((lit - frame[:3, 3]) @ frame[:3, 1])
+    lit = lit[across < between] if between else lit[across > beyond]
+    pixels = seen(BUILT, lit, index=index, window=True)
+    return pixels[((pixels >= 0) & (pixels <= [BUILT.camera.width_px - 1, BUILT.camera.height_px - 1])).all(axis=1)]
+
+
+def steps(thesis, *, index=INDEX, depths_mm=(15.0,), medium=WARM, height_mm=STEP_MM, seed=1):
+    """What step captures would give: a standard of 23.17 mm, certified to 1 um, in water that is said to be warm."""
+    found, rng = [], np.random.default_rng(seed)
+    standard = StepStandard(height_mm=height_mm, height_uncertainty_mm=0.002)
+    for depth in depths_mm:
+        pieces = [tread(depth, index=index, beyond=31.0), tread(depth - STEP_MM, index=index, between=28.0)]
+        pixels = np.vstack(pieces)
+        pixels = pixels[np.argsort(pixels[:, 0])]
+        pixels[:, 1] += rng.normal(0, 0.1, len(pixels))
+        found.append((StepEvidence(pixels, standard, medium.refractive_index(WAVELENGTH), "step"), View(True, 0)))
+    evidence = gathered(thesis, [], found)
+    evidence.media["water"] = medium
+    return evidence
+
+
+def refreshed(earlier, evidence, **options):
+    return solve_refreshed(earlier, evidence, options=CalibrationOptions(), **options)
+
+
+def length_error(calibration):
+    """How wrong a plane 80 mm beyond the stand-off is wide in the cold water, mm."""
+    frame = camera_from_object(BUILT)
+    lit = lit_points(BUILT, normal=frame[:3, 2], point=frame[:3, 3] + 80.0 * frame[:3, 2], index=INDEX)[[20, -21]]
+    pixels = seen(BUILT, lit, index=INDEX, window=True)
+    found = reconstruct_pixels(
+        calibration, pixels, medium_index=calibration.index_of(WARM), stage_mm=0.0, stage_direction=np.eye(3)[0]
+    ).points_mm
+    return abs(np.linalg.norm(found[1] - found[0]) - np.linalg.norm(lit[1] - lit[0]))
+
+
+def test_one_step_tells_the_index_of_colder_water(earlier, thesis):
+    """Water of 18 degC said to have 25: an index wrong by 6.4e-4. An image of 23 mm known to 1 um tells it to 4e-4."""
+    result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
+    change = result.changes[0]
+    assert change.index_before == pytest.approx(WARM.refractive_index(WAVELENGTH), abs=1e-12)
+    assert change.std_before == POORLY_KNOWN
+    assert change.std < 0.6 * POORLY_KNOWN
+    assert abs(change.index - INDEX) < 3 * change.std
+    assert change.length.after_mm < 0.6 * change.length.before_mm
+    assert result.warnings == []
+    calibration = result.calibration
+    assert [known.medium for known in calibration.media] == [WARM, WARM]
+    assert calibration.index_of(WARM) == change.index
+    assert calibration.media[0].index == pytest.approx(earlier.media[0].index, abs=1e-4)
+    assert change.name == "water 2"
+
+
+def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thesis):
+    """Two waters, in one of which the stripe lies on the lower tread alone."""
+    evidence = steps(thesis)
+    flat = replace(evidence.steps[0][0], pixels=tread(15.0, index=INDEX, beyond=31.0))
+    evidence = replace(evidence, media=evidence.media | {"pool": COLD}, steps=[*evidence.steps, (flat, View(True, 1))])
+    result = refreshed(earlier, evidence, index_std=POORLY_KNOWN)
+    assert [change.name for change in result.changes] == ["water 2"]
+    assert "step: left out" in result.warnings[0]
+
+
+def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
+    result = refreshed(earlier, steps(thesis, depths_mm=(-45.0, -15.0, 15.0, 60.0, 85.0)), index_std=POORLY_KNOWN)
+    change = result.changes[0]
+    assert abs(change.index - INDEX) < 3 * change.std < 1e-3
+    assert length_error(result.calibration) < 0.4 * length_error(earlier)
+
+
+def test_stated_uncertainties_of_the_index_hold(thesis):
+    """Pulls of independent calibrations and steps: the mean square of 5 lies within 0.04 and 4.1 (chi2, 99.8 %)."""
+    pulls = []
+    for seed in range(5):
+        change = refreshed(
+            calibrated(thesis, seed=seed, columns=9),
+            steps(thesis, depths_mm=(15.0, 80.0), seed=seed),
+            index_std=POORLY_KNOWN,
+        ).changes[0]
+        pulls.append((change.index - INDEX) / change.std)
+    # The prior holds the index 6e-4 too low and has its share, a fifth of that, of the square.
+    assert 0.04 < np.mean(np.square(pulls)) < 4.5
+
+
+def test_a_prior_with_correlations_counts_as_its_covariance():
+    """Residuals, their derivatives by differences, and the chi-square; from degrees of 1e-8 to 1e3."""
+    rng = np.random.default_rng(0)
+    scale = 10.0 ** np.arange(-8, 4, 3)
+    root = scale[:, None] * rng.normal(size=(4, 4))
+    values = scale * rng.normal(size=4)
+    earlier = EarlierEstimate(values, root @ root.T)
+    global_values = np.append(values + scale * rng.normal(size=4), (7.0, 8.0))
+    off, by_global = earlier.residuals(global_values)
+    assert by_global.shape == (4, 6)
+    expected = np.linalg.solve(root, global_values[:4] - values)
+    assert off @ off == pytest.approx(expected @ expected, rel=1e-8)
+    for place in range(6):
+        reach = scale[place] if place < 4 else 1.0
+        ahead, behind = (global_values + sign * reach * np.eye(6)[place] for sign in (1, -1))
+        numeric = (earlier.residuals(ahead)[0] - earlier.residuals(behind)[0]) / (2 * reach)
+        # Linear, so that differences are exact but for rounding.
+        assert by_global[:, place] == pytest.approx(numeric, rel=1e-8, abs=1e-8 * np.abs(off).max() / reach)
+
+
+@pytest.mark.parametrize("covariance", [np.zeros((2, 2)), np.array([[1.0, 2.0], [2.0, 1.0]])])
+def test_a_covariance_that_is_none_is_refused(covariance):
+    with pytest.raises(CalibrationError, match="covariance of the earlier calibration is damaged"):
+        EarlierEstimate(np.zeros(2), covariance)
+
+
+def test_what_tells_nothing_leaves_everything_as_it_was(earlier, thesis):
+    """Two pixels are a line, and a third a height that nobody knows."""
+    known = found_estimate(earlier, WARM)
+    frame = camera_from_object(BUILT)
+    priors = known.parameters.priors | {StepHeight(20.0): Prior(20.0, 1e4)}
+    parameters = replace(known.parameters, priors=priors, earlier=EarlierEstimate(known.values, known.covariance))
+    evidence = StepProfileEvidence(
+        view=View(True, 0),
+        pixels=np.array([[300.0, 505.0], [900.0, 505.0], [600.0, 480.0]]),
+        upper=np.array([False, False, True]),
+        upward=-frame[:3, 2],
+        along=frame[:3, 1],
+        across=1,
+        height=StepHeight(20.0),
+        image=0,
+    )
+    count = len(known.values)
+    result = estimate(
+        parameters, [evidence], np.append(known.values, 20.0), [np.array([0.0, -330.0])], uncertainty=thesis.uncertainty
+    )
+    std = np.sqrt(np.diag(known.covariance))
+    assert np.abs((result.values[:count] - known.values) / std).max() < 1e-5
+    off = (result.covariance[:count, :count] - known.covariance) / np.outer(std, std)
+    assert np.abs(off).max() < 1e-5
+    assert abs(result.values[-1] - 20.0) > 0.1
+
+
+def test_correlations_of_the_earlier_estimate_count(earlier, thesis):
+    """With its variances alone a step would be said to tell other things, and lengths would be known worse."""
+    covariance = tuple(map(tuple, np.diag(np.diag(earlier.joint.covariance)).tolist()))
+    loose = earlier.model_copy(update={"joint": earlier.joint.model_copy(update={"covariance": covariance})})
+    full, alone = (
+        refreshed(each, steps(thesis), index_std=POORLY_KNOWN).changes[0].length for each in (earlier, loose)
+    )
+    assert alone.after_mm > 1.5 * full.after_mm
+
+
+def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
+    result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
+    path = tmp_path / "new.json"
+    write_calibration(path, result.calibration)
+    calibration = read_calibration(path)
+    joint, before = calibration.joint, earlier.joint
+    count = len(before.parameters)
+    assert joint.parameters[:count] == before.parameters
+    assert joint.parameters[count:] == (MediumIndex("water 2"), StepHeight(23.17))
+    assert joint.std_before[:count] == before.std_before
+    assert joint.std_before[count:] == (POORLY_KNOWN, 0.001)
+    assert (np.array(joint.std[:count]) <= np.array(before.std) * (1 + 1e-6)).all()
+    assert set(joint.scatter_px) == {*before.scatter_px, "stripe on the step"}
+    assert len(joint.images) == len(before.images) + 1
+    assert calibration.provenance["refreshed"][0]["date"] == earlier.provenance.get("date")
+    # The new water is that of use, over the same volume, and its index is the new one.
+    region = regions(calibration)[0]
+    assert region.name == "water 2"
+    assert region.has_area()
+    known = estimate_in(calibration, region)
+    assert known.parameters.medium_index(known.values, known.view) == calibration.media[1].index
+    assert stored_estimate(calibration, thesis, WARM).view == View(True, 1)
+    std = lengths_over(calibration, known, region).std_mm(known.covariance)
+    assert std.max() == pytest.approx(result.changes[0].length.after_mm, rel=0.1)
+    assert certificate_of(calibration, path, issued="2026-01-01").validity[0].name == "water 2"
+    again = refreshed(calibration, steps(thesis, seed=2), index_std=POORLY_KNOWN)
+    assert again.changes[0].name == "water 3"
+    assert len(again.calibration.provenance["refreshed"]) == 2
+
+
+@pytest.mark.parametrize("wrong", [{"height_mm": 23.4}, {"index": 1.3385}])
+def test_a_step_that_contradicts_its_description_is_refused(earlier, thesis, wrong):
+    """A certificate of another step, or sea water said to be fresh."""
+    with pytest.raises(CalibrationError, match="the steps say that the index of water 2 is 1.3") as caught:
+        refreshed(earlier, steps(thesis, **wrong))
+    assert "from the 1.33122 +- 0.000" in str(caught.value)
+    assert "described: check the step's height" in str(caught.value)
+
+
+def moved_since(calibration, name, by):
+    """A calibration of a sensor of which something was otherwise then."""
+    joint = calibration.joint
+    values = list(joint.values)
+    values[joint.parameters.index(parameter_of(name))] += by
+    return calibration.model_copy(update={"joint": joint.model_copy(update={"values": tuple(values)})})
+
+
+def test_a_sensor_that_has_changed_is_noticed(earlier, thesis):
+    """Steps at three depths, in water of which nothing is known: no index accounts for a shifted sheet or new focus."""
+    evidence = steps(thesis, depths_mm=(-45.0, 15.0, 85.0))
+    with pytest.raises(CalibrationError, match="contradicts itself: height of the 23.17 mm step found 23.2"):
+        refreshed(moved_since(earlier, "sheet_offset", 0.3), evidence, index_std=0.02)
+    warnings = refreshed(moved_since(earlier, "f", 10.0), evidence, index_std=0.02).warnings
+    assert any("the new images contradict the earlier calibration by 5." in warning for warning in warnings)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """A calibration of the coarse sensor in water of 25 degC, and steps drawn in water of index 1.3312."""
+    folder = tmp_path_factory.mktemp("refresh")
+    square = drawn_stripes.SENSOR.laser.window.model_copy(update={"tilt_y_deg": 0.0})
+    sensor = drawn_stripes.SENSOR.model_copy(
+        update={"laser": drawn_stripes.SENSOR.laser.model_copy(update={"window": square})}
+    )
+    write_calibration(folder / "calibration.json", calibrated(sensor, sensor))
+    return folder, sensor
+
+
+def step_capture(folder, described_by, name="step.h5", **header):
+    images = [drawn_stripes.step_image(15.0)]
+    described = {
+        "sensor": described_by,
+        "artefact": {"kind": "step", "height_mm": STEP_MM, "height_uncertainty_mm": 0.002},
+        "medium_name": "water",
+        "medium": WARM,
+    }
+    return drawn_stripes.write(folder / name, images, **(described | header))
+
+
+def test_the_command_refreshes_and_says_what_changed(drawn):
+    folder, sensor = drawn
+    capture = step_capture(folder, sensor)
+    told = ("refresh", folder / "calibration.json", "--step", capture, "--index-std", 0.001)
+    done = uwlts(*told)
+    assert done.returncode == 0, done.stderr
+    new = read_calibration(folder / "calibration.refreshed.json")
+    assert f"index of water 2: {WARM.refractive_index(WAVELENGTH):.5f} ± 0.001 before, {new.media[1].index:.5f} ±" in (
+        done.stdout
+    )
+    assert "now (k = 2, by the calibration)" in done.stdout
+    std = new.joint.std_of(MediumIndex("water 2"))
+    assert abs(new.media[1].index - 1.3312) < 3 * std
+    assert std < 9e-4
+    origin = json.loads((folder / "calibration.refreshed.json").read_text(encoding="utf-8"))["provenance"]
+    assert origin["step_captures"][0]["sha256"]
+    assert origin["refreshed"][0]["step_captures"] == ["step.h5"]
+    again = uwlts(*told)
+    assert again.returncode == 2
+    assert "exists already" in again.stderr
+    twice = uwlts("refresh", folder / "calibration.refreshed.json", "--step", capture)
+    assert twice.returncode == 2
+    assert "was made from step.h5 already: take a new image" in twice.stderr
+
+
+def renamed(sensor, **changes):
+    return sensor.model_copy(update=changes)
+
+
+@pytest.mark.parametrize(
+    ("header", "error", "said"),
+    [
+        (lambda s: {"medium": Medium(kind="air")}, CalibrationError, "was taken in air"),
+        (lambda s: {"artefact": None}, DescriptionError, "does not tell its step standard"),
+        (lambda s: {"sensor": renamed(s, name="other")}, CalibrationError, "taken by the sensor 'other'"),
+        (
+            lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=520.0))},
+            CalibrationError,
+            "with a laser of 520 nm",
+        ),
+        (
+            lambda s: {"sensor": renamed(s, camera=renamed(s.camera, window=renamed(s.camera.window, mounted=False)))},
+            CalibrationError,
+            "without the camera's window",
+        ),
+        (lambda s: {"artefact": {"kind": "step", "height_mm": 8.0}}, CalibrationError, "left out, no two"),
+    ],
+)
+def test_an_unsuitable_capture_is_refused(drawn, tmp_path, header, error, said):
+    folder, sensor = drawn
+    calibration = read_calibration(folder / "calibration.json")
+    path = step_capture(tmp_path, sensor, **header(sensor))
+    with Capture(path) as capture, pytest.raises(error, match=said):
+        refresh(calibration, [capture])
+
+
+def test_a_capture_given_twice_is_refused(drawn, tmp_path):
+    """Its noise would count as two independent ones."""
+    folder, sensor = drawn
+    path = step_capture(tmp_path, sensor)
+    copy = tmp_path / "copy.h5"
+    copy.write_bytes(path.read_bytes())
+    known, said = read_calibration(folder / "calibration.json"), r"step\.h5 and copy\.h5 are the same capture"
+    with Capture(path) as one, Capture(copy) as other, pytest.raises(CalibrationError, match=said):
+        refresh(known, [one, other])
+
+
+def test_an_unsuitable_calibration_is_refused(drawn, earlier):
+    folder, sensor = drawn
+    with pytest.raises(CalibrationError, match="calibrate jointly"):
+        refresh(nominal_calibration(sensor), [])
+    with pytest.raises(CalibrationError, match="has no window"):
+        refresh(earlier.model_copy(update={"window": None}), [])
+    with pytest.raises(CalibrationError, match="no capture is given"):
+        refresh(earlier, [])
+    with Capture(step_capture(folder, sensor, "again.h5")) as capture, pytest.raises(RangeError, match="be positive"):
+        refresh(read_calibration(folder / "calibration.json"), [capture], index_std=0.0)

@@ -1,0 +1,350 @@
+"""Scans of spheres, planes and pipes as evidence: derivatives, and what form and size give away."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import WATER
+from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
+from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
+from uwlts.calibration.joint.derivatives import DescribedSheet
+from uwlts.calibration.joint.estimate import estimate
+from uwlts.calibration.joint.evidence import STEP, Residuals
+from uwlts.calibration.joint.initial_scans import scan_stripes, surface_scan, surface_scans
+from uwlts.calibration.joint.parameters import Parameters, Prior
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.artefacts import Pipe, PlaneStandard, SphereStandard
+from uwlts.model.errors import CalibrationError, CaptureError, DescriptionError
+from uwlts.model.parameter_keys import parameter_of
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Medium
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+
+SENSOR = square_sensor()
+STAGE = np.linspace(-18.0, 18.0, 13)
+SPHERES = (Body((0.0, -50.0, 45.0), 25.0), Body((0.5, 49.0, 44.0), 26.0))
+SPACING = float(np.linalg.norm(np.subtract(SPHERES[0].point, SPHERES[1].point)))
+STANDARD = SphereStandard(diameters_mm=(50.0, 52.0), spacings_mm=(SPACING,))
+ALONG, ACROSS = Body((0.0, 2.0, 130.0), 110.0, (1.0, 0.02, -0.01)), Body((0.0, 0.0, 60.0), 30.0, (0.03, 1.0, 0.01))
+LEANING = Body((0.0, 0.0, 20.0), None, (0.6, 0.1, 1.0))
+KINDS = {
+    "spheres": (SPHERES, STANDARD),
+    "plane": ((LEANING,), PlaneStandard()),
+    "pipe along": ((ALONG,), Pipe(diameter_mm=220.0)),
+    "pipe across": ((ACROSS,), Pipe(diameter_mm=60.0)),
+}
+
+SLOPE_NAMES = [key.text for key in SLOPES]
+
+
+def parameters(**std):
+    """Everything as built and known, but for what ``std`` gives a standard uncertainty."""
+    nominal, pose = nominal_calibration(SENSOR), laser_pose(SENSOR)
+    window = nominal.window
+    normal = np.array(window.normal) / window.normal[2]
+    sheet = DescribedSheet(
+        pose.normal, pose.axis, camera_from_object(SENSOR)[:3, 3], pose.origin_mm, pose.origin_mm + 36.0 * pose.axis
+    )
+    known = {
+        "window_distance": window.distance_mm,
+        "window_slope_x": normal[0],
+        "window_slope_y": normal[1],
+        "glass_thickness": window.thickness_mm,
+        "glass_index": window.glass_index,
+        "index of water": WATER,
+        "sheet_turn_fan": 0.0,
+        "sheet_turn_axis": 0.0,
+        "sheet_offset": 0.0,
+        "stage_scale": 0.0,
+        "scan_slope_1": 0.0,
+        "scan_slope_2": 0.0,
+    }
+    priors = {parameter_of(text): Prior(value, std.get(text.replace(" ", "_"), 1e-9)) for text, value in known.items()}
+    camera = SENSOR.camera
+    intrinsics = Intrinsics(CameraOptions(), width_px=camera.width_px, height_px=camera.height_px)
+    found = Parameters(intrinsics, sheet, window, ("water",), priors)
+    return found, found.start(intrinsics.from_model(nominal.camera))
+
+
+def evidence_of(kind, *, stage_mm=STAGE, sizes_known=True, artefact=None, noise=NONE):
+    """Evidence as `surface_scan` makes it by the sensor as built and the stage as described, and its start."""
+    bodies, described = KINDS[kind]
+    stripes, _ = scan_of(SENSOR, bodies, artefact or described, stage_mm=stage_mm, count=700, noise=noise)
+    nominal = nominal_calibration(SENSOR)
+    return surface_scan(stripes, nominal, SENSOR, medium_index=WATER, sizes_known=sizes_known, image=0)
+
+
+def true_own(kind, evidence):
+    """The surface's local parameters and the positions' errors as the scan was made."""
+    frame, surface = camera_from_object(SENSOR), evidence.surface
+    points = np.array([body.point for body in KINDS[kind][0]]) @ frame[:3, :3].T + frame[:3, 3]
+    body = KINDS[kind][0][0]
+    match surface:
+        case Spheres():
+            local = np.append(points.ravel(), np.zeros(surface.count))
+        case Plane():
+            normal = frame[:3, :3] @ body.axis
+            normal /= surface.normal @ normal
+            distance = normal @ (points[0] - surface.point_mm) / np.linalg.norm(normal)
+            local = np.append(surface.across @ normal, distance)
+        case Cylinder():
+            axis = frame[:3, :3] @ body.axis
+            axis /= surface.axis @ axis
+            away = points[0] - surface.point_mm
+            local = np.concatenate(
+                [surface.across @ (away - axis * (surface.axis @ away)), surface.across @ axis, [0.0]]
+            )
+    return np.append(local, np.zeros(len(evidence.stage_mm)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differences_say(kind):
+    """Where residuals vanish, the scale of a residual does not matter; see the other evidence's test.
+
+    Crossings by Fermat are exact to 1e-9 mm, a hundred-millionth of a pixel's 0.2 mm.
+    """
+    model, global_values = parameters()
+    evidence, _ = evidence_of(kind, stage_mm=STAGE[::4])
+    local = true_own(kind, evidence)
+    for key, slope in zip(SLOPES, SLOPE, strict=True):
+        global_values[model.keys.index(key)] = slope
+    found = evidence.residuals(model, global_values, local)
+    assert sum(len(part.values) for part in found) > 300
+    assert max(np.abs(part.values).max() for part in found) < 1e-6
+    vector = np.concatenate([global_values, local])
+
+    def residuals(values):
+        parts = evidence.residuals(model, values[: len(global_values)], values[len(global_values) :])
+        return np.concatenate([part.values for part in parts])
+
+    analytic, row = np.zeros((len(evidence.pixels), len(vector))), 0
+    for part in found:
+        here = np.arange(row, row := row + len(part.values))
+        analytic[np.ix_(here, np.r_[: len(global_values), len(global_values) + part.local_columns])] = np.hstack(
+            [part.by_global, part.by_local]
+        )
+    for place, column in enumerate(analytic.T):
+        reach = 1e-6 * max(1.0, abs(vector[place]))
+        ahead, behind = vector.copy(), vector.copy()
+        ahead[place] += reach
+        behind[place] -= reach
+        numeric = (residuals(ahead) - residuals(behind)) / (2 * reach)
+        assert np.abs(column - numeric).max() <= 1e-4 * np.abs(numeric).max() + 1e-6, place
+
+
+def test_known_lengths_are_off_by_their_standard_uncertainties():
+    evidence, local = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
+    local = true_own("spheres", evidence)
+    assert evidence.known_lengths(local)[0] == pytest.approx([0.0], abs=1e-9)
+    local[3:6] += 0.03 * (local[3:6] - local[:3]) / SPACING
+    off, by_local = evidence.known_lengths(local)
+    assert off == pytest.approx([3.0])
+    for place, column in enumerate(by_local.T):
+        moved = local.copy()
+        moved[place] += 1e-4
+        assert evidence.known_lengths(moved)[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
+
+
+class _Held:
+    """Evidence that holds the lens where it is, so that a scan can be asked alone."""
+
+    def __init__(self, lens):
+        self._lens = lens
+
+    def local_std(self, *, alignment, position_mm):
+        return np.empty(0)
+
+    def residuals(self, parameters, global_values, local):
+        count = len(self._lens)
+        by_global = np.zeros((count, len(global_values)))
+        scale = 1e-6 * np.maximum(1e-3, np.abs(self._lens))
+        by_global[:, :count] = np.diag(1.0 / scale)
+        return [
+            Residuals(
+                STEP, (global_values[:count] - self._lens) / scale, by_global, np.empty((count, 0)), np.arange(0), 0
+            )
+        ]
+
+    def linearised(self, residuals, used):
+        return self
+
+
+def asked(found, **std):
+    """What scans alone say of the parameters that have a standard uncertainty: errors and stated uncertainties."""
+    model, global_values = parameters(**std)
+    lens = len(model.intrinsics.names)
+    evidence, local = zip(*found, strict=True)
+    result = estimate(
+        model,
+        [*evidence, _Held(global_values[:lens].copy())],
+        global_values,
+        [*local, np.empty(0)],
+        uncertainty=SENSOR.uncertainty,
+    )
+    true = dict(zip(model.keys, global_values, strict=True)) | dict(zip(SLOPES, SLOPE, strict=True))
+    values = dict(zip(model.keys, result.values, strict=True))
+    keys = {text: parameter_of(text) for text in (name.replace("_of_", " of ") for name in std)}
+    errors = {text: values[key] - true[key] for text, key in keys.items()}
+    return errors, {text: result.std()[key] for text, key in keys.items()}, result
+
+
+def noise(seed=8):
+    return Noise(stripe_px=0.02, rng=np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["sizes known", "sizes unknown"])
+def test_round_spheres_tell_the_stage_and_the_water(known):
+    standard = STANDARD.model_copy(update={"diameter_uncertainty_mm": 0.002})
+    scan = evidence_of("spheres", artefact=standard, sizes_known=known, noise=noise())
+    errors, std, result = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=2e-3)
+    for name, error in errors.items():
+        assert abs(error) < 4 * std[name], name
+        # That points on a sphere err together is stated, so that the uncertainty is far from what 0.02 px alone leave.
+        assert std[name] < 3e-3, name
+    assert np.abs(result.local[0][6:8]).max() < (0.01 if known else 0.1)
+    assert result.noise[Spheres.kind].besides > 10
+
+
+def test_a_known_spacing_is_a_length_in_water():
+    """Unknown diameters say nothing of the scale; the spacing does, to 0.005 mm in 62 mm or a ten-thousandth."""
+    std = {"index_of_water": 5e-3, "window_distance": 1.0, **dict.fromkeys(SLOPE_NAMES, 0.01)}
+    told = {}
+    for known in (True, False):
+        standard = STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.01})
+        scan = evidence_of("spheres", artefact=standard, sizes_known=known, noise=noise())
+        errors, told[known], result = asked([scan], **std)
+        assert abs(errors["index of water"]) < 4 * told[known]["index of water"]
+        apart = np.linalg.norm(np.diff(result.local[0][:6].reshape(2, 3), axis=0)) - SPACING
+        assert abs(apart) < (0.02 if known else 0.2)
+    assert told[True]["index of water"] < 0.95 * told[False]["index of water"]
+
+
+@pytest.mark.parametrize("kind", ["pipe along", "pipe across"])
+def test_a_pipe_of_known_diameter_tells_the_water(kind):
+    told = {}
+    for known in (True, False):
+        pipe = KINDS[kind][1].model_copy(update={"diameter_uncertainty_mm": 0.01})
+        scan = evidence_of(kind, artefact=pipe, sizes_known=known, noise=noise())
+        errors, told[known], _ = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=5e-3)
+        assert all(abs(errors[name]) < 4 * told[known][name] for name in errors)
+    # Along the stage every profile is the known circle, and the pipe slides on itself whatever way it moves. Across it
+    # the stage measures the width, so that the form tells the water nearly as well, and is round only for the stage's
+    # true direction.
+    better = told[True]["index of water"] / told[False]["index of water"]
+    towards_z = told[True][SLOPE_NAMES[1]] / 0.01
+    assert (better < 0.4 and towards_z > 0.9) if kind == "pipe along" else (better < 0.9 and towards_z < 0.7)
+
+
+def test_a_plane_tells_the_sheet_but_not_the_stage():
+    """Another direction of the stage shears what is measured, and a sheared plane is a plane: the priors stay.
+
+    A sheet that is turned distorts in perspective, which the leaning plane shows, as it crosses all depths.
+    """
+    scan = evidence_of("plane", stage_mm=np.linspace(-70, 70, 15), noise=noise())
+    errors, std, _ = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), sheet_turn_fan=0.05)
+    for name in SLOPE_NAMES:
+        assert std[name] == pytest.approx(0.01, rel=1e-3)
+        assert abs(errors[name] + SLOPE[SLOPE_NAMES.index(name)]) < 1e-3
+    assert std["sheet_turn_fan"] < 0.1 * 0.05
+    assert abs(errors["sheet_turn_fan"]) < 4 * std["sheet_turn_fan"]
+
+
+def test_all_kinds_together_with_a_target_in_water(thesis):
+    """By the whole procedure, from the sensor as its drawings say; the stage's direction goes into the calibration."""
+    drawn = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(5))
+    water = target_series(SENSOR, medium=0, positions=np.arange(6) * 30.0 - 100.0, noise=drawn, columns=15)
+    certified = {
+        "spheres": {"diameter_uncertainty_mm": 0.01, "spacing_uncertainty_mm": 0.01},
+        "plane": {},
+        "pipe along": {"diameter_uncertainty_mm": 0.02},
+    }
+    scans = [
+        scan_of(
+            SENSOR,
+            KINDS[kind][0],
+            KINDS[kind][1].model_copy(update=known),
+            stage_mm=STAGE,
+            count=700,
+            noise=drawn,
+            source=kind,
+        )[0]
+        for kind, known in certified.items()
+    ]
+    seen = replace(gathered(thesis, [water]), scans=scans)
+    result = solve_jointly(seen, options=CalibrationOptions(poses="stage", correct_circles=False))
+    assert result.warnings == []
+    found, std = result.estimate, result.estimate.std()
+    values = dict(zip(found.parameters.keys, found.values, strict=True))
+    camera = SENSOR.camera
+    true = {"f": camera.focal_length_px(), "window_distance": camera.window.distance_mm, "index of water": WATER}
+    assert max(abs(values[key] - true[key.text]) / std[key] for key in map(parameter_of, true)) < 4.5
+    for kind in (Spheres.kind, Plane.kind, Cylinder.kind):
+        assert found.noise[kind].sigma_px == pytest.approx(0.1, rel=0.1)
+    frame = result.calibration.object_transform()
+    moved, stage = stage_direction(SENSOR), result.calibration.stages[0]
+    assert stage.described == pytest.approx((1.0, 0.0, 0.0))
+    back = result.calibration.stage_direction_of((-1.0, 0.0, 0.0))
+    assert back == pytest.approx(-np.array(stage.direction))
+    assert result.calibration.stage_direction_of((0.0, 1.0, 0.0)) == (0.0, 1.0, 0.0)
+    slopes = [std[name] for name in SLOPES]
+    assert np.linalg.norm(frame[:3, :3] @ stage.direction - moved) < 4.5 * np.linalg.norm(slopes)
+    assert max(slopes) < 0.6 * np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
+    sources = {image.source.split(",")[0] for image in result.calibration.joint.images}
+    assert set(certified) < sources
+
+
+def test_scans_that_do_not_show_what_they_say_are_left_out():
+    bodies, plane = KINDS["plane"]
+    stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3], count=300)
+    wrong = replace(stripes, artefact=Pipe(diameter_mm=220.0), source="pipe.h5")
+    few = replace(
+        stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
+    )
+    found, warnings = surface_scans(
+        [wrong, few, stripes], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True
+    )
+    assert len(found) == 1
+    assert len(warnings) == 2
+    assert warnings[0].startswith("pipe.h5: left out, ")
+    assert "profile lines" in warnings[1]
+
+
+def test_scans_along_different_directions_are_refused():
+    bodies, plane = KINDS["plane"]
+    stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3])
+    other = replace(stripes, stage_direction=np.array([0.0, 1.0, 0.0]))
+    with pytest.raises(CalibrationError, match="different directions"):
+        surface_scans([stripes, other], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True)
+
+
+@pytest.mark.parametrize(
+    ("artefact", "pose", "error", "says"),
+    [
+        (None, None, DescriptionError, "does not say what it shows"),
+        ({"kind": "step", "height_mm": 20.0}, None, DescriptionError, "shows a step"),
+        ({"kind": "pipe"}, None, DescriptionError, "diameter_mm"),
+        ({"kind": "plane"}, None, CaptureError, "no stripe"),
+        ({"kind": "plane"}, np.eye(4), CalibrationError, "carry poses"),
+    ],
+)
+def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, pose, error, says):
+    header = CaptureHeader(
+        name="scan",
+        sensor=SENSOR,
+        medium_name="water",
+        medium=Medium(kind="custom", index=WATER),
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+        artefact=artefact,
+    )
+    path = tmp_path / "scan.h5"
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        image = np.zeros((SENSOR.camera.height_px, SENSOR.camera.width_px), dtype=np.uint8)
+        writer.append(Frame(image, 0.0, True, 1.0, 0.0, pose))
+    with Capture(path) as capture, pytest.raises(error, match=says):
+        scan_stripes(capture, VIEW, stripe=CalibrationOptions().stripe)

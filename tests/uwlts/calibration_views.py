@@ -1,0 +1,135 @@
+"""A sensor's views for the calibration tests, made without the sensor's software: NumPy, Fermat's principle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.oracles.fermat import directions_seen, plate
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.library import find, read_table
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Sensor
+
+STEP_MM = 23.17
+WATER = 1.3312
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Pinhole with radial distortion, as the thesis calibrates it."""
+
+    f: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+
+    def pixels(self, rays):
+        x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+        square = x**2 + y**2
+        radial = 1 + self.k1 * square + self.k2 * square**2
+        return np.column_stack([self.f * x * radial + self.cx, self.f * y * radial + self.cy])
+
+
+def built_sensor() -> Sensor:
+    """The thesis's sensor with the deviations from its drawings that real ones have."""
+    return Sensor.model_validate(read_table(find("thesis-as-built", "sensors"), "sensors"))
+
+
+def lens_of(sensor: Sensor) -> Lens:
+    camera = sensor.camera
+    return Lens(camera.focal_length_px(), *camera.principal_point(), camera.distortion.k1, camera.distortion.k2)
+
+
+def inside(pixels, sensor: Sensor):
+    """Pixels (N, 2) in the image: (N,) bool."""
+    return ((pixels >= 0) & (pixels <= [sensor.camera.width_px - 1, sensor.camera.height_px - 1])).all(axis=1)
+
+
+def lattice(columns=25, rows=25):
+    """The thesis's circle centres (N, 3) in mm, target frame, origin in the middle."""
+    x, y = np.meshgrid(np.arange(columns) - columns // 2, np.arange(rows) - rows // 2)
+    return np.column_stack([9.375 * x.ravel(), 9.372 * y.ravel(), np.zeros(x.size)])
+
+
+def turn(x=0.0, y=0.0, z=0.0):
+    """Rotation by angles in rad about the three axes, x first."""
+    (cx, sx), (cy, sy), (cz, sz) = ((np.cos(a), np.sin(a)) for a in (x, y, z))
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]]) @ about_y @ about_x
+
+
+def stage_images(
+    sensor, *, positions=np.arange(31) * 10.0, stage_tilt=(0.0, 0.0), noise_px=0.0, rng=None, points=None, spin=0.02
+):
+    """The thesis's target images in air and the true ``T_camera_target`` of each.
+
+    The target faces the laser, spun a little; the stage carries the sensor along the target's normal, tilted by
+    ``stage_tilt`` in the target's frame, towards the target.
+    """
+    lens, points = lens_of(sensor), lattice() if points is None else points
+    rotation = camera_from_object(sensor)[:3, :3] @ turn(0.004, -0.007, np.pi / 2 + spin)
+    direction = rotation @ np.array([*stage_tilt, 1.0]) / np.linalg.norm([*stage_tilt, 1.0])
+    frame = camera_from_object(sensor)
+    middle = frame[:3, 3] + 60.0 * frame[:3, 2]
+    images, poses = [], []
+    for position in positions:
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = middle - (position - positions.mean()) * direction
+        seen = lens.pixels(points @ rotation.T + pose[:3, 3])
+        here = inside(seen, sensor)
+        pixels = seen[here] + (rng.normal(0, noise_px, (here.sum(), 2)) if noise_px else 0.0)
+        images.append(TargetImage(points[here], pixels, float(position)))
+        poses.append(pose)
+    return images, np.array(poses), direction
+
+
+def stripes_on_target(sensor, poses, *, count=1280, noise_px=0.0, rng=None):
+    """Stripe pixels of each image: the sheet's line on the target, as far as the fan and the image reach."""
+    lens, laser = lens_of(sensor), laser_pose(sensor)
+    stripes = []
+    for pose in poses:
+        normal, origin = pose[:3, 2], pose[:3, 3]
+        angle = np.linspace(-1, 1, count) * np.radians(sensor.laser.fan_angle_deg / 2)
+        rays = np.cos(angle)[:, None] * laser.axis + np.sin(angle)[:, None] * laser.fan
+        points = laser.origin_mm + rays * ((normal @ (origin - laser.origin_mm)) / (rays @ normal))[:, None]
+        pixels = lens.pixels(points)
+        pixels = pixels[inside(pixels, sensor)]
+        if noise_px:
+            pixels = pixels + np.column_stack([np.zeros(len(pixels)), rng.normal(0, noise_px, len(pixels))])
+        stripes.append(pixels)
+    return stripes
+
+
+def step_profile(depth_mm, *, shift_mm=0.0, tilt=0.0, height_mm=STEP_MM, count=1280):
+    """Points (N, 3) in the OCS of base, block, base at a depth, the block nearer by the height, tilted about X."""
+    along = np.linspace(-75, 75, count)
+    up = np.where(np.abs(along - shift_mm) < 30, -height_mm, 0.0)
+    y, z = np.cos(tilt) * along - np.sin(tilt) * up, np.sin(tilt) * along + np.cos(tilt) * up
+    return np.column_stack([np.zeros(count), y, depth_mm + z])
+
+
+def nine_steps(*, count=1280):
+    """The thesis's nine poses of the step standard: three near, three at the stand-off, three far; OCS."""
+    return [
+        step_profile(depth, shift_mm=shift, tilt=tilt, count=count)
+        for depth in (-50.0, 15.0, 90.0)
+        for shift, tilt in ((-15.0, 0.01), (0.0, -0.02), (12.0, 0.03))
+    ]
+
+
+def through_window(sensor, points_object, *, index=WATER, refractions=2, noise_px=0.0, rng=None):
+    """Pixels of points in the OCS seen through the sensor's window, by least optical length."""
+    window, frame = sensor.camera.window, camera_from_object(sensor)
+    faces = plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
+    indices = [1.0, window.index(sensor.laser.wavelength_nm), index]
+    if refractions == 1:
+        faces, indices = faces[:1], [1.0, index]
+    rays = directions_seen(points_object @ frame[:3, :3].T + frame[:3, 3], faces, indices)
+    pixels = lens_of(sensor).pixels(rays)
+    pixels = pixels[inside(pixels, sensor)]
+    if noise_px:
+        pixels = pixels + np.column_stack([np.zeros(len(pixels)), rng.normal(0, noise_px, len(pixels))])
+    return pixels

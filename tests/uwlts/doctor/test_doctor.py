@@ -1,0 +1,391 @@
+"""What `uwlts doctor` finds, each time in a condition that really holds: nothing of the machine is replaced."""
+
+import os
+import re
+import resource
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from packaging.requirements import Requirement
+
+from twin.devices.grbl_controller import BENCH_SETTINGS, GrblController
+from uwlts.doctor import devices, libraries, machine
+from uwlts.doctor.machine import Finding, examine_renderer
+
+ROOT = Path(__file__).resolve().parents[3]
+NOBODY = 65534
+
+
+def doctor(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "uwlts.cli", "doctor", *arguments]
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def as_nobody(program: str) -> str:
+    """What a program prints that gives up the rights of an administrator once it has imported what it needs."""
+    start = f"""
+        import os, tempfile
+        from pathlib import Path
+        from uwlts.doctor.devices import examine_ports
+        from uwlts.doctor.machine import examine_folder
+        if os.geteuid() == 0:
+            os.setgroups([])
+            os.setresgid({NOBODY}, {NOBODY}, {NOBODY})
+            os.setresuid({NOBODY}, {NOBODY}, {NOBODY})
+    """
+    command = [sys.executable, "-c", textwrap.dedent(start) + textwrap.dedent(program)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+# The command
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess:
+    return doctor(folder=tmp_path_factory.mktemp("empty"))
+
+
+def test_a_machine_on_which_the_tests_run_lacks_nothing_required(whole):
+    assert whole.returncode == 0, whole.stdout + whole.stderr
+    assert whole.stderr == ""
+    assert "nothing that is required is missing" in whole.stdout
+    devices_of_all = ("Aravis", "camera", "GenTL producer", "serial port")
+    for subject in (
+        "Python",
+        "required libraries",
+        "libLLVM",
+        "folder",
+        "network buffer",
+        "computer",
+        "clock",
+        *devices_of_all,
+    ):
+        assert re.search(rf"^ ?(ok|warning) +{subject}", whole.stdout, re.MULTILINE), subject
+
+
+def test_a_broken_library_ends_in_exit_code_1_without_a_traceback(tmp_path):
+    (tmp_path / "numpy").mkdir()
+    (tmp_path / "numpy" / "__init__.py").write_text("raise ImportError('truncated on the way')\n")
+    ended = doctor(folder=tmp_path, PYTHONPATH=f"{tmp_path}:{ROOT}")
+    assert ended.returncode == 1
+    assert "Traceback" not in ended.stdout + ended.stderr
+    said = re.sub(r"\s+", " ", ended.stdout)
+    assert re.search(r"missing numpy \S+ does not load: ImportError: truncated on the way", said)
+    # The cameras cannot be examined without it; the ports below them are.
+    assert "a part was left out: truncated on the way" in said and "serial port" in said
+    assert re.search(r"--force-reinstall --no-deps 'numpy>=.*'$", ended.stdout, re.M)
+
+
+def test_devices_that_are_named_and_missing_end_in_exit_code_1(tmp_path):
+    ended = doctor("--camera", "replay:nothing", "--stage", str(tmp_path / "tty"), folder=tmp_path)
+    assert ended.returncode == 1 and ended.stderr == ""
+    assert "missing: camera, stage; " in ended.stdout
+    assert "there is no such port" in re.sub(r"\s+", " ", ended.stdout)
+
+
+# Libraries
+
+
+def test_python_is_compared_with_what_is_required():
+    assert libraries.examine_python(">=3.11").status == "ok"
+    too_old = libraries.examine_python(">=99")
+    assert too_old.status == "missing" and "needed is >=99" in too_old.found and "install Python" in too_old.advice
+
+
+def test_the_requirements_are_the_projects_own():
+    python, required, extras = libraries.project_requirements()
+    assert python == ">=3.11"
+    assert {"numpy", "rich", "optuna"} <= {Requirement(line).name for line in required}
+    assert "dask" in {Requirement(line).name for line in extras}
+
+
+def test_an_installed_package_tells_its_requirements_without_a_checkout(tmp_path):
+    for source in [
+        ROOT / "uwlts" / "__init__.py",
+        *(ROOT / "uwlts" / "doctor").glob("*.py"),
+        ROOT / "uwlts/model/errors.py",
+    ]:
+        copy = tmp_path / source.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(source.read_bytes())
+    (tmp_path / "uwlts-9.dist-info").mkdir()
+    (tmp_path / "uwlts-9.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.4\nName: uwlts\nVersion: 9\nRequires-Python: >=3.11\nRequires-Dist: numpy>=2\n"
+        "Requires-Dist: winonly; sys_platform == 'win32'\nRequires-Dist: laspy>=2; extra == 'cloud'\n"
+    )
+    program = "from uwlts.doctor import libraries; print(libraries.project_requirements())"
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert ended.stdout.strip() == "('>=3.11', ['numpy>=2'], ['winonly', 'laspy>=2'])"
+
+
+def test_every_kind_of_missing_library_is_named():
+    found = libraries.examine_required(["numpy>=2", "pydantic>=999", "no-such-library-of-ours>=1"])
+    version = metadata.version("pydantic")
+    assert [each.status for each in found] == ["ok", "missing", "missing"]
+    assert found[0].found == f"numpy {metadata.version('numpy')}"
+    assert found[1].found == f"{version} is installed, >=999 is needed"
+    assert found[1].advice.endswith("-m pip install 'pydantic>=999'")
+    assert found[2].found == "not installed"
+
+
+def test_a_library_that_ends_the_process_is_named_and_the_others_are_still_tried(tmp_path, monkeypatch):
+    (tmp_path / "rich.py").write_text("import os; os.abort()\n")
+    (tmp_path / "plotly.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    found = {each.subject: each for each in libraries.examine_required(["rich", "jinja2", "plotly", "tomli-w"])}
+    assert found["rich"].found.endswith("does not load: the process ended with status -6")
+    assert found["plotly"].found.endswith("does not load: OSError: libGL.so.1: cannot open shared object file")
+    assert re.fullmatch(r"jinja2 \S+, tomli-w \S+", found["required libraries"].found)
+
+
+def test_a_missing_optional_library_is_a_warning_that_says_what_for():
+    purposes = {"no-such-library-of-ours": "clouds as XYZ", "Pytest": "tests"}
+    missing, there = libraries.examine_optional(purposes, requirements=["no-such-library-of-ours>=2", "pytest>=8"])
+    assert missing.status == "warning" and missing.found == "not installed"
+    assert "only for clouds as XYZ" in missing.advice and "'no-such-library-of-ours>=2'" in missing.advice
+    assert there == Finding("Pytest", "ok", f"{metadata.version('pytest')}, for tests")
+    old = libraries.examine_optional({"pytest": "tests"}, requirements=["pytest>=999"])[0]
+    assert old.status == "warning" and ">=999 is needed" in old.found
+
+
+def test_a_libllvm_that_is_none_is_a_warning_with_the_command_that_gets_one(tmp_path, monkeypatch):
+    (tmp_path / "libLLVM.so").write_text("not a library")
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "libLLVM.so"))
+    (finding,) = examine_renderer()
+    assert finding.status == "warning" and str(tmp_path) in finding.found
+    assert finding.advice.endswith("-m twin.backend.llvm --install")
+
+
+# The machine
+
+
+def test_a_folder_is_measured_and_left_as_it_was(tmp_path):
+    finding = machine.examine_folder(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    frames, megabytes = map(int, re.match(r".* takes (\d+) frames/s .*\((\d+) MB/s\)", finding.found).groups())
+    # Both are rounded to whole numbers.
+    assert abs(frames * 1.31072 - megabytes) <= 0.5 * 1.31072 + 0.5
+    assert frames > 0 and (finding.status == "ok") == (finding.advice == "")
+
+
+def test_a_folder_that_cannot_be_written_to_is_a_warning(tmp_path):
+    assert "No such file or directory" in machine.examine_folder(tmp_path / "none").found
+    program = """
+        folder = Path(tempfile.mkdtemp())
+        folder.chmod(0o500)
+        print(examine_folder(folder))
+        folder.rmdir()
+    """
+    assert re.search(r"'warning', found='/\S+ cannot be written to: Permission denied'", as_nobody(program))
+
+
+def test_a_disk_that_takes_no_more_is_a_warning(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # The kernel's limit for one file stands for a quota: writing fails on the way.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000_000, before[1]))
+    try:
+        finding = machine.examine_folder(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert finding.status == "warning" and "File too large" in finding.found
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("content", "status"), [("212992\n", "warning"), ("1310720\n", "ok"), ("x", "warning")])
+def test_the_network_buffer_must_hold_a_frame(tmp_path, content, status):
+    (tmp_path / "rmem_max").write_text(content)
+    finding = machine.examine_buffer(tmp_path / "rmem_max")
+    assert finding.status == status
+    assert ("sudo sysctl -w net.core.rmem_max=" in finding.advice) == (content == "212992\n")
+
+
+def test_this_machines_buffer_processors_and_memory_are_read():
+    allowed = Path("/proc/sys/net/core/rmem_max").read_text().strip()
+    assert f" {allowed} bytes" in machine.examine_buffer().found
+    kib = int(re.search(r"MemTotal: +(\d+) kB", Path("/proc/meminfo").read_text())[1])
+    found = machine.examine_computer().found
+    assert found.startswith(f"{len(os.sched_getaffinity(0))} processors")
+    assert found.endswith(f"{kib * 1024 / 1e9:.0f} GB of memory")
+
+
+def test_a_clock_behind_the_softwares_own_files_is_a_warning(tmp_path):
+    (tmp_path / "newest.py").touch()
+    assert machine.examine_clock(tmp_path).status == "ok"
+    later = time.time() + 86400
+    os.utime(tmp_path / "newest.py", (later, later))
+    finding = machine.examine_clock(tmp_path)
+    assert finding.status == "warning" and "set-ntp" in finding.advice
+
+
+# Devices
+
+
+def test_an_aravis_that_does_not_load_is_a_warning_that_says_how_to_get_it(tmp_path):
+    (tmp_path / "libaravis.so").write_text("not a library")
+    program = "from uwlts.doctor.devices import examine_cameras; print(*examine_cameras(), sep='\\n')"
+    ended = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        env=os.environ | {"UWLTS_LIBARAVIS": str(tmp_path / "libaravis.so")},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ended.stdout.count("Finding(") == 1 and "status='warning'" in ended.stdout
+    assert str(tmp_path) in ended.stdout and "apt-get install libaravis" in ended.stdout
+
+
+def test_producers_are_judged_by_their_kind():
+    simulated = Path(find_spec("genicam").origin).parent
+    assert devices.examine_producers(str(simulated))[0] == Finding(
+        "GenTL producer", "ok", f"genicam:{simulated / 'viky.cti'}"
+    )
+
+
+def test_producers_that_are_not_there_or_for_another_machine_are_warnings(tmp_path, monkeypatch):
+    (tmp_path / "text.cti").write_text("not a library")
+    (tmp_path / "empty").mkdir()
+    whole = Path(sys.executable).resolve().read_bytes()[:20]
+    foreign = bytearray(whole)
+    foreign[18] ^= 0xFF
+    (tmp_path / "other.cti").write_bytes(foreign)
+    found = devices.examine_producers(f"{tmp_path}:{tmp_path / 'empty'}:{tmp_path / 'none'}")
+    assert [each.status for each in found] == ["warning"] * 4
+    said = [each.found.removeprefix(str(tmp_path)) for each in found]
+    assert said == [
+        "/other.cti is no library for this machine",
+        "/text.cti is no library for this machine",
+        "/empty holds no producer (*.cti)",
+        "/none is no folder",
+    ]
+    monkeypatch.delenv(devices.PRODUCERS, raising=False)
+    assert "is not set" in devices.examine_producers()[0].found
+
+
+def test_a_port_that_this_user_may_not_open_is_a_warning_with_the_command():
+    # A terminal like the ports of a stage: root's, open to a group that nobody is in.
+    program = """
+        port = os.ttyname(os.openpty()[1])
+        print(examine_ports([port])[0])
+        os.chmod(port, 0o060)
+        print(examine_ports([port])[0])
+        os.chmod(port, 0o000)
+        print(examine_ports([port])[0])
+    """
+    usable, of_a_group, of_none = as_nobody(program).splitlines()
+    assert "status='ok'" in usable
+    assert "status='warning'" in of_a_group and re.search(r"sudo usermod -aG \w+ \$USER", of_a_group)
+    assert "status='warning'" in of_none and "sudo chgrp dialout /dev/pts/" in of_none
+
+
+def test_a_port_that_is_gone_is_a_warning():
+    assert devices.examine_ports(["/dev/ttyNone"])[0].found == "/dev/ttyNone is not there"
+    assert devices.examine_ports([])[0].found == "none"
+
+
+# A camera
+
+
+def images(folder: Path, grey: int, count: int = 12) -> str:
+    folder.mkdir()
+    for number in range(count):
+        assert cv2.imwrite(str(folder / f"{number}.png"), np.full((48, 64), grey, np.uint8))
+    return f"replay:{folder}"
+
+
+def test_ten_frames_are_taken_and_judged(tmp_path):
+    (good,) = devices.try_camera(images(tmp_path / "good", 51))
+    assert good.status == "ok" and "64 x 48 px of 8 bit" in good.found
+    # 51 of 255.
+    assert "10 frames" in good.found and good.found.endswith("mean grey value 20.0 % of full scale")
+    (white,) = devices.try_camera(images(tmp_path / "white", 255))
+    assert white.status == "warning" and "saturated" in white.advice
+    (black,) = devices.try_camera(images(tmp_path / "black", 0))
+    assert black.status == "warning" and "lens cap" in black.advice
+
+
+def test_a_camera_that_does_not_give_ten_frames_is_missing(tmp_path):
+    (short,) = devices.try_camera(images(tmp_path / "few", 51, count=9))
+    assert short.status == "missing" and "all 9 images" in short.found
+    (unknown,) = devices.try_camera("webcam:0")
+    assert unknown.status == "missing" and "is not the address of a camera" in unknown.found
+    assert "genicam:PRODUCER.cti" in unknown.advice
+
+
+# A stage
+
+
+@contextmanager
+def unmoved(**options: object) -> Iterator[GrblController]:
+    """A controller, of which it is seen that the stage stays where it was and the laser dark."""
+    with GrblController(position_mm=30.0, boot_s=0.1, **options) as controller:
+        yield controller
+        state = controller.state()
+        assert (state.position_mm, state.moving, state.laser_on) == (30.0, False, False)
+
+
+def test_the_settings_are_those_of_the_documentation():
+    text = (ROOT / "docs" / "hardware-stage.md").read_text()
+    rows = [line for line in text.splitlines() if line.startswith("| `$")]
+    documented = {int(number): float(value) for row in rows for number, value in re.findall(r"`\$(\d+)=(\d+)`", row)}
+    assert len(documented) > 15
+    examined = {number: value for number, (value, _) in devices.BEHAVIOUR.items()} | devices.MECHANICS
+    assert examined == documented
+    assert devices.judge_settings(BENCH_SETTINGS)[0].status == "ok"
+
+
+def test_a_stage_as_documented_is_in_order():
+    with unmoved() as controller:
+        build, settings, state = devices.try_stage(controller.port)
+    assert build.found == f"{controller.port}: Grbl 1.1h, options V"
+    assert [each.status for each in (build, settings, state)] == ["ok"] * 3
+    assert state.found == "locked until it is homed, as after every start"
+
+
+def test_settings_that_contradict_the_documentation_are_named():
+    with unmoved(settings={1: 25, 32: 0, 100: 250}) as controller:
+        _, behaviour, mechanics, _ = devices.try_stage(controller.port)
+    assert behaviour.status == mechanics.status == "warning"
+    assert behaviour.found.startswith("$1 is 25, not 255") and "$32 is 0, not 1" in behaviour.found
+    assert behaviour.advice.endswith(": $1=255 $32=1")
+    assert mechanics.found.endswith(": $100 is 250") and mechanics.advice.endswith("$100=80")
+
+
+def test_a_stage_without_a_switch_is_told_what_that_means():
+    with unmoved(settings={20: 0, 22: 0}) as controller:
+        _, settings, state = devices.try_stage(controller.port)
+    assert "without a limit switch" in settings.advice
+    assert (state.status, state.found) == ("ok", "idle")
+
+
+def test_an_alarm_silence_and_a_firmware_that_cannot_switch_the_laser_are_missing():
+    with unmoved(options="") as controller:
+        assert "without V" in devices.try_stage(controller.port)[0].found
+    with unmoved() as controller:
+        controller.mute()
+        (silent,) = devices.try_stage(controller.port)
+    assert silent.status == "missing" and "nothing answers" in silent.found
+    assert "docs/hardware-stage.md" in silent.advice
+
+
+def test_a_pressed_switch_is_a_warning():
+    with GrblController(position_mm=-0.1, boot_s=0.1) as controller:
+        state = devices.try_stage(controller.port)[-1]
+    assert state.status == "warning" and "X are active" in state.found and "limit switch is pressed" in state.advice

@@ -1,0 +1,288 @@
+"""Frame check, addresses, replay, and cameras by a GenTL producer.
+
+`viky.cti`, a simulated camera that comes with genicam, stands for a camera maker's producer: a real one of its kind,
+but without exposure, gain and trigger.
+"""
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import genicam
+import numpy as np
+import pytest
+
+from uwlts.hardware.camera import Camera, FrameCheck, FrameCounts, FrameStatus, Region
+from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.replay import ReplayCamera
+from uwlts.model.errors import HardwareError, ImageError, SetupError
+from uwlts.model.sensor import Sensor
+from uwlts.runtime import aravis_library
+from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+
+PRODUCER = Path(genicam.__file__).with_name("viky.cti")
+SHORT, DUPLICATED, DROPPED, LATE, OK = FrameStatus
+
+
+def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | None = None):
+    """Status of each (number, time, complete), and the counts."""
+    check = FrameCheck(period_s=period_s)
+    statuses = [check.judge(frame_id=number, time_s=at, complete=whole) for number, at, whole in frames]
+    return statuses, check.counts
+
+
+@pytest.mark.parametrize(
+    ("frames", "statuses", "counts"),
+    [
+        ([(7, 0.0, True), (8, 0.1, True), (9, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
+        ([(1, 0.0, True), (4, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2)),
+        ([(1, 0.0, True), (2, 0.1, False), (3, 0.2, True)], [OK, SHORT, OK], FrameCounts(ok=2, short=1)),
+        ([(1, 0.0, True), (3, 0.2, False)], [OK, SHORT], FrameCounts(ok=1, short=1, dropped=1)),
+        ([(1, 0.0, True), (1, 0.1, True)], [OK, DUPLICATED], FrameCounts(ok=1, duplicated=1)),
+        ([(1, 0.0, True), (2, 0.0, True)], [OK, DUPLICATED], FrameCounts(ok=1, duplicated=1)),
+        ([(5, 0.5, True), (4, 0.4, True), (6, 0.6, True)], [OK, LATE, OK], FrameCounts(ok=2, late=1)),
+        ([(1, 0.0, True), (2, 0.21, True)], [OK, LATE], FrameCounts(ok=1, late=1)),
+        ([(1, 0.0, True), (2, 0.19, True)], [OK, OK], FrameCounts(ok=2)),
+        # Numbers of 16 bits begin anew, at 1 or at 0.
+        ([(65535, 0.0, True), (1, 0.1, True), (2, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
+        ([(65535, 0.0, True), (0, 0.1, True), (1, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
+        ([(65534, 0.0, True), (2, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2)),
+        ([(65535, 0.0, True), (65536, 0.1, True)], [OK, OK], FrameCounts(ok=2)),
+    ],
+)
+def test_each_fault_has_its_name_and_is_counted(frames, statuses, counts):
+    assert judged(frames, period_s=0.1) == (statuses, counts)
+
+
+def test_without_a_period_or_time_stamps_nothing_is_late_or_equal():
+    assert judged([(1, 0.0, True), (2, 99.0, True)])[0] == [OK, OK]
+    assert judged([(1, None, True), (2, None, True)], period_s=0.1)[0] == [OK, OK]
+
+
+def test_after_an_unanswered_trigger_the_count_may_begin_anew():
+    check = FrameCheck()
+    check.judge(frame_id=8, time_s=1.0, complete=True)
+    check.missed()
+    assert check.judge(frame_id=1, time_s=2.0, complete=True) is OK
+    assert check.counts == FrameCounts(ok=2, unanswered=1)
+
+
+@pytest.mark.parametrize("address", ["", "gige", "usb:1", "genicam:", "replay:", "0"])
+def test_an_unknown_address_lists_the_known_ones(address):
+    with pytest.raises(HardwareError, match=r"(?s)not the address of a camera.*gige:NAME.*genicam:.*replay:PATH"):
+        open_camera(address)
+
+
+def pictures(folder: Path, count: int, *, suffix: str = ".png", kind: type = np.uint8) -> Path:
+    """A folder of images that hold their number; sorted as texts 10 would come before 2."""
+    folder.mkdir()
+    for number in range(count):
+        image = np.arange(24 * 32, dtype=kind).reshape(24, 32) % 251
+        image[0, 0] = number
+        assert cv2.imwrite(str(folder / f"image-{number}{suffix}"), image)
+    return folder
+
+
+def first_pixels(camera: Camera, count: int) -> list[int]:
+    return [int(camera.grab(1.0).image[0, 0]) for _ in range(count)]
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [(".png", np.uint8), (".tif", np.uint16), (".BMP", np.uint8)])
+def test_a_folder_is_shown_in_the_order_of_its_numbers(tmp_path, suffix, kind):
+    folder = pictures(tmp_path / "f", 12, suffix=suffix, kind=kind)
+    (folder / "notes.txt").write_text("no image")
+    with open_camera(f"replay:{folder}") as camera:
+        assert (camera.info.width_px, camera.info.height_px, camera.info.bits) == (32, 24, 8 * np.dtype(kind).itemsize)
+        assert camera.configure(exposure_ms=4.0).exposure_ms == 4.0
+        camera.start()
+        frame = camera.grab(1.0)
+        assert frame.image.dtype == kind and frame.exposure_ms == 4.0
+        assert first_pixels(camera, 11) == list(range(1, 12))
+        with pytest.raises(HardwareError, match="all 12 images of .* have been shown"):
+            camera.grab(1.0)
+        assert camera.counts == FrameCounts(ok=12)
+
+
+def test_a_replay_can_be_repeated_triggered_and_cut(tmp_path):
+    with ReplayCamera(pictures(tmp_path / "f", 3), repeat=True) as camera:
+        settings = camera.configure(trigger="software", region=Region(0, 0, 8, 4))
+        assert (settings.frame_rate_hz, settings.exposure_ms, settings.gain_db) == (None, None, None)
+        camera.start()
+        with pytest.raises(HardwareError, match="did not answer a trigger within 0.01 s"):
+            camera.grab(0.01)
+        for expected in (0, 1, 2, 0):
+            camera.trigger()
+            frame = camera.grab(1.0)
+            assert frame.image.shape == (4, 8) and frame.image[0, 0] == expected
+        assert camera.counts == FrameCounts(ok=4, unanswered=1)
+
+
+def test_a_frame_nobody_fetched_is_thrown_away_by_the_next_trigger(tmp_path):
+    with ReplayCamera(pictures(tmp_path / "f", 3)) as camera:
+        camera.configure(trigger="software")
+        camera.start()
+        camera.trigger()
+        camera.trigger()
+        assert first_pixels(camera, 1) == [1]
+        assert camera.counts == FrameCounts(ok=1, late=1)
+
+
+def test_a_replay_keeps_its_frame_rate_and_drops_what_a_slow_program_leaves(tmp_path):
+    with ReplayCamera(pictures(tmp_path / "f", 3), repeat=True) as camera:
+        assert camera.configure(frame_rate_hz=200).frame_rate_hz == 200
+        camera.start(faults="skip")
+        began = time.monotonic()
+        frames = [camera.grab(1.0) for _ in range(20)]
+        # The first comes at once, the last 19 periods later.
+        assert time.monotonic() - began >= 19 / 200 - 1e-3
+        assert np.allclose(np.diff([frame.time_s for frame in frames]), 1 / 200, atol=1e-9)
+        assert camera.counts.dropped == 0
+        # 32 frames wait in the buffers, all later ones are lost.
+        time.sleep(0.5)
+        assert camera.grab(1.0).status is DROPPED
+        assert camera.counts.dropped >= 0.5 * 200 - 32 - 2
+        camera.stop()
+        camera.start()
+        camera.grab(1.0)
+        time.sleep(0.5)
+        with pytest.raises(HardwareError, match="frames before it were dropped"):
+            for _ in range(5):
+                camera.grab(1.0)
+
+
+def test_a_capture_is_shown_with_its_exposures(tmp_path, thesis: Sensor):
+    small = thesis.camera.model_copy(update={"width_px": 32, "height_px": 16})
+    header = CaptureHeader(
+        name="small",
+        sensor=thesis.model_copy(update={"camera": small}),
+        medium_name="air",
+        medium=thesis.medium("air"),
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+    )
+    path = tmp_path / "small.h5"
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        for number in range(3):
+            writer.append(Frame(np.full((16, 32), number, np.uint8), 0.0, True, 2.0 + number, float(number)))
+    with open_camera(f"replay:{path}") as camera:
+        assert (camera.info.width_px, camera.info.height_px, camera.info.bits) == (32, 16, thesis.detector.bits)
+        assert camera.configure(exposure_ms=9.0).exposure_ms == 2.0
+        camera.start()
+        frames = [camera.grab(1.0) for _ in range(3)]
+    assert [frame.exposure_ms for frame in frames] == [2.0, 3.0, 4.0]
+    assert [int(frame.image[0, 0]) for frame in frames] == [0, 1, 2]
+
+
+def test_what_cannot_be_replayed_is_said(tmp_path):
+    with pytest.raises(HardwareError, match="no folder of images and no capture"):
+        open_camera(f"replay:{tmp_path / 'missing'}")
+    with pytest.raises(HardwareError, match="holds no image"):
+        open_camera(f"replay:{tmp_path}")
+    folder = pictures(tmp_path / "f", 2)
+    (folder / "image-1.png").write_bytes((folder / "image-1.png").read_bytes()[:40])
+    with ReplayCamera(folder) as camera:
+        for wish, message in (
+            ({"trigger": "line"}, "no trigger input"),
+            ({"bits": 12}, "images of 8 bits, not 12"),
+            ({"gain_db": 3.0}, "has no gain"),
+            ({"exposure_ms": 0.0}, "exposure_ms is 0.0: it must be positive"),
+            ({"region": Region(30, 0, 3, 3)}, "not within the image sensor of 32 x 24 px"),
+        ):
+            with pytest.raises(HardwareError, match=message):
+                camera.configure(**wish)
+        camera.configure()
+        camera.start()
+        camera.grab(1.0)
+        with pytest.raises(ImageError, match="image-1.png is a PNG file that is truncated"):
+            camera.grab(1.0)
+    cv2.imwrite(str(folder / "image-1.png"), np.zeros((24, 31), np.uint8))
+    with ReplayCamera(folder) as camera:
+        camera.configure()
+        camera.start()
+        camera.grab(1.0)
+        with pytest.raises(ImageError, match="image 1 .* has 31 x 24 px of uint8, the first one 32 x 24"):
+            camera.grab(1.0)
+    cv2.imwrite(str(folder / "image-0.png"), np.zeros((24, 32, 3), np.uint8))
+    with pytest.raises(ImageError, match="expected a grey image"):
+        open_camera(f"replay:{folder}")
+
+
+def test_calls_in_the_wrong_order_are_refused(tmp_path):
+    camera = ReplayCamera(pictures(tmp_path / "f", 2))
+    for call, message in ((camera.configure, "call open"), (camera.start, "call configure")):
+        with pytest.raises(HardwareError, match=message):
+            call()
+    with pytest.raises(HardwareError, match="call start"):
+        camera.grab(1.0)
+    with camera:
+        camera.configure()
+        camera.start()
+        for call, message in (
+            (camera.configure, "call stop"),
+            (camera.start, "running already"),
+            (camera.trigger, "trigger 'free'"),
+        ):
+            with pytest.raises(HardwareError, match=message):
+                call()
+        camera.stop()
+        camera.stop()
+    camera.close()
+    with pytest.raises(HardwareError, match="call open"):
+        _ = camera.info
+
+
+def test_a_camera_by_a_gentl_producer():
+    with open_camera(f"genicam:{PRODUCER}:1") as camera:
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        assert (camera.info.name, camera.info.serial) == ("Machine Vision Games Ltd. Viky", "1")
+        assert (camera.info.width_px, camera.info.height_px, camera.info.bits) == (800, 800, 8)
+        settings = camera.configure(region=Region(0, 0, 320, 200), frame_rate_hz=100)
+        assert settings.region == Region(0, 0, 320, 200) and settings.bits == 8
+        assert settings.frame_rate_hz == pytest.approx(100)
+        assert settings.exposure_ms is None and settings.gain_db is None
+        camera.start()
+        frames = [camera.grab(2.0) for _ in range(5)]
+        assert [frame.frame_id for frame in frames] == list(range(frames[0].frame_id, frames[0].frame_id + 5))
+        assert all(frame.image.shape == (200, 320) and frame.image.dtype == np.uint8 for frame in frames)
+        # A ball bounces.
+        assert not np.array_equal(frames[0].image, frames[4].image)
+        assert camera.counts == FrameCounts(ok=5)
+        camera.stop()
+        for wish, message in (
+            ({"exposure_ms": 1.0}, "no setting for exposure"),
+            ({"gain_db": 1.0}, "no setting for gain"),
+            ({"trigger": "software"}, "cannot be triggered by Software"),
+            ({"bits": 12}, "does not give Mono12, only RGBa8, Mono8"),
+            ({"region": Region(1, 0, 320, 200)}, "has no OffsetX"),
+        ):
+            with pytest.raises(HardwareError, match=message):
+                camera.configure(**wish)
+
+
+def test_a_producer_lists_its_cameras():
+    with pytest.raises(HardwareError, match=r"(?s)3 of the cameras .* expected one.*viky.cti:0.*viky.cti:2"):
+        open_camera(f"genicam:{PRODUCER}")
+    with pytest.raises(HardwareError, match=r"(?s)0 of the cameras .*viky.cti:1 "):
+        open_camera(f"genicam:{PRODUCER}:77")
+    with pytest.raises(HardwareError, match="no GenTL producer at nowhere.cti"):
+        open_camera("genicam:nowhere.cti")
+
+
+def test_missing_libraries_are_said_with_what_to_install(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "harvesters", None)
+    with pytest.raises(SetupError, match="pip install harvesters genicam"):
+        open_camera(f"genicam:{PRODUCER}")
+    aravis_library.load_aravis.cache_clear()
+    monkeypatch.setenv(aravis_library.VARIABLE, str(tmp_path / "libaravis.so"))
+    with pytest.raises(SetupError, match=r"UWLTS_LIBARAVIS names .*libaravis.so"):
+        open_camera("gige:1")
+    monkeypatch.setenv(aravis_library.VARIABLE, "libc.so.6")
+    with pytest.raises(SetupError, match="lacks arv_camera_new"):
+        open_camera("gige:1")
+    monkeypatch.delenv(aravis_library.VARIABLE)
+    monkeypatch.setattr(aravis_library, "LIBRARY", "libaravis-0.0.so.0")
+    with pytest.raises(SetupError, match=r"(?s)cannot be used.*apt-get install libaravis-0.8-0"):
+        open_camera("gige:1")
+    aravis_library.load_aravis.cache_clear()

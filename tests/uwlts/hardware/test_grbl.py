@@ -1,0 +1,592 @@
+"""The Grbl driver against the twin's controller over a pseudo terminal: what works, faults, and the laser's end."""
+
+import errno
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import termios
+import textwrap
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin.devices.grbl_controller import GrblController
+from twin.devices.grbl_firmware import GrblError, parse_block
+from twin.devices.grbl_motion import Axis, Ramp
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.grbl_line import (
+    Alarm,
+    Banner,
+    Garbage,
+    Message,
+    Ok,
+    Refusal,
+    Setting,
+    Status,
+    alarm_text,
+    parse_reply,
+    parse_settings,
+    refusal_text,
+)
+from uwlts.model.errors import HardwareError, RangeError
+
+ROOT = Path(__file__).resolve().parents[3]
+FAST = {"speed_up": 100.0, "boot_s": 1.0, "position_mm": 30.0}
+STEP_MM = 0.0125
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+@pytest.fixture
+def controller() -> Iterator[GrblController]:
+    with GrblController(**FAST) as running:
+        yield running
+
+
+@pytest.fixture
+def stage(controller: GrblController) -> Iterator[GrblStage]:
+    """A homed stage. Faults are left to the test; whatever it leaves, the laser is off in the end."""
+    with GrblStage(controller.port) as opened:
+        opened.home()
+        yield opened
+        opened._line.fault = opened._line.fault or "test over"
+
+
+# What is said
+
+
+@pytest.mark.parametrize(
+    ("line", "meaning"),
+    [
+        ("ok", Ok()),
+        ("error:9", Refusal(9)),
+        ("ALARM:1", Alarm(1)),
+        ("Grbl 1.1h ['$' for help]", Banner("1.1h")),
+        ("\\xffGrbl 1.1f ['$' for help]", Banner("1.1f")),
+        ("$100=80.000", Setting(100, 80.0)),
+        ("$13=0 (report inches, bool)", Setting(13, 0.0)),
+        ("[MSG:'$H'|'$X' to unlock]", Message("MSG:'$H'|'$X' to unlock")),
+        (">G54G20:ok", Message(">G54G20:ok")),
+        (
+            "<Hold:0|MPos:-5.000,1.000,0.000|Bf:15,128|FS:0,1000|Pn:XZ|WCO:1.500,0.000,0.000>",
+            Status("Hold", 0, machine_mm=-5.0, offset_mm=1.5, spindle=1000.0, pins="XZ"),
+        ),
+        ("<Idle|WPos:2.000,0.000,0.000|F:0>", Status("Idle", work_mm=2.0)),
+    ],
+)
+def test_replies_are_understood(line, meaning):
+    assert parse_reply(line) == meaning
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "okk",
+        "error:",
+        "ALARM:x",
+        "Grbl 0.9j ['$' for help]",
+        "$100=",
+        "$100=nan",
+        "<Idle>",
+        "<Idle|MPos:1.0,inf>",
+        "<Run|MPos:1.000|WPos:1.000>",
+        "<Fly|MPos:1.000>",
+        "<Idle|MPos:1..0>",
+        "[unended",
+        "\\xff\\x80",
+        "<Idle|MPos:--1>",
+    ],
+)
+def test_what_grbl_never_says_is_garbage(line):
+    assert parse_reply(line) == Garbage(line)
+
+
+def test_every_documented_alarm_and_error_has_its_meaning():
+    # doc/csv of Grbl 1.1: alarms 1 to 9, errors 1 to 17 and 20 to 38.
+    assert all("unknown" not in alarm_text(code) for code in range(1, 10))
+    assert all("unknown to" not in refusal_text(code) for code in [*range(1, 18), *range(20, 39)])
+    assert "unknown" in alarm_text(10) and "unknown to" in refusal_text(18)
+
+
+def test_settings_that_cannot_work_are_refused():
+    good = dict.fromkeys((13, 20, 21, 22, 23, 24, 25, 26, 27, 30, 31, 32, 100, 110, 120, 130), 1.0) | {13: 0.0}
+    assert parse_settings(good).steps_per_mm == 1
+    with pytest.raises(HardwareError, match=r"lacks \$100, \$130"):
+        parse_settings({n: v for n, v in good.items() if n not in (100, 130)})
+    with pytest.raises(HardwareError, match=r"inches .*send \$13=0"):
+        parse_settings(good | {13: 1.0})
+    with pytest.raises(HardwareError, match=r"\$100 \(steps/mm\) is 0"):
+        parse_settings(good | {100: 0.0})
+
+
+# How the twin's axis moves
+
+
+@pytest.mark.parametrize("way_mm", [-200.0, 30.0, 0.5, STEP_MM])
+def test_a_movement_keeps_to_speed_and_acceleration_and_arrives(way_mm):
+    ramp = Ramp(5.0, 5.0 + way_mm, speed=10.0, acceleration=50.0, start_s=2.0)
+    times = np.linspace(2.0, ramp.end_s, 20001)
+    positions, speeds = np.array([ramp.at(time_s) for time_s in times]).T
+    assert (positions[0], positions[-1]) == (5.0, 5.0 + way_mm)
+    assert np.abs(speeds).max() <= 10 * (1 + 1e-12)
+    assert np.abs(np.diff(speeds)).max() <= 50 * np.diff(times).max() * (1 + 1e-6)
+    # The trapezoidal rule errs by at most a dt^2 / 2 at each of the two kinks of the speed.
+    way = np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(times))
+    assert way == pytest.approx(way_mm, abs=50 * np.diff(times).max() ** 2)
+
+
+def test_a_hold_brakes_and_a_resumption_arrives():
+    axis = Axis(acceleration=50.0)
+    axis.add(100.0, speed=10.0, time_s=0.0)
+    axis.hold(3.0)
+    # v^2 / 2a beyond the place where it was asked for.
+    held_mm = Ramp(0.0, 100.0, 10.0, 50.0, 0.0).at(3.0)[0] + 10**2 / (2 * 50)
+    assert axis.braking(3.1) and not axis.braking(3.3)
+    assert axis.at(9.0) == (pytest.approx(held_mm), 0.0)
+    axis.resume(10.0)
+    axis.advance(100.0)
+    assert axis.at(100.0) == (100.0, 0.0) and not axis.pending
+
+
+# The twin's controller, spoken to directly
+
+
+class Terminal:
+    """A program on the port that is no driver."""
+
+    def __init__(self, port: str):
+        self.descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY)
+
+    def read(self, quiet_s: float = 0.05, last: str = "") -> list[str]:
+        """Lines until one ends with ``last`` and then none comes for a while."""
+        data = b""
+        while select.select([self.descriptor], [], [], quiet_s if data.endswith(last.encode() + b"\r\n") else 3.0)[0]:
+            data += os.read(self.descriptor, 4096)
+        return data.decode("ascii").split("\r\n")[:-1]
+
+    def say(self, text: str, quiet_s: float = 0.05, last: str = "") -> list[str]:
+        os.write(self.descriptor, text.encode("ascii"))
+        return self.read(quiet_s, last)
+
+
+@pytest.fixture
+def terminal(controller: GrblController) -> Iterator[Terminal]:
+    opened = Terminal(controller.port)
+    assert opened.read(last="unlock]") == ["", "Grbl 1.1h ['$' for help]", "[MSG:'$H'|'$X' to unlock]"]
+    yield opened
+    os.close(opened.descriptor)
+
+
+def test_the_controller_is_locked_until_homed_or_unlocked(terminal):
+    assert terminal.say("G1X1F100\n") == ["error:9"]
+    assert terminal.say("?")[0].startswith("<Alarm|MPos:0.000,0.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>")
+    assert terminal.say("$X\n") == ["[MSG:Caution: Unlocked]", "ok"]
+    assert terminal.say("G90\r\n") == ["ok", "ok"]
+    assert terminal.say("?") == ["<Idle|MPos:0.000,0.000,0.000|FS:0,0>"]
+    assert terminal.say("$G\n") == ["[GC:G0 G54 G17 G21 G90 G94 M5 M9 T0 F0 S0]", "ok"]
+    assert terminal.say("$I\n") == ["[VER:1.1h.20190825:]", "[OPT:V,15,128]", "ok"]
+
+
+def test_the_controller_refuses_as_grbl_does(terminal):
+    terminal.say("$X\n")
+    refusals = {
+        "G1X-1": 22,
+        "G5X1": 20,
+        "X": 2,
+        "1": 1,
+        "G0G1X1": 21,
+        "X1X2": 25,
+        "S-1": 4,
+        "G4": 28,
+        "$Q": 3,
+        "$100=-1": 4,
+        "Y1": 20,
+        "G0 X-1 P1": 36,
+        "G" + "0" * 90: 11,
+        "$22=x": 2,
+    }
+    for line, code in refusals.items():
+        assert terminal.say(f"{line}\n", 0.03) == [f"error:{code}"], line
+    terminal.say("$22=0\n")
+    assert terminal.say("$20=1\n") == ["error:10"]
+    assert terminal.say("$H\n") == ["error:5"]
+
+
+def test_laser_mode_keeps_the_pin_off_under_g0_and_at_rest_under_m4(controller, terminal):
+    terminal.say("$X\nM3S500\n")
+    assert not controller.state().laser_on
+    terminal.say("G1F100\n")
+    assert controller.state().power == 0.5
+    terminal.say("M4\n")
+    assert not controller.state().laser_on
+    terminal.say("$32=0\nG0\nM3\n")
+    assert controller.state().laser_on
+    assert "FS:0,500" in terminal.say("?")[0]
+    terminal.say("M5\n")
+    assert not controller.state().laser_on
+
+
+def test_the_planner_takes_fifteen_movements_and_then_waits(terminal):
+    terminal.say("$H\n", last="ok")
+    lines = terminal.say("G91G1F30\n" + "X0.5\n" * 15, 0.03)
+    assert lines == ["ok"] * 16
+    assert "Run" in terminal.say("?")[0]
+    assert terminal.say("X0.5\nG4P0.01\n", 0.4) == ["ok", "ok"]
+    assert terminal.say("?")[0].startswith("<Idle|MPos:-740.000")
+
+
+def test_soft_limits_and_a_reset_while_moving_end_in_an_alarm(terminal):
+    terminal.say("$H\n", last="ok")
+    assert terminal.say("G0X1\n") == ["ALARM:2", "[MSG:Reset to continue]"]
+    os.write(terminal.descriptor, b"?$X\n")
+    assert not select.select([terminal.descriptor], [], [], 0.1)[0]
+    locked = ["", "Grbl 1.1h ['$' for help]", "[MSG:'$H'|'$X' to unlock]"]
+    assert terminal.say("\x18") == locked
+    terminal.say("$X\nG1X-700F60\n", last="ok")
+    assert terminal.say("\x18") == ["ALARM:3", *locked]
+
+
+def test_blocks_hold_words_and_commands_apart():
+    block = parse_block("G21G90G94G53G1X-12.5F600")
+    assert block.machine_coordinates and block.values == {"X": -12.5, "F": 600.0}
+    assert block.commands == {"units": "G21", "distance": "G90", "feed": "G94", "motion": "G1"}
+    with pytest.raises(GrblError, match="error:26"):
+        parse_block("G92")
+
+
+# Opening
+
+
+def test_opening_reads_version_settings_and_state(controller):
+    with GrblStage(controller.port) as stage:
+        assert stage.version == "1.1h"
+        assert (stage.settings.step_mm, stage.settings.travel_mm, stage.settings.soft_limits) == (STEP_MM, 750.0, True)
+        assert stage.limits_mm == (0.0, 750.0)
+        assert not stage.position_known
+        with pytest.raises(HardwareError, match="home it first"):
+            stage.move_to(10.0, feed_mm_per_min=100.0)
+        # By it DTR drops when the port is closed, whoever closes it.
+        assert termios.tcgetattr(stage._line._serial.fd)[2] & termios.HUPCL
+
+
+def test_a_board_that_does_not_reset_is_woken_and_keeps_its_position():
+    with GrblController(**FAST, resets_when_opened=False) as controller:
+        for known in (False, True):
+            with GrblStage(controller.port, boot_s=0.3) as stage:
+                assert stage.position_known is known
+                if not known:
+                    assert stage.home() == 2.0
+                assert stage.position_mm() == 2.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"version": "0.9j"}, r"is not Grbl 1\.1, it says .*0\.9j"),
+        ({"version": "3.7 [FluidNC"}, r"is not Grbl 1\.1"),
+        ({"options": "MZ"}, "without V: the laser needs"),
+        ({"settings": {13: 1}}, r"inches"),
+    ],
+)
+def test_a_controller_that_cannot_do_it_is_refused(options, message):
+    with GrblController(**FAST, **options) as controller:
+        with pytest.raises(HardwareError, match=message):
+            GrblStage(controller.port, boot_s=0.3)
+        assert wait_for(lambda: not controller.state().port_open)
+
+
+def test_a_silent_port_and_a_foreign_device_are_told_apart():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    try:
+        with pytest.raises(HardwareError, match="nothing answers"):
+            GrblStage(os.ttyname(slave), boot_s=0.1)
+        threading.Timer(0.05, os.write, (master, b"\x80\xff\x00~~")).start()
+        with pytest.raises(HardwareError, match="does not speak Grbl, it says .*baud"):
+            GrblStage(os.ttyname(slave), boot_s=0.1)
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_port_that_is_missing_or_in_use_is_named(controller):
+    with pytest.raises(HardwareError, match="there is no such port; ports found"):
+        GrblStage("/dev/ttyACM987")
+    with GrblStage(controller.port), pytest.raises(HardwareError, match="another program uses it"):
+        GrblStage(controller.port)
+
+
+# Moving
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "home_mm"),
+    [({23: 1}, "V", 2.0), ({23: 0}, "V", 748.0), ({23: 1}, "VZ", 0.0), ({23: 0}, "VZ", 750.0), ({10: 0}, "V", 2.0)],
+)
+def test_positions_count_from_the_lower_end_whatever_grbl_calls_them(settings, options, home_mm):
+    with (
+        GrblController(**FAST | {"position_mm": abs(home_mm - 20)}, settings=settings, options=options) as controller,
+        GrblStage(controller.port) as stage,
+    ):
+        assert stage.home() == pytest.approx(home_mm, abs=1e-9)
+        # Where homing sets its zero after the pull-off, the controller's zero is not at the switch but beside it.
+        offset_mm = {"VZ": 2.0 if settings.get(23) else -2.0}.get(options, 0.0)
+        stage._line.command("G92X5")
+        for target_mm in (410.0, 400.0125):
+            assert stage.move_to(target_mm, feed_mm_per_min=900.0) == pytest.approx(target_mm, abs=1e-9)
+            assert controller.state().position_mm == pytest.approx(target_mm + offset_mm, abs=1e-9)
+
+
+def test_a_movement_ends_on_the_nearest_step_and_not_before_its_time():
+    speed_up = 5.0
+    with (
+        GrblController(speed_up=speed_up, boot_s=0.1, resets_when_opened=False, settings={22: 0, 20: 0}) as controller,
+        GrblStage(controller.port, boot_s=0.1) as stage,
+    ):
+        begun = time.monotonic()
+        reached_mm = stage.move_to(20.004, feed_mm_per_min=600.0)
+        took_s = (time.monotonic() - begun) * speed_up
+        assert reached_mm == pytest.approx(20.0, abs=1e-9)
+        assert not controller.state().moving
+    # 20 mm at 10 mm/s and one ramp of 0.2 s; at the end a dwell of 10 ms, a few ticks, and 0.2 s of real time.
+    expected_s = 20 / 10 + 10 / 50
+    assert expected_s <= took_s < expected_s + 0.2 * speed_up
+
+
+@pytest.mark.parametrize(
+    ("target_mm", "feed"), [(-0.1, 100.0), (750.1, 100.0), (float("nan"), 100.0), (9, 0), (9, 901)]
+)
+def test_nothing_is_sent_for_a_target_outside(controller, stage, target_mm, feed):
+    with pytest.raises(RangeError, match="travel|feed"):
+        stage.move_to(target_mm, feed_mm_per_min=feed)
+    assert controller.state().position_mm == 2.0
+    assert stage.move_to(9.0, feed_mm_per_min=900.0) == 9.0
+
+
+def test_without_homing_positions_count_from_the_start():
+    with GrblController(**FAST, settings={22: 0, 20: 0}) as controller, GrblStage(controller.port) as stage:
+        with pytest.raises(HardwareError, match=r"\$22=0"):
+            stage.home()
+        assert stage.move_to(-20.0, feed_mm_per_min=900.0) == -20.0
+        assert controller.state().position_mm == 10.0
+
+
+def test_the_laser_follows_and_its_power_is_a_share(controller, stage):
+    for mode in (1, 0):
+        stage._line.command(f"$32={mode}")
+        stage.laser(True)
+        assert controller.state().power == 1.0
+        stage.move_to(5.0 + mode, feed_mm_per_min=900.0)
+        assert controller.state().laser_on and stage.laser_power == 1.0
+        stage.laser(True, power=0.25)
+        assert controller.state().power == 0.25
+        stage.laser(False)
+        assert not controller.state().laser_on and stage.laser_power == 0.0
+    with pytest.raises(RangeError, match="power 1.5"):
+        stage.laser(True, power=1.5)
+
+
+def test_a_laser_that_gives_no_light_is_seen_by_the_twin_alone(controller, stage):
+    controller.break_laser()
+    stage.laser(True)
+    assert not controller.state().laser_on and stage.laser_power == 1.0
+
+
+# Stopping
+
+
+def interrupt_after(seconds: float) -> threading.Timer:
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    return timer
+
+
+@pytest.mark.parametrize("reset", [True, False])
+def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(controller, stage, reset):
+    stage.laser(True)
+    interrupt_after(0.3)
+    with pytest.raises(KeyboardInterrupt):
+        stage.move_to(700.0, feed_mm_per_min=900.0)
+    stopped_mm = stage.stop(reset=reset)
+    assert 10.0 < stopped_mm < 600.0
+    assert not controller.state().laser_on and not controller.state().moving
+    if not reset:
+        with pytest.raises(HardwareError, match="held"):
+            stage.move_to(20.0, feed_mm_per_min=900.0)
+        assert stage.unlock() == stopped_mm
+    assert stage.move_to(stopped_mm + 1, feed_mm_per_min=900.0) == pytest.approx(stopped_mm + 1, abs=1e-9)
+    # A step, as the stop is not on one.
+    assert controller.state().position_mm == pytest.approx(stopped_mm + 1, abs=STEP_MM)
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("fault", "message", "recovers"),
+    [
+        (lambda c: c.disconnect(), "connection is lost.*CANNOT be switched", False),
+        (lambda c: c.stall(), "stall: the stage has stood at", True),
+        (lambda c: c.alarm(1), "ALARM:1, hard limit.*home", True),
+        (lambda c: c.alarm(3), "ALARM:3, reset while moving", True),
+        (lambda c: c.garbage(), "garbage on the line", True),
+        (lambda c: c.garbage(b"x" * 300), "garbage on the line", True),
+        (lambda c: c.garbage(b"ok\r\nok\r\n"), "came although nothing was sent", True),
+        (lambda c: c.restart(), "restarted by itself", True),
+        (lambda c: c.mute(), "silence: 3 status queries", False),
+        (lambda c: c.hold(), "feed hold", True),
+        (lambda c: c.lose_steps(-80 * 400), "missed steps: the limit switch at 0 mm is pressed", True),
+    ],
+)
+def test_a_fault_while_moving_is_named_and_the_laser_is_off(controller, stage, fault, message, recovers):
+    stage.move_to(60.0, feed_mm_per_min=900.0)
+    stage.laser(True)
+    assert controller.state().laser_on
+    timer = threading.Timer(0.15, fault, (controller,))
+    timer.start()
+    with pytest.raises(HardwareError, match=message):
+        stage.move_to(700.0, feed_mm_per_min=900.0)
+    assert wait_for(lambda: not controller.state().laser_on, 0.2)
+    assert stage.laser_power == 0.0 and not stage.position_known
+    with pytest.raises(HardwareError, match="has stopped after a fault"):
+        stage.move_to(60.0, feed_mm_per_min=900.0)
+    stage.laser(False)
+    if recovers:
+        assert stage.home() == 2.0
+        assert stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0
+        assert controller.state().position_mm == 60.0
+
+
+def test_a_movement_that_ends_short_by_more_than_a_step_is_named(controller, stage):
+    controller.stop_short(1)
+    assert stage.move_to(10.0, feed_mm_per_min=900.0) == pytest.approx(10.0 - STEP_MM, abs=1e-9)
+    controller.stop_short(3)
+    with pytest.raises(HardwareError, match=r"missed steps: 19\.962 mm read back where 20\.000 mm .* -3 steps"):
+        stage.move_to(20.0, feed_mm_per_min=900.0)
+    assert not controller.state().laser_on
+
+
+def test_noise_at_rest_leaves_the_position_to_be_unlocked(controller, stage):
+    controller.garbage()
+    with pytest.raises(HardwareError, match="garbage"):
+        stage.position_mm()
+    assert stage.unlock() == 2.0
+    assert stage.move_to(4.0, feed_mm_per_min=900.0) == 4.0
+
+
+def test_homing_that_fails_says_so():
+    # The switch is 1400 mm away and Grbl seeks over 1.5 times the 750 mm of travel.
+    with GrblController(**FAST | {"position_mm": 1400.0}) as controller, GrblStage(controller.port) as stage:
+        with pytest.raises(HardwareError, match=r"ALARM:9, homing: no limit switch"):
+            stage.home()
+        assert not stage.position_known
+
+
+# The laser's end, whatever ends the program
+
+
+LIT = """
+    import sys
+    from uwlts.hardware.grbl import GrblStage
+    with GrblStage(sys.argv[1]) as stage:
+        stage.home()
+        stage.laser(True)
+        print(stage._line._guard.pid, flush=True)
+        {then}
+"""
+MOVES = "stage.move_to(740.0, feed_mm_per_min=60.0)"
+
+
+def lit_program(controller: GrblController, then: str = MOVES) -> tuple[subprocess.Popen[str], int]:
+    program = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(LIT.format(then=then)), controller.port],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert program.stdout is not None
+    guard = int(program.stdout.readline())
+    assert controller.state().laser_on
+    return program, guard
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV])
+def test_the_laser_goes_off_when_the_program_is_ended_while_moving(controller, ending):
+    program, _ = lit_program(controller)
+    assert wait_for(lambda: controller.state().moving)
+    program.send_signal(ending)
+    # The guard wakes at once when its pipe ends; 0.5 s is far beyond its 0.2 s of polling.
+    assert wait_for(lambda: not controller.state().laser_on, 0.5)
+    program.communicate(timeout=10)
+    assert program.returncode != 0
+    assert wait_for(lambda: not controller.state().port_open)
+    assert not controller.state().moving
+
+
+@pytest.mark.parametrize("then", ["pass", "raise ValueError", "import os; os._exit(3)", "sys.exit(1)"])
+def test_the_laser_goes_off_however_the_program_leaves(controller, then):
+    program, _ = lit_program(controller, then=f"sys.stdin.readline()\n        {then}")
+    program.communicate("\n", timeout=10)
+    assert wait_for(lambda: not controller.state().laser_on, 0.5)
+
+
+@pytest.mark.parametrize("gated", [True, False])
+def test_without_the_guard_only_the_interlock_saves_a_killed_program(gated):
+    with GrblController(**FAST, gated=gated) as controller:
+        program, guard = lit_program(controller)
+        os.kill(guard, signal.SIGKILL)
+        program.kill()
+        program.communicate(timeout=10)
+        assert wait_for(lambda: not controller.state().port_open)
+        assert controller.state().laser_on is not gated
+        # The next opening restarts the controller, as on the Uno.
+        again = os.open(controller.port, os.O_RDWR | os.O_NOCTTY)
+        assert wait_for(lambda: not controller.state().laser_on)
+        os.close(again)
+
+
+def test_the_laser_is_not_lit_without_its_guard(controller, stage):
+    stage._line._guard.kill()
+    stage._line._guard.wait()
+    with pytest.raises(HardwareError, match="switches the laser off after a crash is gone"):
+        stage.laser(True)
+    assert not controller.state().laser_on
+
+
+def test_closing_is_confirmed_or_an_error(controller):
+    with GrblStage(controller.port) as stage:
+        stage.home()
+        stage.laser(True)
+    assert not controller.state().laser_on
+    with pytest.raises(HardwareError, match="closed"):
+        stage.position_mm()
+    # A controller whose port is closed and opened within 2 ms does not notice and must be woken, which takes 2.5 s.
+    assert wait_for(lambda: not controller.state().port_open)
+    with pytest.raises(HardwareError, match="does not restart on Ctrl-X"), GrblStage(controller.port):
+        controller.mute()
+
+
+def test_an_error_in_the_body_is_not_hidden_by_closing(controller):
+    with pytest.raises(OSError, match="disk full"), GrblStage(controller.port) as stage:
+        stage.home()
+        stage.laser(True)
+        controller.mute()
+        raise OSError(errno.ENOSPC, "disk full")
+    assert wait_for(lambda: not controller.state().laser_on, 0.5)

@@ -1,0 +1,98 @@
+"""Evidence for the joint calibration, in air and in a medium, made by Fermat's principle, not the sensor's software."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.oracles.fermat import Face, directions_seen, plate, points_seen_on_plane
+from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lattice, lens_of, nine_steps, through_window, turn
+from uwlts.calibration.evidence import AirEvidence, StepEvidence
+from uwlts.calibration.joint.gathering import Gathered, Series
+from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.artefacts import StepStandard
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.targets import parse_target
+
+MEDIUM = Medium(kind="custom", index=WATER)
+TARGET = parse_target(
+    {"kind": "circles", "diameter_mm": 5.0, "marker_diameter_mm": 2.0, "columns": 25, "rows": 25, "origin": (12, 12)}
+    | {"spacing_x_mm": 9.375, "spacing_y_mm": 9.372}
+)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what the views are spoilt by, and the generator."""
+
+    circles_px: float = 0.0
+    stripe_px: float = 0.0
+    stage_mm: float = 0.0
+    rng: np.random.Generator | None = None
+
+    def draw(self, sigma, shape):
+        return self.rng.normal(0, sigma, shape) if sigma else np.zeros(shape)
+
+
+def seen(sensor: Sensor, points, *, index, window):
+    """Pixels (N, 2) of points (N, 3) in the camera frame."""
+    if not window:
+        return lens_of(sensor).pixels(points)
+    plate_of = sensor.camera.window
+    faces = plate(distance=plate_of.distance_mm, thickness=plate_of.thickness_mm, normal=plate_of.normal())
+    indices = [1.0, plate_of.index(sensor.laser.wavelength_nm), index]
+    return lens_of(sensor).pixels(directions_seen(points, faces, indices))
+
+
+def lit_points(sensor: Sensor, *, normal, point, index, bow=0.0, count=200):
+    """Where the fan, through the laser's window, lights a plane: (count, 3), camera frame."""
+    pose, window = laser_pose(sensor), sensor.laser.window
+    module = np.stack([pose.normal, pose.fan, pose.axis])
+    angle = np.linspace(-1, 1, count) * np.radians(sensor.laser.fan_angle_deg / 2)
+    rays = np.column_stack([np.full(count, np.sin(bow)), np.cos(bow) * np.sin(angle), np.cos(bow) * np.cos(angle)])
+    faces = plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
+    there, across = module @ (point - pose.origin_mm), module @ normal
+    straight = rays * ((across @ there) / (rays @ across))[:, None]
+    indices = [1.0, window.index(sensor.laser.wavelength_nm), index]
+    found = points_seen_on_plane(rays, Face(there, across), straight, faces, indices)
+    return found @ module + pose.origin_mm
+
+
+def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise=Noise(), tilts=None, columns=25):
+    """A series of the target on the stage, or with ``tilts`` (F, 2) in rad by hand, with the stripes on it."""
+    index = 1.0 if medium is None else WATER
+    frame = camera_from_object(sensor)
+    direction = frame[:3, :3] @ np.array([0.002, -0.001, 1.0])
+    images, stripes = [], []
+    for number, position in enumerate(positions):
+        by_hand = (0.0, 0.0) if tilts is None else tilts[number]
+        rotation = frame[:3, :3] @ turn(0.004 + by_hand[0], -0.007 + by_hand[1], np.pi / 2 + 0.02)
+        there = position + noise.draw(noise.stage_mm, ())
+        origin = frame[:3, 3] + 20.0 * frame[:3, 2] - there * direction
+        points = lattice(columns, columns)
+        pixels = seen(sensor, points @ rotation.T + origin, index=index, window=window)
+        here = inside(pixels, sensor)
+        found = pixels[here] + noise.draw(noise.circles_px, (here.sum(), 2))
+        images.append(TargetImage(points[here], found, float(position)))
+        lit = lit_points(sensor, normal=rotation[:, 2], point=origin, index=index, bow=bow)
+        pixels = seen(sensor, lit, index=index, window=window)
+        pixels = pixels[inside(pixels, sensor)]
+        stripes.append(pixels + np.column_stack([np.zeros(len(pixels)), noise.draw(noise.stripe_px, len(pixels))]))
+    evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
+    return Series(View(window, medium), evidence, None if tilts is not None else True, ["target"])
+
+
+def step_views(sensor: Sensor, *, noise=Noise()):
+    """Nine images of the step standard on the sheet as described, without what the laser's window does to it."""
+    standard = StepStandard(height_mm=STEP_MM)
+    found = []
+    for profile in nine_steps(count=400):
+        pixels = through_window(sensor, profile, noise_px=noise.stripe_px, rng=noise.rng)
+        found.append((StepEvidence(pixels, standard, WATER, "step"), View(True, 0)))
+    return found
+
+
+def gathered(sensor: Sensor, series, steps=()) -> Gathered:
+    """What captures with these views would give; ``sensor`` is what the drawings say."""
+    return Gathered(sensor, {"water": MEDIUM}, list(series), list(steps), [], {}, [])

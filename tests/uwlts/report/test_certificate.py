@@ -1,0 +1,276 @@
+"""Certificates: their seal, what they say of lengths and form, and their page."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from uwlts.calibration.joint.observability import Region, estimate_in, pixels_at, regions
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.calibration import KnownMedium
+from uwlts.model.errors import CalibrationError, CaptureError, OutputError
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.report.certificate import (
+    NOT_JOINT,
+    JointCertificate,
+    canonical,
+    certificate_of,
+    check_certificate,
+    read_certificate,
+    seal_of,
+)
+from uwlts.report.certificate_page import certificate_page, refuse_unsuitable_certificate, write_certificate
+from uwlts.report.certificate_volume import (
+    change_from,
+    ends_over,
+    form_of,
+    in_use,
+    length_uncertainties,
+    without_rigid_motion,
+)
+from uwlts.storage.calibration_file import read_calibration, write_calibration
+
+BUILT = built_sensor()
+ISSUED = "2026-01-02T03:04:05+00:00"
+DRAWS = 300
+
+
+@pytest.fixture(scope="module")
+def path(thesis, tmp_path_factory):
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise, columns=15)
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    calibration = solve_jointly(gathered(thesis, [series]), options=options).calibration
+    path = tmp_path_factory.mktemp("certificate") / "calibration.json"
+    write_calibration(path, calibration)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibration(path):
+    return read_calibration(path)
+
+
+@pytest.fixture(scope="module")
+def use(calibration):
+    return in_use(calibration, regions(calibration)[0])
+
+
+@pytest.fixture(scope="module")
+def content(calibration, path):
+    return certificate_of(calibration, path, issued=ISSUED)
+
+
+def test_the_same_calibration_gives_the_same_json(calibration, path, content):
+    again = certificate_of(read_calibration(path), path, issued=ISSUED)
+    stored = content.in_file()
+    assert json.dumps(again.in_file()) == json.dumps(stored)
+    # What is sealed does not depend on the order of keys, nor on the seal itself.
+    assert canonical(dict(reversed(stored.items()))) == canonical(stored)
+    assert seal_of(stored) == content.sha256 == stored["sha256"]
+
+
+def test_a_changed_byte_is_found(calibration, path, content, tmp_path):
+    page = tmp_path / "cert.html"
+    write_certificate(page, content, calibration)
+    beside = tmp_path / "cert.json"
+    assert check_certificate(beside, path) == []
+    text = beside.read_text(encoding="utf-8")
+    place = text.index('"std": ') + 9
+    digit = "1" if text[place] != "1" else "2"
+    beside.write_text(text[:place] + digit + text[place + 1 :], encoding="utf-8")
+    assert "was changed after it was issued" in check_certificate(beside, path)[0]
+    beside.write_text(text, encoding="utf-8")
+    other = tmp_path / "calibration.json"
+    changed = bytearray(path.read_bytes())
+    changed[-20] ^= 1
+    other.write_bytes(changed)
+    assert "is not the calibration" in check_certificate(beside, other)[0]
+
+
+def test_what_is_no_certificate_is_refused(path, tmp_path):
+    with pytest.raises(CaptureError, match="not a certificate"):
+        read_certificate(path)
+    newer = tmp_path / "newer.json"
+    newer.write_text('{"format": "uwlts-certificate", "version": 9}', encoding="utf-8")
+    with pytest.raises(CaptureError, match="version 9"):
+        read_certificate(newer)
+
+
+def test_the_calibration_itself_is_never_replaced(path):
+    with pytest.raises(OutputError, match="would replace the calibration"):
+        refuse_unsuitable_certificate(path.with_suffix(".html"), path, overwrite=True)
+
+
+def test_it_says_where_it_holds(calibration, content, thesis):
+    """Stripes lie on the plate of 235 mm and in the image, over the travel of 180 mm less where they miss it."""
+    validity = content.validity[0]
+    assert validity.name == "water"
+    assert validity.index == calibration.media[0].index
+    assert 0 < validity.index_std <= 1.01e-4
+    assert 100 < np.ptp(validity.z_mm) < 190
+    assert 100 < np.ptp(validity.y_mm) < 235
+    depth = validity.camera_depth_mm
+    assert 0.8 * np.ptp(validity.z_mm) < depth[1] - depth[0] < np.ptp(validity.z_mm)
+    assert sum(image.residual_count for image in content.images) == content.residuals
+    assert {image.source for image in content.images} == {f"target, frame {n}" for n in range(6)}
+    assert content.made_from["target"]["kind"] == "circles"
+    tilt = next(row for row in content.parameters if row.name == "window_slope_x")
+    assert tilt.unit == "°"
+    assert tilt.std_before == pytest.approx(thesis.uncertainty.window_tilt_deg, rel=1e-3)
+
+
+def points(calibration, known, values, pixels):
+    """Points (N, 3) in the OCS of the calibration by other values of its parameters."""
+    changed = calibration.model_copy(
+        update={
+            "camera": known.parameters.camera(values),
+            "window": known.parameters.window_model(values),
+            "sheet": known.parameters.sheet_model(values),
+        }
+    )
+    index = known.parameters.medium_index(values, known.view)
+    return reconstruct_pixels(
+        changed, pixels, medium_index=index, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
+    ).points_mm
+
+
+def test_lengths_are_worth_what_draws_say(calibration, use):
+    """By drawing parameters and reconstructing with them: a standard deviation of 300 draws is right to 4 % (1 sigma).
+
+    The largest of 81 places is compared with the largest by draws, which lies a little higher.
+    """
+    known = use.known
+    drawn = np.random.default_rng(1).multivariate_normal(known.values, use.covariance, DRAWS, method="svd")
+    compared = 0
+    for worth in length_uncertainties(use):
+        if worth.axis == "X" or worth.length_mm not in (20.0, 100.0):
+            continue
+        pixels = pixels_at(calibration, known, ends_over(use.region, worth.axis, worth.length_mm).reshape(-1, 2))
+        found = np.array([points(calibration, known, values, pixels) for values in drawn])
+        lengths = np.linalg.norm(found[:, 1::2] - found[:, ::2], axis=2)
+        assert worth.calibration_mm == pytest.approx(2 * np.std(lengths, axis=0).max(), rel=0.2)
+        assert worth.point_mm > worth.calibration_mm
+        compared += 1
+    assert compared == 4
+
+
+def test_along_x_the_stage_counts(use, thesis):
+    """Two positions and the scale of 100 mm, twice: k = 2."""
+    known = thesis.uncertainty
+    worth = next(w for w in length_uncertainties(use) if w.axis == "X" and w.length_mm == 100.0)
+    assert worth.calibration_mm == pytest.approx(
+        2 * np.sqrt(2 * known.stage_position_mm**2 + (100 * known.stage_scale) ** 2)
+    )
+
+
+def test_drift_of_the_water_counts(calibration):
+    """In water whose index follows from its temperature; 5 K change it by 5e-4 and more."""
+    water = MEDIUM.model_copy(update={"kind": "fresh", "index": None})
+    medium = KnownMedium(medium=water, index=calibration.media[0].index)
+    known = calibration.provenance["known_before"]
+    std = []
+    for kelvin in (0.0, 5.0):
+        provenance = calibration.provenance | {"known_before": known | {"drift_k": kelvin}}
+        warmer = calibration.model_copy(update={"media": (medium,), "provenance": provenance})
+        found = length_uncertainties(in_use(warmer, regions(warmer)[0]))
+        std.append(next(w.calibration_mm for w in found if w.axis == "Y" and w.length_mm == 100.0))
+    assert std[1] > 2 * std[0]
+
+
+def test_rigid_motions_leave_the_form():
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-50, 50, (40, 2))
+    full = np.column_stack([np.zeros(40), at])
+    motion = np.cross([1e-3, -2e-3, 3e-3], full) + [0.1, 0.2, -0.3]
+    bent = np.column_stack([np.zeros((40, 2)), 1e-5 * at[:, 0] ** 2])
+    assert np.abs(without_rigid_motion(at, motion[None])).max() < 1e-12
+    left = without_rigid_motion(at, (motion + bent)[None])[0]
+    assert np.allclose(left, without_rigid_motion(at, bent[None])[0])
+    assert left.std() > 0.2 * bent.std()
+
+
+def test_the_form_is_known_better_than_single_points(use):
+    form = form_of(use)
+    assert form.calibration_mm.shape == (17, 21, 3)
+    assert (form.point_mm >= form.calibration_mm).all()
+    assert 0 < form.calibration_mm[..., 1:].max() < 0.05
+    # 0.1 px of noise: some 15 µm across the line, which is far more than the calibration leaves open.
+    assert np.median(form.point_mm[..., 2]) > 2 * np.median(form.calibration_mm[..., 2])
+    assert form.short_mm in (20.0, 50.0)
+
+
+def test_lengths_shown_where_they_are_measured_stay_in_the_volume(use):
+    region = use.region
+    mesh = region.mesh(5, 7)
+    low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
+    assert ((mesh >= low - 1e-9) & (mesh <= high + 1e-9)).all()
+    corner = Region("water", MEDIUM, region.view, np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]), np.zeros(2), 3)
+    assert corner.width_at(5.0) == pytest.approx((0.0, 5.0))
+    assert corner.has_area()
+    assert not replace(corner, outline_mm=corner.outline_mm[:2]).has_area()
+
+
+def test_against_another_calibration(calibration, thesis):
+    """Half a per cent of the focal length changes all distances across the axis by as much, and none to itself."""
+    region = regions(calibration)[0]
+    same = change_from(calibration, calibration, region)
+    assert same.largest_mm < 1e-9
+    camera = calibration.camera.model_copy(
+        update={"fx_px": 1.005 * calibration.camera.fx_px, "fy_px": 1.005 * calibration.camera.fy_px}
+    )
+    change = change_from(calibration, calibration.model_copy(update={"camera": camera}), region)
+    width = change.moved_mm[8, -1, 1] - change.moved_mm[8, 0, 1]
+    assert width == pytest.approx(0.005 * (change.at_mm[8, -1, 0] - change.at_mm[8, 0, 0]), rel=0.4)
+    small = calibration.camera.model_copy(update={"width_px": 640})
+    with pytest.raises(CalibrationError, match="image size is 1280 x 1024 px in one and 640 x 1024"):
+        change_from(calibration, calibration.model_copy(update={"camera": small}), region)
+
+
+def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, content, thesis):
+    page = certificate_page(content, calibration, before=("drawings", nominal_calibration(thesis)))
+    for words in (
+        "What lengths are worth",
+        "cannot tell",
+        "Correlation of the parameters",
+        "Against drawings",
+        content.sha256,
+        content.calibration.sha256,
+        "turn of the laser&#39;s window",
+    ):
+        assert words in page, words
+    assert "://" not in page.replace("http://www.w3.org/2000/svg", "")
+    assert "<script" not in page
+    assert page.count("<svg") == 3 + 8 + 3
+    # Maps hold pixels, in which any letters may occur.
+    text = re.sub(r'base64,[^"]*', "", page).lower()
+    assert len(text) > 10_000 and "nan" not in text.replace("nanometre", "")
+
+
+def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path):
+    path = tmp_path / "nominal.json"
+    write_calibration(path, nominal_calibration(thesis))
+    known = read_calibration(path)
+    content = certificate_of(known, path, issued=ISSUED)
+    assert content.remark == NOT_JOINT
+    assert not content.uncertainty_known
+    assert not isinstance(content, JointCertificate) and "lengths" not in content.in_file()
+    page = certificate_page(content, known)
+    assert NOT_JOINT[1:] in page
+    assert "What lengths are worth" not in page
+
+
+def test_a_damaged_volume_is_told(calibration):
+    damaged = calibration.joint.model_copy(
+        update={"covered": (calibration.joint.covered[0].model_copy(update={"medium": 7}),)}
+    )
+    with pytest.raises(CalibrationError, match="covered volume is damaged"):
+        regions(calibration.model_copy(update={"joint": damaged}))
+    region = regions(calibration)[0]
+    assert estimate_in(calibration, region).view == region.view

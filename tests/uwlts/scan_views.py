@@ -1,0 +1,98 @@
+"""Scans of bodies that stand still in water: cut by the sheet geometrically, seen by Fermat's principle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.uwlts.calibration_views import WATER, built_sensor, inside
+from tests.uwlts.joint_views import Noise, seen
+from uwlts.calibration.joint.initial_scans import ScanStripes
+from uwlts.calibration.joint.parameters import View
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Sensor
+
+VIEW = View(True, 0)
+SLOPE = np.array([0.004, -0.003])
+"""How far the stage really leans from the OCS's X, towards Y and Z."""
+NONE = Noise()
+
+_FACING = np.cos(np.radians(75))
+
+
+def square_sensor() -> Sensor:
+    """The sensor as built, but its laser's window square to the sheet, which so stays a plane in the water."""
+    laser = built_sensor().laser
+    window = laser.window.model_copy(update={"tilt_y_deg": 0.0})
+    return built_sensor().model_copy(update={"laser": laser.model_copy(update={"window": window})})
+
+
+def stage_direction(sensor: Sensor) -> np.ndarray:
+    """Where the stage really moves the sensor (3,), camera frame."""
+    turned = camera_from_object(sensor)[:3, :3] @ np.array([1.0, *SLOPE])
+    return turned / np.linalg.norm(turned)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A sphere; with ``axis`` a cylinder through the point; without ``radius`` a plane with that normal. OCS, mm."""
+
+    point: tuple[float, float, float]
+    radius: float | None = None
+    axis: tuple[float, float, float] | None = None
+
+    def lit(self, origin, rays):
+        """Where rays (N, 3) from a point first meet it, and the unit normals out of it there; NaN where they do not."""
+        away = np.array(self.point) - origin
+        axis = np.zeros(3) if self.axis is None else np.array(self.axis) / np.linalg.norm(self.axis)
+        if self.radius is None:
+            reach = (axis @ away) / (rays @ axis)
+            normals = np.broadcast_to(-axis * np.sign(axis @ away), rays.shape)
+            return origin + reach[:, None] * rays, normals
+
+        def across(vectors):
+            return vectors - np.multiply.outer(vectors @ axis, axis)
+
+        a, b = np.sum(across(rays) ** 2, axis=1), across(rays) @ across(away)
+        with np.errstate(invalid="ignore"):
+            reach = (b - np.sqrt(b**2 - a * (across(away) @ across(away) - self.radius**2))) / a
+        points = origin + reach[:, None] * rays
+        return points, across(points - self.point) / self.radius
+
+
+def scan_of(sensor: Sensor, bodies, artefact, *, stage_mm, count=200, noise=NONE, source="scan"):
+    """Stripes on bodies while the stage stands at positions (F,), and which body each lies on: (N,)."""
+    frame, pose = camera_from_object(sensor), laser_pose(sensor)
+    rotation = frame[:3, :3]
+    origin = rotation.T @ (pose.origin_mm - frame[:3, 3])
+    angle = np.linspace(-1, 1, count) * np.radians(sensor.laser.fan_angle_deg / 2)
+    rays = (np.sin(angle)[:, None] * pose.fan + np.cos(angle)[:, None] * pose.axis) @ rotation
+    moves, pupil = rotation.T @ stage_direction(sensor), -rotation.T @ frame[:3, 3]
+    pixels, image, which = [], [], []
+    for number, position in enumerate(stage_mm):
+        travel = (position + noise.draw(noise.stage_mm, ())) * moves
+        for place, body in enumerate(bodies):
+            points, normals = body.lit(origin + travel, rays)
+            towards = pupil + travel - points
+            facing = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
+            points = points[facing > _FACING] - travel
+            if not len(points):
+                continue
+            found = seen(sensor, points @ rotation.T + frame[:3, 3], index=WATER, window=True)
+            found = found[inside(found, sensor)]
+            pixels.append(found + np.column_stack([np.zeros(len(found)), noise.draw(noise.stripe_px, len(found))]))
+            image.append(np.full(len(found), number))
+            which.append(np.full(len(found), place))
+    pixels = np.vstack(pixels)
+    stripes = ScanStripes(
+        source,
+        np.concatenate(image),
+        pixels[:, 0],
+        pixels[:, 1],
+        np.full(len(pixels), 4.0),
+        np.zeros(len(pixels)),
+        np.asarray(stage_mm, dtype=float),
+        np.array([1.0, 0.0, 0.0]),
+        artefact,
+        VIEW,
+    )
+    return stripes, np.concatenate(which)

@@ -1,0 +1,272 @@
+"""Whole campaigns by Fermat's principle: all that the sensor's description states an uncertainty for is drawn anew."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from tests.uwlts.calibration_views import STEP_MM, built_sensor, inside, lattice, turn
+from tests.uwlts.joint_views import TARGET, gathered, lit_points, seen
+from uwlts.calibration.evidence import AirEvidence, StepEvidence
+from uwlts.calibration.joint.gathering import Gathered, Series
+from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.artefacts import SphereStandard, StepStandard
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Medium, Sensor
+
+SPHERES = SphereStandard(kind="spheres", diameters_mm=(50.12, 50.14), spacings_mm=(99.18,))
+PLACES_MM = {"near": -40.0, "standoff": 15.0, "far": 85.0}
+FORMULA = 1.5e-5
+"""Error that Quan and Fry state for their formula of the index of water."""
+# A finder of stripes gives up where a surface leans away further: the cosine of the angle of incidence.
+_LEAST_COSINE = 0.4
+_FEWEST_LIT = 50
+_TRACED = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Reality:
+    """What a sensor, its stage and its standards really are where drawings and certificates say something else.
+
+    ``lean`` (2,) are the slopes of the stage's direction against the target's normal,
+    ``warmer_k`` by how much the water is warmer than its thermometer says.
+    """
+
+    sensor: Sensor
+    bow: float
+    warmer_k: float
+    formula: float
+    stage_scale: float
+    lean: np.ndarray
+    target_bow_mm: float
+    step_mm: float
+    circles_px: float
+    stripe_px: float
+    stage_mm: float
+    rng: np.random.Generator
+
+    def index(self, medium: Medium, drift_k: float = 0.0) -> float:
+        """Index of a medium; that of water is of the second order in the temperature, also beyond 30 degC."""
+        if medium.kind == "air":
+            return 1.0
+        wavelength, at = self.sensor.laser.wavelength_nm, np.array([10.0, 20.0, 30.0])
+        known = [medium.model_copy(update={"temperature_c": t}).refractive_index(wavelength) for t in at]
+        return (
+            float(np.polyval(np.polyfit(at, known, 2), medium.temperature_c + self.warmer_k + drift_k)) + self.formula
+        )
+
+
+def drawn_reality(described: Sensor, rng: np.random.Generator) -> Reality:
+    """A sensor built from drawings; what they state no uncertainty for differs as in the sensor as built."""
+    known, built = described.uncertainty, built_sensor()
+    camera, laser, window = built.camera, built.laser, described.camera.window
+    slope_x, slope_y = np.tan(np.radians(known.window_tilt_deg)) * rng.standard_normal(2)
+    bow, facing = np.radians([known.bow_deg, known.laser_window_tilt_deg]) * rng.standard_normal(2)
+    window = window.model_copy(
+        update={
+            "distance_mm": window.distance_mm + rng.normal(0, known.window_distance_mm),
+            "tilt_y_deg": float(np.degrees(np.arctan(slope_x))),
+            "tilt_x_deg": float(np.degrees(np.arctan(-slope_y / np.hypot(1.0, slope_x)))),
+            "thickness_mm": window.thickness_mm + rng.normal(0, known.glass_thickness_mm),
+            "glass": window.index(laser.wavelength_nm) + rng.normal(0, known.glass_index),
+        }
+    )
+    camera = camera.model_copy(
+        update={
+            "window": window,
+            "focal_length_mm": camera.focal_length_mm + rng.normal(0, 0.03),
+            "principal_point_px": tuple(camera.principal_point() + rng.normal(0, 4.0, 2)),
+        }
+    )
+    facing_window = laser.window.model_copy(update={"tilt_y_deg": float(np.degrees(facing + bow))})
+    laser = laser.model_copy(
+        update={
+            "window": facing_window,
+            "baseline_mm": laser.baseline_mm + rng.normal(0, 0.5),
+            "triangulation_angle_deg": laser.triangulation_angle_deg + rng.normal(0, 0.1),
+            "roll_deg": laser.roll_deg + rng.normal(0, 0.1),
+        }
+    )
+    return Reality(
+        sensor=built.model_copy(update={"camera": camera, "laser": laser}),
+        bow=float(bow),
+        warmer_k=rng.normal(0, known.temperature_k),
+        formula=rng.normal(0, FORMULA),
+        stage_scale=rng.normal(0, known.stage_scale),
+        lean=np.tan(np.radians(known.stage_alignment_deg)) * rng.standard_normal(2),
+        target_bow_mm=rng.normal(0, known.target_bow_mm),
+        step_mm=STEP_MM + rng.normal(0, known.step_height_mm),
+        circles_px=rng.uniform(0.03, 0.05),
+        stripe_px=rng.uniform(0.1, 0.15),
+        stage_mm=known.stage_position_mm,
+        rng=rng,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FanRays:
+    """Rays of the fan behind the laser's window: points (N, 3) and steps (N, 3) along them, camera frame, mm."""
+
+    points: np.ndarray
+    steps: np.ndarray
+
+    @classmethod
+    def of(cls, real: Reality, index: float, count: int) -> "FanRays":
+        """Through where they light two planes; behind the window light runs straight.
+
+        A spline through so many rays is right to 1e-5 mm between them: they are smooth over the fan.
+        """
+        frame = camera_from_object(real.sensor)
+        between, wanted = np.linspace(-1, 1, _TRACED), np.linspace(-1, 1, count)
+        near, far = (
+            CubicSpline(
+                between,
+                lit_points(
+                    real.sensor,
+                    normal=frame[:3, 2],
+                    point=frame[:3, 3] + depth * frame[:3, 2],
+                    index=index,
+                    bow=real.bow,
+                    count=_TRACED,
+                ),
+            )(wanted)
+            for depth in (-150.0, 150.0)
+        )
+        return cls(near, far - near)
+
+    def on_plane(self, normal: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
+        """Where they meet a plane (N, 3); its distance along the normal may differ from ray to ray."""
+        return self.points + ((offset - self.points @ normal) / (self.steps @ normal))[:, None] * self.steps
+
+    def on_sphere(self, centre: np.ndarray, radius: float) -> np.ndarray:
+        """Where those that meet a sphere do so first (M, 3)."""
+        from_centre, length = self.points - centre, np.linalg.norm(self.steps, axis=1, keepdims=True)
+        along = self.steps / length
+        half = np.sum(from_centre * along, axis=1)
+        under_root = half**2 - np.sum(from_centre**2, axis=1) + radius**2
+        hit = under_root > 0
+        return self.points[hit] - (half[hit] + np.sqrt(under_root[hit]))[:, None] * along[hit]
+
+
+def stripe_noise(real: Reality, pixels: np.ndarray) -> np.ndarray:
+    """Pixels (N, 2) of a stripe along the width, with its noise across."""
+    return pixels + np.column_stack([np.zeros(len(pixels)), real.rng.normal(0, real.stripe_px, len(pixels))])
+
+
+def target_series(
+    real: Reality, *, view: View, index: float, positions: np.ndarray, spacings: int, rays: int
+) -> Series:
+    """The bent target on the stage with the stripe on it; every so many circles of it, for speed."""
+    sensor = real.sensor
+    frame = camera_from_object(sensor)
+    placed = turn(*real.rng.normal(0, 0.005, 2), np.pi / 2 + real.rng.normal(0, 0.01))
+    rotation = frame[:3, :3] @ placed
+    direction = rotation @ [*real.lean, 1.0]
+    direction /= np.linalg.norm(direction)
+    grid = lattice(25, 25)
+    x, y = np.round(grid[:, 0] / 9.375).astype(int), np.round(grid[:, 1] / 9.372).astype(int)
+    flat = grid[(x % spacings == 0) & (y % spacings == 0)]
+    corner = np.sum(grid[:, :2] ** 2, axis=1).max()
+
+    def bulge(points: np.ndarray) -> np.ndarray:
+        return real.target_bow_mm * np.sum(points[:, :2] ** 2, axis=1) / corner
+
+    bent = np.column_stack([flat[:, :2], bulge(flat)])
+    fan = FanRays.of(real, index, rays)
+    images, stripes = [], []
+    for position in positions:
+        travel = position * (1 + real.stage_scale) + real.rng.normal(0, real.stage_mm)
+        origin = frame[:3, 3] + 20.0 * frame[:3, 2] - travel * direction
+        pixels = seen(sensor, bent @ rotation.T + origin, index=index, window=view.window)
+        here = inside(pixels, sensor)
+        found = pixels[here] + real.rng.normal(0, real.circles_px, (here.sum(), 2))
+        images.append(TargetImage(flat[here], found, float(position)))
+        lit = fan.on_plane(rotation[:, 2], rotation[:, 2] @ origin)
+        for _ in range(2):
+            lit = fan.on_plane(rotation[:, 2], rotation[:, 2] @ origin + bulge((lit - origin) @ rotation))
+        on_it = (np.abs((lit - origin) @ rotation)[:, :2] < 115.0).all(axis=1)
+        pixels = seen(sensor, lit[on_it], index=index, window=view.window)
+        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)]))
+    evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
+    return Series(view, evidence, True, ["target"])
+
+
+def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -> list[tuple[StepEvidence, View]]:
+    """The stripe over a block on a plate, one image at each depth of the OCS."""
+    frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
+    found = []
+    for depth in depths:
+        rotation = frame[:3, :3] @ turn(*real.rng.normal(0, 0.01, 2))
+        normal, middle = rotation[:, 2], frame[:3, 3] + depth * frame[:3, 2]
+        base = fan.on_plane(normal, normal @ middle)
+        top = fan.on_plane(normal, normal @ middle - real.step_mm)
+        shift = real.rng.uniform(-12.0, 12.0)
+        on_top = np.abs((top - middle) @ rotation[:, 1] - shift) < 30.0
+        lit = np.where(on_top[:, None], top, base)
+        # The block's side and its shadow, and the plate's ends.
+        along = np.abs((lit - middle) @ rotation[:, 1] - shift)
+        lit = lit[on_top | ((along > 34.0) & (along < 75.0))]
+        pixels = seen(real.sensor, lit, index=index, window=True)
+        pixels = stripe_noise(real, pixels[inside(pixels, real.sensor)])
+        found.append((StepEvidence(pixels, StepStandard(kind="step", height_mm=STEP_MM), index, "step"), View(True, 0)))
+    return found
+
+
+def evidence(
+    real: Reality, described: Sensor, *, wet: bool, images: int = 6, spacings: int = 2, rays: int = 150
+) -> Gathered:
+    """Target images without and with the camera's window, in air or in water, and for the latter some of a step."""
+    water = described.media["water"]
+    index = real.index(water) if wet else 1.0
+    size = {"spacings": spacings, "rays": rays}
+    series = [
+        target_series(real, view=View(False, None), index=1.0, positions=np.linspace(-180, 60, images), **size),
+        target_series(
+            real, view=View(True, 0 if wet else None), index=index, positions=np.linspace(-120, 60, images), **size
+        ),
+    ]
+    steps = step_images(real, index=index, depths=np.array([-45.0, 5.0, 75.0]), rays=rays) if wet else []
+    return replace(gathered(described, series, steps), media={"water": water} if wet else {})
+
+
+@dataclass(frozen=True, eq=False)
+class ScanStripes:
+    """Stripe centres of a scan: image, column and row (N,) of each, and what the stage says (F,) in mm."""
+
+    frame: np.ndarray
+    line: np.ndarray
+    centre_px: np.ndarray
+    stage_mm: np.ndarray
+
+
+def scan_of_spheres(
+    real: Reality, *, index: float, place: str, positions: np.ndarray, lean: np.ndarray, rays: int = 800
+) -> ScanStripes:
+    """Stripes on the sphere standard, the sensor moved across it along the sheet's normal but for a lean (2,)."""
+    frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
+    # A beam tilted into the line optics turns the sheet's normal as a whole.
+    frame[:3, :3] = frame[:3, :3] @ turn(0.0, real.bow, 0.0)
+    direction = frame[:3, :3] @ [1.0, *lean]
+    direction /= np.linalg.norm(direction)
+    spun = turn(*np.radians(real.rng.normal(0, (5.0, 0.0, 5.0))))
+    parts = []
+    for number, position in enumerate(positions):
+        travel = position * (1 + real.stage_scale) + real.rng.normal(0, real.stage_mm)
+        for side, diameter in zip((-1, 1), SPHERES.diameters_mm, strict=True):
+            centre = spun @ [0.0, side * SPHERES.spacings_mm[0] / 2, 0.0] + [0.0, 0.0, PLACES_MM[place]]
+            centre = frame[:3, :3] @ centre + frame[:3, 3] - travel * direction
+            lit = fan.on_sphere(centre, diameter / 2)
+            outward = (lit - centre) / (diameter / 2)
+            facing = -np.sum(outward * lit, axis=1) / np.linalg.norm(lit, axis=1)
+            lit = lit[(facing > _LEAST_COSINE) & (outward @ -frame[:3, 2] > _LEAST_COSINE)]
+            if len(lit) < _FEWEST_LIT:
+                continue
+            pixels = seen(real.sensor, lit, index=index, window=True)
+            pixels = pixels[inside(pixels, real.sensor)]
+            pixels = pixels[np.argsort(pixels[:, 0])]
+            columns = np.arange(np.ceil(pixels[0, 0]), pixels[-1, 0])
+            rows = CubicSpline(*pixels.T)(columns)
+            parts.append((np.full(len(columns), number), columns.astype(int), rows))
+    frame_of, line, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return ScanStripes(frame_of, line, rows + real.rng.normal(0, real.stripe_px, len(rows)), positions)

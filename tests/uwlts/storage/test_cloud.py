@@ -1,0 +1,397 @@
+"""Clouds survive the disk bit by bit, outputs appear whole or not at all, damaged files are refused."""
+
+import errno
+import os
+import resource
+from dataclasses import fields
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from tests.system.in_process import uwlts
+from tests.uwlts import drawn_stripes
+from uwlts.model.errors import CaptureError, OutputError
+from uwlts.storage.capture import Capture
+from uwlts.storage.cloud import PointCloud, PointUncertainty, is_cloud, read_cloud, write_cloud
+from uwlts.storage.files import written_aside
+
+KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
+
+
+def some_cloud(count: int = 40, **changes) -> PointCloud:
+    rng = np.random.default_rng(3)
+    values = {
+        "points_mm": rng.normal(scale=300.0, size=(count, 3)),
+        "intensity": rng.random(count),
+        "frame": np.arange(count) // 7,
+        "line": np.arange(count) * 3,
+        "deviation_mm": np.where(np.arange(count) % 5, rng.normal(size=count), np.nan),
+        "metadata": {"medium": "water", "nested": {"n": [1.3315, 2, None, True]}},
+    }
+    return PointCloud(**{**values, **changes})
+
+
+def some_uncertainty(count: int = 40, patterns: int = 3) -> PointUncertainty:
+    rng = np.random.default_rng(5)
+    shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3)}
+    names = [part.name for part in fields(PointUncertainty)]
+    return PointUncertainty(**{n: rng.normal(size=shapes.get(n, (count, 3))).astype(np.float32) for n in names})
+
+
+@KINDS
+def test_a_cloud_comes_back_bit_by_bit(tmp_path, name):
+    cloud = some_cloud(uncertainty=some_uncertainty())
+    write_cloud(tmp_path / name, cloud)
+    back = read_cloud(tmp_path / name)
+    assert len(back) == 40
+    for field, kind in (
+        ("points_mm", np.float64),
+        ("intensity", np.float32),
+        ("frame", np.int32),
+        ("line", np.int32),
+        ("deviation_mm", np.float32),
+    ):
+        assert getattr(back, field).dtype == kind
+        np.testing.assert_array_equal(getattr(back, field), getattr(cloud, field))
+    for part in fields(PointUncertainty):
+        found = getattr(back.uncertainty, part.name)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, getattr(cloud.uncertainty, part.name))
+    assert back.metadata == cloud.metadata
+    assert os.listdir(tmp_path) == [name]
+    assert is_cloud(tmp_path / name)
+
+
+@KINDS
+def test_a_cloud_without_points_deviation_or_uncertainty_comes_back(tmp_path, name):
+    write_cloud(tmp_path / f"none-{name}", PointCloud(np.zeros((0, 3)), [], [], []))
+    assert len(read_cloud(tmp_path / f"none-{name}")) == 0
+    write_cloud(tmp_path / name, some_cloud(deviation_mm=None))
+    back = read_cloud(tmp_path / name)
+    assert back.deviation_mm is None
+    assert back.uncertainty is None
+
+
+def test_both_files_hold_the_systematic_covariance_for_other_programs(tmp_path):
+    cloud = some_cloud(uncertainty=some_uncertainty())
+    for name in ("a.ply", "a.h5"):
+        write_cloud(tmp_path / name, cloud)
+    vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    pairs = [f"systematic_{pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")]
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert dict(file.attrs)["format"] == b"uwlts-cloud"
+        np.testing.assert_array_equal(file["systematic_mm2"], np.stack([vertices[pair] for pair in pairs], axis=1))
+
+
+def test_captures_and_clouds_in_hdf5_are_told_apart(tmp_path):
+    capture = drawn_stripes.write(tmp_path / "capture.h5", [])
+    write_cloud(tmp_path / "cloud.h5", some_cloud())
+    assert not is_cloud(capture)
+    with pytest.raises(CaptureError, match=r"its format is 'uwlts-capture', expected 'uwlts-cloud'"):
+        read_cloud(capture)
+    with pytest.raises(CaptureError, match=r"its format is 'uwlts-cloud', expected 'uwlts-capture'"):
+        Capture(tmp_path / "cloud.h5")
+
+
+def test_a_cloud_in_hdf5_goes_through_the_commands(tmp_path):
+    write_cloud(tmp_path / "a.h5", some_cloud(uncertainty=some_uncertainty()))
+    assert "cloud of 40 points from 6 frames" in uwlts("info", tmp_path / "a.h5").stdout
+    assert uwlts("export", tmp_path / "a.h5", "--out", tmp_path / "b.ply").returncode == 0
+    assert uwlts("export", tmp_path / "b.ply", "--out", tmp_path / "c.h5").returncode == 0
+    back = read_cloud(tmp_path / "c.h5")
+    np.testing.assert_array_equal(back.points_mm, some_cloud().points_mm)
+    np.testing.assert_array_equal(back.uncertainty.patterns_mm, some_uncertainty().patterns_mm)
+    refused = uwlts("export", drawn_stripes.write(tmp_path / "d.h5", []), "--out", tmp_path / "d.h5")
+    assert refused.returncode == 2
+
+
+def _without(name):
+    def damage(file):
+        del file[name]
+
+    return damage
+
+
+def _text_for(name):
+    def damage(file):
+        del file[name]
+        file[name] = np.array([b"one"] * 40)
+
+    return damage
+
+
+def _shorter(file):
+    values = file["frame"][:-1]
+    del file["frame"]
+    file["frame"] = values
+
+
+def _newer(file):
+    file.attrs["version"] = 99
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_without("line"), "has no line"),
+        (_without("random_mm2"), "has no random_mm2"),
+        (_text_for("intensity"), "intensity are no numbers"),
+        (_shorter, "frame has the shape"),
+        (_newer, "has version 99"),
+        (lambda file: file.create_group("more"), "not a complete HDF5 file of a cloud"),
+    ],
+)
+def test_a_damaged_cloud_in_hdf5_is_refused(tmp_path, damage, message):
+    path = tmp_path / "damaged.h5"
+    write_cloud(path, some_cloud(uncertainty=some_uncertainty()))
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(CaptureError, match=message) as refusal:
+        read_cloud(path)
+    assert "damaged.h5" in str(refusal.value)
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(deadline=None, max_examples=40)
+@given(metadata=st.dictionaries(st.text(), JSON, max_size=5), blanks=st.integers(0, 1000))
+def test_any_metadata_comes_back_through_short_ascii_lines(tmp_path_factory, metadata, blanks):
+    # The run of blanks puts every kind of character at the end of a comment.
+    metadata = {**metadata, "blanks": "x" + " " * blanks + "\n"}
+    path = tmp_path_factory.mktemp("metadata") / "a.ply"
+    for each in (path, path.with_suffix(".h5")):
+        write_cloud(each, some_cloud(3, metadata=metadata))
+        assert read_cloud(each).metadata == metadata
+    header = path.read_bytes().split(b"end_header\n")[0]
+    # rply, the reader of CloudCompare and others, refuses comments of 1024 characters.
+    assert max(len(line) for line in header.split(b"\n")) < 1024
+    assert header.isascii()
+
+
+def test_the_header_is_what_other_programs_expect(tmp_path):
+    write_cloud(tmp_path / "a.ply", some_cloud())
+    header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert [line for line in header if not line.startswith("comment")][2:] == [
+        "element vertex 40",
+        "property double x",
+        "property double y",
+        "property double z",
+        "property float intensity",
+        "property float deviation",
+        "property int frame",
+        "property int line",
+    ]
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8", "i4"])
+@pytest.mark.parametrize("text", [False, True])
+def test_files_of_other_programs_need_only_positions(tmp_path, kind, text):
+    vertices = np.array([(1, 2, 3, 255), (4, 5, 6, 0)], dtype=[("z", kind), ("x", kind), ("y", kind), ("red", "u1")])
+    faces = np.array([([0, 1, 0],)], dtype=[("vertex_indices", "O")])
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, text=text, byte_order=">").write(str(tmp_path / "foreign.ply"))
+    cloud = read_cloud(tmp_path / "foreign.ply")
+    np.testing.assert_array_equal(cloud.points_mm, [[2, 3, 1], [5, 6, 4]])
+    assert cloud.points_mm.dtype == np.float64
+    assert np.isnan(cloud.intensity).all()
+    assert (cloud.frame == -1).all() and (cloud.line == -1).all()
+    assert cloud.deviation_mm is None and cloud.metadata == {}
+
+
+def test_fields_saved_again_by_cloudcompare_are_recognised(tmp_path):
+    names = ["x", "y", "z", "scalar_intensity", "scalar_frame", "scalar_line"]
+    vertices = np.array([(1, 2, 3, 0.5, 7, 9)], dtype=[(name, "f4") for name in names])
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "cc.ply"))
+    cloud = read_cloud(tmp_path / "cc.ply")
+    assert (cloud.intensity[0], cloud.frame[0], cloud.line[0]) == (0.5, 7, 9)
+
+
+@KINDS
+def test_every_truncation_is_refused(tmp_path, name):
+    write_cloud(tmp_path / name, some_cloud())
+    whole, cut = (tmp_path / name).read_bytes(), tmp_path / f"cut-{name}"
+    checked = 0
+    for length in range(0, len(whole), 11):
+        cut.write_bytes(whole[:length])
+        with pytest.raises(CaptureError, match=cut.name):
+            read_cloud(cut)
+        checked += 1
+    assert checked > 150
+
+
+def foreign(tmp_path: Path, *, content: bytes = b"", dtype=None, row=None) -> Path:
+    path = tmp_path / "foreign.ply"
+    if dtype is None:
+        path.write_bytes(content)
+    else:
+        PlyData([PlyElement.describe(np.array([row], dtype=dtype), "vertex")]).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ({"content": b"\x89PNG\r\n"}, "not a complete PLY"),
+        ({"content": b"ply\nformat ascii 1.0\nend_header\n"}, "without vertices"),
+        ({"dtype": [("x", "f4"), ("y", "f4")], "row": (1, 2)}, "no z"),
+        ({"dtype": [("x", "O"), ("y", "f4"), ("z", "f4")], "row": ([1, 2], 2, 3)}, "x is a list"),
+        ({"dtype": [("x", "f4"), ("y", "f4"), ("z", "f4")], "row": (1, np.nan, 3)}, "1 of 1 points"),
+        (
+            {"dtype": [("x", "f4"), ("y", "f4"), ("z", "f4"), ("frame", "f4")], "row": (1, 2, 3, 0.5)},
+            "no whole numbers",
+        ),
+        (
+            {
+                "content": b"ply\nformat ascii 1.0\ncomment uwlts-metadata 1/2 {};\nelement vertex 0\n"
+                b"property float x\nproperty float y\nproperty float z\nend_header\n"
+            },
+            "incomplete",
+        ),
+        (
+            {
+                "content": b"ply\nformat ascii 1.0\ncomment uwlts-metadata 1/1 {;\nelement vertex 0\n"
+                b"property float x\nproperty float y\nproperty float z\nend_header\n"
+            },
+            "damaged",
+        ),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path, content, message):
+    with pytest.raises(CaptureError, match=message) as refusal:
+        read_cloud(foreign(tmp_path, **content))
+    assert "foreign.ply" in str(refusal.value)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    for name in ("none.ply", "none.h5"):
+        with pytest.raises(CaptureError, match="does not exist"):
+            read_cloud(tmp_path / name)
+    with pytest.raises(CaptureError, match="cannot be read"):
+        read_cloud(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"points_mm": np.zeros((40, 2))}, r"\(N, 3\)"),
+        ({"points_mm": np.full((40, 3), np.inf)}, "40 of 40"),
+        ({"frame": np.zeros(39)}, "frame has the shape"),
+        ({"deviation_mm": np.zeros((40, 1))}, "deviation_mm has the shape"),
+        ({"metadata": {"bad": np.float32(1)}}, "JSON"),
+        ({"metadata": {"bad": float("nan")}}, "JSON"),
+        ({"metadata": {1: "keys are strings"}}, "dict of strings"),
+    ],
+)
+def test_inconsistent_clouds_are_refused(changes, message):
+    with pytest.raises(CaptureError, match=message):
+        some_cloud(**changes)
+
+
+def test_a_cloud_cannot_be_changed_through_its_arrays():
+    cloud = some_cloud()
+    with pytest.raises(ValueError, match="read-only"):
+        cloud.points_mm[0] = 0
+
+
+@KINDS
+def test_existing_files_are_refused_unless_overwriting_is_asked_for(tmp_path, name):
+    path = tmp_path / name
+    write_cloud(path, some_cloud())
+    with pytest.raises(OutputError, match="exists already"):
+        write_cloud(path, some_cloud(3))
+    assert len(read_cloud(path)) == 40
+    write_cloud(path, some_cloud(3), overwrite=True)
+    assert len(read_cloud(path)) == 3
+
+
+@KINDS
+def test_a_write_that_the_system_cuts_short_leaves_the_old_file(tmp_path, name):
+    path = tmp_path / name
+    write_cloud(path, some_cloud(3))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OutputError, match=f"cannot write .*{name}"):
+            write_cloud(path, some_cloud(5000), overwrite=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(read_cloud(path)) == 3
+    assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt, ValueError, SystemExit])
+def test_any_exception_removes_the_temporary_file(tmp_path, interruption):
+    (tmp_path / "a.json").write_text("old")
+    with pytest.raises(interruption), written_aside(tmp_path / "a.json", overwrite=True) as aside:
+        aside.write_text("half")
+        raise interruption
+    assert os.listdir(tmp_path) == ["a.json"]
+    assert (tmp_path / "a.json").read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    "number, message",
+    [(errno.ENOSPC, "disk is full"), (errno.EACCES, "no permission"), (errno.EROFS, "read-only"), (errno.EIO, "error")],
+)
+def test_errors_of_the_system_say_what_to_do(tmp_path, number, message):
+    with pytest.raises(OutputError, match=message), written_aside(tmp_path / "a.json"):
+        raise OSError(number, os.strerror(number))
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_file_appears_at_the_end_with_its_suffix_and_ordinary_permissions(tmp_path):
+    mask = os.umask(0o027)
+    try:
+        with written_aside(tmp_path / "a.json") as aside:
+            aside.write_text("{}")
+            assert aside.parent == tmp_path and aside.suffix == ".json"
+            assert not (tmp_path / "a.json").exists()
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "a.json").read_text() == "{}"
+    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
+    with pytest.raises(OutputError, match="exists already"), written_aside(tmp_path / "a.json") as aside:
+        aside.write_text("mine")
+        (tmp_path / "a.json").write_text("theirs")
+    assert (tmp_path / "a.json").read_text() == "theirs"
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_link_stays_and_its_file_is_replaced(tmp_path):
+    (tmp_path / "file.json").write_text("old")
+    (tmp_path / "link.json").symlink_to("file.json")
+    with written_aside(tmp_path / "link.json", overwrite=True) as aside:
+        aside.write_text("new")
+    assert (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "file.json").read_text() == "new"
+
+
+def test_unsuitable_places_are_refused_before_the_body_runs(tmp_path):
+    (tmp_path / "folder.json").mkdir()
+    for path, message in (
+        (tmp_path / "missing" / "a.json", "create it first"),
+        (tmp_path / "folder.json", "not a regular file"),
+        (Path("/dev/null"), "not a regular file"),
+    ):
+        with pytest.raises(OutputError, match=message), written_aside(path, overwrite=True):
+            pytest.fail("the body ran")
+    with pytest.raises(OutputError, match="cannot write"), written_aside(Path("/proc/a.json")):
+        pytest.fail("the body ran")

@@ -1,0 +1,214 @@
+"""Captures and clouds in other programs' formats, read back by those formats' own libraries."""
+
+import contextlib
+import sys
+from pathlib import Path
+
+import cv2
+import laspy
+import numpy as np
+import pye57
+import pytest
+
+from tests.uwlts.storage.test_capture import a_header, record, small_sensor
+from uwlts import cli
+from uwlts.model.errors import OutputError, SetupError
+from uwlts.runtime.console import run
+from uwlts.storage.capture import Capture, CaptureWriter, Frame
+from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.export_ import CLOUD_FORMATS, LAZ_STEP_M, export_capture, export_cloud
+from uwlts.storage.import_ import import_folder
+
+
+def a_cloud(count: int = 500, *, reach_mm: float = 300.0, **changes) -> PointCloud:
+    rng = np.random.default_rng(3)
+    known = {
+        "points_mm": rng.uniform(-reach_mm, reach_mm, (count, 3)) + [0, 0, 400.0],
+        "intensity": rng.uniform(0, 255, count),
+        "frame": np.arange(count) // 10,
+        "line": np.arange(count) % 10,
+        "metadata": {"medium": "water"},
+    }
+    return PointCloud(**(known | changes))
+
+
+def assert_same(first: Path, second: Path) -> None:
+    """Two captures that hold the same to the last bit."""
+    with Capture(first) as a, Capture(second) as b:
+        assert a.header.model_dump_json() == b.header.model_dump_json()
+        assert a.dtype == b.dtype and len(a) == len(b) > 0
+        for name in ("stage_mm", "pose", "laser_on", "exposure_ms", "time_s"):
+            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=name == "pose")
+        for index in range(len(a)):
+            assert np.array_equal(a.image(index), b.image(index))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("image_format", ["png", "tiff"])
+def test_an_exported_capture_comes_back(tmp_path: Path, dtype: type, image_format: str):
+    # What import says of images without a stripe or with odd headers does not matter to a capture of its own.
+    header = a_header(saturation_dn=int(np.iinfo(dtype).max), artefact={"kind": "plane", "flatness_mm": None})
+    record(tmp_path / "a.h5", 7, dtype, header=header)
+    with Capture(tmp_path / "a.h5") as capture:
+        export_capture(capture, tmp_path / "images", image_format=image_format)
+    import_folder(tmp_path / "images", tmp_path / "b.h5")
+    assert_same(tmp_path / "a.h5", tmp_path / "b.h5")
+    assert sorted(path.suffix for path in (tmp_path / "images").iterdir()) == sorted(
+        [".csv", ".json", ".toml"] + 7 * [f".{image_format}"]
+    )
+
+
+def test_poses_and_numbers_come_back_to_the_last_bit(tmp_path: Path):
+    rng = np.random.default_rng(5)
+    sensor = small_sensor()
+    shape = (sensor.camera.height_px, sensor.camera.width_px)
+    with CaptureWriter(tmp_path / "a.h5", a_header(sensor=sensor, target=None), dtype=np.uint8) as writer:
+        for index in range(4):
+            stage, exposure, time = rng.normal(size=3).tolist()
+            image = rng.integers(0, 255, shape, dtype=np.uint8)
+            writer.append(
+                Frame(image, stage, index < 2, exposure, time, rng.normal(size=(4, 4)) if index % 2 else None)
+            )
+    with Capture(tmp_path / "a.h5") as capture:
+        export_capture(capture, tmp_path / "images")
+    import_folder(tmp_path / "images", tmp_path / "b.h5")
+    assert_same(tmp_path / "a.h5", tmp_path / "b.h5")
+
+
+def test_all_sixteen_bits_are_in_the_files(tmp_path: Path):
+    record(tmp_path / "a.h5", 1, np.uint16)
+    with Capture(tmp_path / "a.h5") as capture:
+        export_capture(capture, tmp_path / "images")
+        stored = cv2.imread(str(tmp_path / "images" / "00000-lamp.png"), cv2.IMREAD_UNCHANGED)
+        assert stored.dtype == np.uint16 and np.array_equal(stored, capture.image(0)) and stored.max() > 60000
+
+
+def test_a_folder_that_exists_stays(tmp_path: Path):
+    record(tmp_path / "a.h5", 2)
+    (tmp_path / "images").mkdir()
+    with Capture(tmp_path / "a.h5") as capture:
+        with pytest.raises(OutputError, match="exists already"):
+            export_capture(capture, tmp_path / "images")
+        with pytest.raises(OutputError, match="does not exist; create it first"):
+            export_capture(capture, tmp_path / "no" / "images")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.h5", "images"]
+
+
+def test_an_interruption_leaves_nothing(tmp_path: Path):
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    record(tmp_path / "a.h5", 2)
+    with Capture(tmp_path / "a.h5") as capture, contextlib.suppress(KeyboardInterrupt):
+        export_capture(capture, tmp_path / "images", progress=interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_ply_keeps_everything(tmp_path: Path):
+    cloud = a_cloud(deviation_mm=np.linspace(-1, 1, 500))
+    export_cloud(cloud, tmp_path / "a.ply")
+    back = read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(back.points_mm, cloud.points_mm) and np.array_equal(back.intensity, cloud.intensity)
+    assert np.array_equal(back.deviation_mm, cloud.deviation_mm) and back.metadata == cloud.metadata
+
+
+def test_xyz_keeps_every_digit(tmp_path: Path):
+    cloud = a_cloud(intensity=np.r_[np.nan, np.random.default_rng(1).uniform(0, 255, 499)])
+    export_cloud(cloud, tmp_path / "a.xyz")
+    assert (tmp_path / "a.xyz").read_text().startswith("//X Y Z Intensity\n")
+    back = np.loadtxt(tmp_path / "a.xyz", comments="//")
+    assert np.array_equal(back[:, :3], cloud.points_mm)
+    assert np.array_equal(back[:, 3].astype(np.float32), cloud.intensity, equal_nan=True)
+
+
+def test_laz_keeps_a_tenth_of_a_micrometre(tmp_path: Path):
+    cloud = a_cloud(deviation_mm=np.linspace(-1, 1, 500), intensity=np.r_[np.nan, np.linspace(0, 300, 499)])
+    export_cloud(cloud, tmp_path / "a.laz")
+    content = laspy.read(tmp_path / "a.laz")
+    assert (tmp_path / "a.laz").read_bytes()[:4] == b"LASF" and content.header.are_points_compressed
+    # Rounded to half a step, and the sum with the offset to double precision.
+    assert np.abs(content.xyz - 1e-3 * cloud.points_mm).max() <= 0.5001 * LAZ_STEP_M
+    assert np.array_equal(np.array(content["amplitude"]), cloud.intensity, equal_nan=True)
+    assert content.intensity[0] == 0 and np.abs(content.intensity[1:] - cloud.intensity[1:]).max() <= 0.5
+    assert np.array_equal(content["frame"], cloud.frame) and np.array_equal(content["line"], cloud.line)
+    assert np.array_equal(np.array(content["deviation_mm"]), cloud.deviation_mm)
+
+
+def test_laz_refuses_what_its_steps_do_not_reach(tmp_path: Path):
+    wide = a_cloud(2, points_mm=np.array([[0.0, 0, 0], [500e3, 0, 0]]))
+    with pytest.raises(OutputError, match="reaches 250 m from its middle"):
+        export_cloud(wide, tmp_path / "a.laz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_e57_keeps_single_precision(tmp_path: Path):
+    cloud = a_cloud()
+    export_cloud(cloud, tmp_path / "a.e57")
+    file = pye57.E57(str(tmp_path / "a.e57"))
+    back = file.read_scan_raw(0)
+    file.close()
+    found = np.column_stack([back[f"cartesian{axis}"] for axis in "XYZ"])
+    # Half a unit in the last of 24 binary digits, of coordinates below 1 m.
+    assert np.abs(found - 1e-3 * cloud.points_mm).max() <= 2.0**-25
+    assert np.array_equal(np.asarray(back["intensity"], dtype=np.float32), cloud.intensity)
+
+
+def test_e57_of_unknown_intensity(tmp_path: Path):
+    export_cloud(a_cloud(intensity=np.full(500, np.nan)), tmp_path / "a.e57")
+    file = pye57.E57(str(tmp_path / "a.e57"))
+    assert "intensity" not in file.read_scan_raw(0)
+    file.close()
+    with pytest.raises(OutputError, match="1 of 500 points have no intensity"):
+        export_cloud(a_cloud(intensity=np.r_[np.nan, np.ones(499)]), tmp_path / "b.e57")
+
+
+@pytest.mark.parametrize("suffix", CLOUD_FORMATS)
+def test_one_point_and_a_flat_cloud(tmp_path: Path, suffix: str):
+    export_cloud(a_cloud(1), tmp_path / f"one{suffix}")
+    export_cloud(a_cloud(points_mm=a_cloud().points_mm * [1, 1, 0]), tmp_path / f"flat{suffix}")
+
+
+@pytest.mark.parametrize("suffix", CLOUD_FORMATS)
+def test_what_exists_stays_and_nothing_is_made_of_nothing(tmp_path: Path, suffix: str):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"precious")
+    with pytest.raises(OutputError, match="exists already"):
+        export_cloud(a_cloud(), path)
+    assert path.read_bytes() == b"precious"
+    export_cloud(a_cloud(), path, overwrite=True)
+    assert path.stat().st_size > 1000
+    empty = a_cloud(0, points_mm=np.empty((0, 3)), intensity=np.empty(0), frame=np.empty(0), line=np.empty(0))
+    with pytest.raises(OutputError, match="has no points"):
+        export_cloud(empty, tmp_path / f"b{suffix}")
+    assert [left.name for left in tmp_path.iterdir()] == [path.name]
+
+
+def test_unknown_endings_are_refused(tmp_path: Path):
+    with pytest.raises(OutputError, match=r"ends with none of .ply, .h5, .xyz, .laz, .e57"):
+        export_cloud(a_cloud(), tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize(("library", "suffix"), [("laspy", ".laz"), ("lazrs", ".laz"), ("pye57", ".e57")])
+def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, suffix: str):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(SetupError, match=rf"needs the library {library}.*uwlts\[clouds\]"):
+        export_cloud(a_cloud(), tmp_path / f"a{suffix}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    record(tmp_path / "a.h5", 3)
+    write_cloud(tmp_path / "a.ply", a_cloud())
+
+    def called(*arguments: str) -> int:
+        monkeypatch.setattr("sys.argv", ["uwlts", *arguments])
+        return run(cli.app)
+
+    assert called("export", str(tmp_path / "a.h5"), "--out", str(tmp_path / "images"), "--images", "tiff") == 0
+    assert "wrote 3 images" in capsys.readouterr().out
+    assert called("import", str(tmp_path / "images"), "--out", str(tmp_path / "b.h5")) == 0
+    assert called("export", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.laz")) == 0
+    assert called("export", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.laz")) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert called("export", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.laz"), "--overwrite") == 0
+    assert_same(tmp_path / "a.h5", tmp_path / "b.h5")

@@ -1,0 +1,504 @@
+"""Images of others become a capture: formats, channels, bits, positions, and refusals that name the cause."""
+
+import contextlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tomli_w
+
+from uwlts import cli
+from uwlts.model.errors import DescriptionError, ImageError, OutputError
+from uwlts.runtime.console import run
+from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.import_ import import_folder
+from uwlts.storage.import_.images import SUFFIXES, grey_values, one_channel, read_image
+from uwlts.storage.import_.matching import natural_key, read_rows
+from uwlts.stripe import extract_stripe
+
+WIDTH, HEIGHT = 96, 64
+SENSOR = {
+    "base": "thesis",
+    "name": "small",
+    "camera": {"width_px": WIDTH, "height_px": HEIGHT, "stripe_along": "width"},
+}
+TOLD = {
+    "sensor": SENSOR,
+    "medium": "water",
+    "laser": "*.png",
+    "stage": {"start_mm": 5.0, "step_mm": 0.5, "direction": [1.0, 0.0, 0.0]},
+}
+
+
+def stripe_image(row: float = 30.3, *, height: float = 150.0, dark: float = 10.0, seed: int = 0) -> np.ndarray:
+    """(H, W) uint8: a Gaussian line along the width."""
+    across = np.arange(HEIGHT)[:, None] - np.full(WIDTH, row)
+    noise = np.random.default_rng(seed).normal(0, 1, across.shape)
+    return np.clip(dark + height * np.exp(-((across / 1.5) ** 2) / 2) + noise, 0, 255).round().astype(np.uint8)
+
+
+def lamp_image(seed: int = 0) -> np.ndarray:
+    """(H, W) uint8: stripes of a lit scene."""
+    scene = 60 + 50 * np.sin(np.arange(WIDTH) / 3)
+    return np.clip(np.random.default_rng(seed).normal(scene, 2, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
+
+
+def folder_of(tmp_path: Path, images: dict[str, np.ndarray], told: dict | None = None) -> Path:
+    folder = tmp_path / "images"
+    for name, image in images.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(folder / name), image)
+    (folder / "import.toml").write_text(tomli_w.dumps(TOLD if told is None else told))
+    return folder
+
+
+def three(tmp_path: Path, told: dict | None = None, **others: np.ndarray) -> Path:
+    images = {f"l{number}.png": stripe_image(20.0 + number, seed=number) for number in (1, 2, 3)}
+    return folder_of(tmp_path, images | {f"{name}.png": image for name, image in others.items()}, told)
+
+
+def without(*keys: str, **changes) -> dict:
+    return {key: value for key, value in TOLD.items() if key not in keys} | changes
+
+
+# --- what comes in
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_format_comes_in(tmp_path: Path, suffix: str):
+    image = stripe_image()
+    folder = folder_of(tmp_path, {f"a{suffix}": image}, without("laser", laser=f"*{suffix}"))
+    assert import_folder(folder, tmp_path / "a.h5").warnings == ()
+    with Capture(tmp_path / "a.h5") as capture:
+        error = np.abs(capture.image(0).astype(int) - image)
+        # JPEG at OpenCV's quality of 95 quantises the cosines by a few grey levels.
+        assert error.max() <= (12 if suffix in (".jpg", ".jpeg") else 0)
+
+
+def test_everything_told_is_in_the_capture(tmp_path: Path):
+    target = {"kind": "chessboard", "columns": 9, "rows": 6, "square_mm": 15.0}
+    artefact = {"kind": "step", "height_mm": 23.17}
+    told = without("laser", laser="l*", lamp="w*", exposure_ms=4.0, lamp_exposure_ms=9.0, target=target, name="bench")
+    images = {f"l{n}.png": stripe_image(20.0 + n) for n in (1, 10, 9)} | {
+        f"w{n}.png": lamp_image(n) for n in (1, 9, 10)
+    }
+    folder = folder_of(tmp_path, images, told | {"artefact": artefact})
+    imported = import_folder(folder, tmp_path / "a.h5")
+    assert (imported.laser, imported.lamp, imported.warnings) == (3, 3, ())
+    with Capture(tmp_path / "a.h5") as capture:
+        header = capture.header
+        assert (header.name, header.medium_name, header.target, header.artefact) == ("bench", "water", target, artefact)
+        assert (header.stage_direction, header.saturation_dn, capture.dtype) == ((1.0, 0.0, 0.0), 255, np.uint8)
+        assert header.sensor.camera.width_px == WIDTH and header.sensor.laser.wavelength_nm == 635.0
+        assert header.provenance["source"] == "imported images" and "time" in header.provenance
+        assert "exposure" not in header.provenance
+        assert capture.stage_mm.tolist() == [5.0, 5.0, 5.5, 5.5, 6.0, 6.0]
+        assert capture.laser_on.tolist() == [False, True] * 3
+        assert capture.exposure_ms.tolist() == [9.0, 4.0] * 3
+        for index, name in enumerate(("w1", "l1", "w9", "l9", "w10", "l10")):
+            assert np.array_equal(capture.image(index), images[f"{name}.png"])
+
+
+def test_names_are_sorted_as_people_count():
+    names = ["b2", "a10.png", "A9.png", "a1/f12", "a1/f2"]
+    assert sorted(names, key=natural_key) == ["a1/f2", "a1/f12", "A9.png", "a10.png", "b2"]
+
+
+@pytest.mark.parametrize("channel", ["blue", "green", "red", "grey", "max"])
+def test_the_chosen_channel_comes_in(tmp_path: Path, channel: str):
+    blue, green, red = (lamp_image(seed) for seed in (1, 2, 3))
+    red = np.maximum(red, stripe_image())
+    folder = folder_of(tmp_path, {"a.png": np.dstack([blue, green, red])}, TOLD | {"channel": channel})
+    import_folder(folder, tmp_path / "a.h5")
+    # Luminance after ITU-R BT.601, as OpenCV documents it, rounded.
+    luminance = 0.114 * blue + 0.587 * green + 0.299 * red
+    wanted = {
+        "blue": blue,
+        "green": green,
+        "red": red,
+        "grey": luminance,
+        "max": np.maximum(np.maximum(blue, green), red),
+    }
+    with Capture(tmp_path / "a.h5") as capture:
+        assert np.abs(capture.image(0) - wanted[channel].astype(float)).max() <= (0.51 if channel == "grey" else 0)
+
+
+def test_colour_without_colours_needs_no_channel():
+    image = stripe_image()
+    assert np.array_equal(one_channel(np.dstack([image] * 3), None, name="a"), image)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+@pytest.mark.parametrize("bits", [10, 12, 16])
+@pytest.mark.parametrize("aligned", ["low", "high"])
+def test_all_bits_come_in(tmp_path: Path, suffix: str, bits: int, aligned: str):
+    image = stripe_image().astype(np.uint16) * 2 ** (bits - 8) + 1
+    stored = image * 2 ** (16 - bits) if aligned == "high" else image
+    told = without("laser", laser="a*", bits=bits, aligned=aligned)
+    import_folder(folder_of(tmp_path, {f"a{suffix}": stored}, told), tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 2**bits - 1)
+        assert np.array_equal(capture.image(0), image)
+
+
+def test_a_background_is_subtracted_with_its_sign(tmp_path: Path):
+    dark = [lamp_image(seed) for seed in (4, 5)]
+    lit = [np.clip(scene.astype(int) + stripe_image(25.25, height=90, dark=0, seed=9), 0, 255) for scene in dark]
+    images = {f"l{n}.png": image.astype(np.uint8) for n, image in enumerate(lit)}
+    images |= {f"w{n}.png": image for n, image in enumerate(dark)}
+    told = without("laser", laser="l*", lamp="w*", background="w*")
+    import_folder(folder_of(tmp_path, images, told), tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 255 + 256)
+        assert "256 added" in capture.header.provenance["background"]
+        for index in range(2):
+            assert np.array_equal(capture.image(2 * index), dark[index])
+            difference = capture.image(2 * index + 1).astype(int) - 256
+            assert np.array_equal(difference, lit[index].astype(int) - dark[index]) and difference.min() == 0
+            # Read out as the stripe software does with the two images themselves.
+            stored = extract_stripe(capture.image(2 * index + 1), stripe_along="width", saturation=511)
+            pair = extract_stripe(images[f"l{index}.png"], stripe_along="width", background=dark[index])
+            assert len(pair.lines) > 0.9 * WIDTH and np.array_equal(stored.lines, pair.lines)
+            # float32 holds 256 more grey levels to 3e-5 of one, against a stripe of 90.
+            assert np.abs(stored.centre_px - pair.centre_px)[pair.lines].max() < 1e-4
+
+
+def test_noise_below_the_background_stays_below(tmp_path: Path):
+    images = {"l.png": stripe_image(seed=1), "dark.png": stripe_image(height=0, seed=2)}
+    import_folder(folder_of(tmp_path, images, without("laser", laser="l*", background="dark*")), tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert len(capture) == 1
+        assert np.array_equal(capture.image(0).astype(int) - 256, images["l.png"].astype(int) - images["dark.png"])
+        assert capture.image(0).min() < 256
+
+
+def test_images_are_taken_as_stored_whatever_exif_says(tmp_path: Path):
+    folder = folder_of(tmp_path, {"a.jpg": stripe_image()}, without("laser", laser="a*"))
+    upright = read_image(folder / "a.jpg")
+    # An Exif block with one entry: orientation 6, to be turned by a quarter turn.
+    entry = b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01" + entry + b"\0\0\0\0"
+    content = (folder / "a.jpg").read_bytes()
+    block = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    (folder / "a.jpg").write_bytes(content[:2] + block + content[2:])
+    assert cv2.imread(str(folder / "a.jpg")).shape[:2] == (WIDTH, HEIGHT)
+    assert np.array_equal(read_image(folder / "a.jpg"), upright)
+
+
+def test_free_poses_count_the_images(tmp_path: Path):
+    told = without("laser", "stage", laser="l*", lamp="w*", stage={"free": True})
+    folder = three(tmp_path, told, w1=lamp_image(1), w2=lamp_image(2), w3=lamp_image(3))
+    import_folder(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert capture.stage_mm.tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+        assert "counts the poses" in capture.header.provenance["stage"]
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_a_table_tells_each_image(tmp_path: Path, separator: str):
+    pose = np.eye(4)
+    pose[:3, 3] = 1.5, -2.25, 1 / 3
+    cells = separator.join(repr(value) for value in pose.ravel().tolist())
+    names = separator.join(f"pose_{row}{column}" for row in range(4) for column in range(4))
+    lines = [
+        f"file,light,stage_mm,exposure_ms,time_s,{names}",
+        f"l3.png,laser,7.5,2,0.5,{cells}",
+        f"w.png,lamp,0.125,3,1,{',' * 15}",
+        f"l1.png,laser,-1e-3,2,2,{',' * 15}",
+        f"l2.png,ignore,,,,{',' * 15}",
+    ]
+    told = without("laser", "stage", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
+    folder = three(tmp_path, told, w=lamp_image())
+    (folder / "each.csv").write_text("\n".join(lines).replace(",", separator), encoding="utf-8-sig")
+    assert import_folder(folder, tmp_path / "a.h5").warnings == ()
+    with Capture(tmp_path / "a.h5") as capture:
+        assert capture.stage_mm.tolist() == [7.5, 0.125, -1e-3] and capture.time_s.tolist() == [0.5, 1.0, 2.0]
+        assert capture.laser_on.tolist() == [True, False, True] and capture.exposure_ms.tolist() == [2.0, 3.0, 2.0]
+        assert np.array_equal(capture.pose[0], pose) and np.isnan(capture.pose[1:]).all()
+
+
+def test_patterns_say_which_image_is_what_where_the_table_tells_positions_only(tmp_path: Path):
+    told = without("stage", "laser", laser="l*", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
+    folder = three(tmp_path, told)
+    (folder / "each.csv").write_text("file,stage_mm\nl2.png,4\nl1.png,3\n")
+    imported = import_folder(folder, tmp_path / "a.h5")
+    assert len(imported.warnings) == 1 and "l3.png" in imported.warnings[0]
+    with Capture(tmp_path / "a.h5") as capture:
+        assert capture.stage_mm.tolist() == [4.0, 3.0]
+
+
+def test_the_table_names_backgrounds(tmp_path: Path):
+    told = without("laser", table="each.csv", stage={"positions_mm": [1.0, 2.0], "direction": [0.0, 0.0, 1.0]})
+    folder = three(tmp_path, told, dark=stripe_image(height=0, dark=4))
+    (folder / "each.csv").write_text("file,light,background\nl1.png,laser,dark.png\nl2.png,laser,dark.png\n")
+    import_folder(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert capture.stage_mm.tolist() == [1.0, 2.0] and np.median(capture.image(0)) == pytest.approx(256 + 6, abs=1)
+
+
+def test_intrinsics_fill_the_sensor(tmp_path: Path):
+    folder = three(tmp_path, TOLD | {"intrinsics": "camera.yaml"})
+    matrix, coefficients = (
+        np.array([[2000.0, 0, 50], [0, 2004, 31], [0, 0, 1]]),
+        np.array([0.1, -0.2, 1e-3, 2e-3, 0.05]),
+    )
+    storage = cv2.FileStorage(str(folder / "camera.yaml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", coefficients)
+    storage.release()
+    import_folder(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        camera = capture.header.sensor.camera
+    assert camera.focal_length_px() == pytest.approx(2002.0, rel=1e-12)
+    assert camera.principal_point() == (50.0, 31.0)
+    assert tuple(camera.distortion.model_dump().values()) == tuple(coefficients)
+
+
+# --- what is refused
+
+
+def refused(folder: Path, tmp_path: Path, error: type[Exception], words: str) -> None:
+    """An import that fails with the words and leaves nothing behind."""
+    out = tmp_path / "refused.h5"
+    with pytest.raises(error, match=words):
+        import_folder(folder, out)
+    assert not out.exists() and not part_path(out).exists()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.97])
+def test_truncated(tmp_path: Path, suffix: str, share: float):
+    folder = folder_of(
+        tmp_path, {f"a1{suffix}": lamp_image(), f"a2{suffix}": lamp_image()}, without("laser", laser="a*")
+    )
+    content = (folder / f"a2{suffix}").read_bytes()
+    (folder / f"a2{suffix}").write_bytes(content[: int(share * len(content))])
+    refused(folder, tmp_path, ImageError, f"a2{suffix} is a .* file that is truncated or damaged")
+
+
+@pytest.mark.parametrize(("content", "words"), [(b"", "it is empty"), (b"\x7fELF\x02\x01", "it begins with b'.x7fELF")])
+def test_foreign(tmp_path: Path, content: bytes, words: str):
+    folder = three(tmp_path)
+    (folder / "l2.png").write_bytes(content)
+    refused(folder, tmp_path, ImageError, f"l2.png is no PNG, TIFF, BMP or JPEG image: {words}")
+
+
+def test_wrong_size_in_the_middle(tmp_path: Path):
+    folder = three(tmp_path, l2=stripe_image()[:, :-2])
+    refused(folder, tmp_path, ImageError, "l2.png has 94 x 64 pixels; expected 96 x 64 .* and the images before it")
+
+
+def test_wrong_size_from_the_start(tmp_path: Path):
+    folder = folder_of(tmp_path, {"l1.png": stripe_image()[:-2]})
+    refused(folder, tmp_path, ImageError, "96 x 62 pixels; expected 96 x 64 .*sensor that took the images")
+
+
+def test_rotated(tmp_path: Path):
+    folder = folder_of(tmp_path, {"l1.png": stripe_image().T})
+    refused(folder, tmp_path, ImageError, "64 x 96 pixels; .* turned by a quarter turn: turn them back, or exchange")
+    folder = three(tmp_path, l2=stripe_image().T)
+    refused(folder, tmp_path, ImageError, "l2.png has 64 x 96 .*it is turned by a quarter turn")
+
+
+def test_another_depth_in_the_middle(tmp_path: Path):
+    folder = three(tmp_path, l2=stripe_image().astype(np.uint16))
+    refused(folder, tmp_path, ImageError, "l2.png is of uint16, the images before it of uint8")
+
+
+def test_all_black(tmp_path: Path):
+    black = np.random.default_rng(0).integers(0, 4, (HEIGHT, WIDTH), dtype=np.uint8)
+    black[10, 10] = 255  # a hot pixel
+    folder = folder_of(tmp_path, {"l1.png": black, "l2.png": black})
+    refused(folder, tmp_path, ImageError, "all 2 laser images are black.*is the laser on")
+    target = {"kind": "chessboard", "columns": 9, "rows": 6, "square_mm": 15.0}
+    told = without("laser", laser="l*", lamp="w*", target=target)
+    images = {"l1.png": stripe_image(), "l2.png": stripe_image(), "w1.png": black, "w2.png": black}
+    refused(folder_of(tmp_path, images, told), tmp_path, ImageError, "all 2 lamp images are black")
+
+
+def test_the_wrong_channel_is_black(tmp_path: Path):
+    colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    colour[:, :, 2] = stripe_image()
+    folder = folder_of(tmp_path, {"l1.png": colour}, TOLD | {"channel": "green"})
+    refused(folder, tmp_path, ImageError, "black.*the channel that of its colour")
+
+
+def test_one_black_image_is_told(tmp_path: Path):
+    imported = import_folder(three(tmp_path, l2=np.zeros((HEIGHT, WIDTH), np.uint8)), tmp_path / "a.h5")
+    assert imported.warnings[0] == "1 of 3 laser images are black, such as l2.png"
+
+
+def test_all_white(tmp_path: Path):
+    white = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    white[: HEIGHT // 3] = 200
+    refused(three(tmp_path, l2=white), tmp_path, ImageError, "l2.png is white: 67 % of its pixels are saturated")
+
+
+def test_white_with_ten_bits(tmp_path: Path):
+    folder = folder_of(tmp_path, {"l1.png": np.full((HEIGHT, WIDTH), 1023, np.uint16)}, TOLD | {"bits": 10})
+    refused(folder, tmp_path, ImageError, "is white: 100 % .*1023 DN")
+
+
+def test_without_stripe_is_told_and_imported(tmp_path: Path):
+    folder = folder_of(tmp_path, {f"l{n}.png": stripe_image(height=0, dark=40, seed=n) for n in (1, 2)})
+    warnings = import_folder(folder, tmp_path / "a.h5").warnings
+    assert len(warnings) == 1 and "no stripe in any of the 2 laser images" in warnings[0]
+    with Capture(tmp_path / "a.h5") as capture:
+        assert len(capture) == 2
+
+
+def test_a_stripe_across_is_told(tmp_path: Path):
+    square = {"width_px": 80, "height_px": 80}
+    sensor = SENSOR | {"camera": SENSOR["camera"] | square}
+    image = stripe_image()[:, :80].T
+    folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, TOLD | {"sensor": sensor})
+    warnings = import_folder(folder, tmp_path / "a.h5").warnings
+    assert "one runs across: the images are turned, or the sensor's stripe_along" in warnings[0]
+
+
+def test_alpha(tmp_path: Path):
+    folder = three(tmp_path, l2=np.dstack([stripe_image()] * 4))
+    refused(folder, tmp_path, ImageError, "l2.png has 4 channels, that is with an alpha channel")
+
+
+def test_colour_without_a_channel(tmp_path: Path):
+    folder = three(tmp_path, l2=np.dstack([stripe_image(), lamp_image(), lamp_image()]))
+    refused(folder, tmp_path, ImageError, "l2.png is a colour image: choose the channel")
+
+
+def test_sixteen_bits_of_unknown_use(tmp_path: Path):
+    image = stripe_image().astype(np.uint16)
+    refused(folder_of(tmp_path, {"l.png": image}), tmp_path, ImageError, "16 bit: say how many the camera used")
+    told = TOLD | {"bits": 10}
+    refused(folder_of(tmp_path, {"l.png": image * 16}, told), tmp_path, ImageError, "more than 10 bits have: .*'high'")
+    refused(
+        folder_of(tmp_path, {"l.png": stripe_image()}, told), tmp_path, ImageError, "a file of 8 bit, but bits = 10"
+    )
+    with pytest.raises(ImageError, match="more than its upper 10 bits"):
+        grey_values(image * 3, bits=10, aligned="high", name="l.png")
+
+
+def test_several_pages_and_floating_point(tmp_path: Path):
+    assert cv2.imwritemulti(str(tmp_path / "pages.tif"), [stripe_image(), stripe_image()])
+    with pytest.raises(ImageError, match=r"pages.tif holds 2 pages"):
+        read_image(tmp_path / "pages.tif")
+    assert cv2.imwrite(str(tmp_path / "float.tif"), stripe_image().astype(np.float32))
+    with pytest.raises(ImageError, match="holds values of float32"):
+        read_image(tmp_path / "float.tif")
+
+
+def test_empty_folder(tmp_path: Path):
+    folder = folder_of(tmp_path, {"l.png": stripe_image()})
+    (folder / "l.png").unlink()
+    (folder / ".l.png").write_bytes(b"hidden")
+    refused(folder, tmp_path, ImageError, "holds no image")
+    refused(tmp_path / "nowhere", tmp_path, ImageError, "no folder at")
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (without("stage", stage={"direction": [1.0, 0.0, 0.0]}), "positions of the stage are missing"),
+        (TOLD | {"stage": {"start_mm": 0.0, "direction": [1.0, 0.0, 0.0]}}, "start_mm and step_mm belong together"),
+        (TOLD | {"stage": {"positions_mm": [1.0, 2.0], "direction": [1.0, 0.0, 0.0]}}, "has 2 positions for 3 images"),
+        (TOLD | {"stage": {"start_mm": 0.0, "step_mm": 1.0}}, "stage.direction is missing"),
+        (TOLD | {"stage": {"start_mm": 0.0, "step_mm": 0.0}}, "l1.png and l2.png have the same position, 0 mm"),
+        (TOLD | {"stage": {"start_mm": 0.0, "step_mm": 1.0, "free": True}}, "give the positions once"),
+        (TOLD | {"stage": {"positions_mm": [1.0, 2.0, 1.0]}}, "l1.png and l3.png have the same position"),
+        (TOLD | {"exposure": 3.0}, "exposure: unknown key"),
+        (TOLD | {"stage": TOLD["stage"] | {"stop_mm": 3.0}}, "stage.stop_mm: unknown key"),
+        (TOLD | {"channel": "infrared"}, "channel: .*found 'infrared'"),
+        (without("sensor"), "sensor missing"),
+        (TOLD | {"medium": "milk"}, "knows the media air, water, not 'milk'"),
+        (TOLD | {"target": {"kind": "chessboard"}}, "columns is missing"),
+        (TOLD | {"laser": "scan*.png"}, "none of the 3 images"),
+        (TOLD | {"lamp": "l2*"}, "l2.png would be both laser and lamp image"),
+        (TOLD | {"background": "l2*"}, "l2.png would be both laser and background image"),
+        (TOLD | {"laser": "l1*", "background": "l[23]*"}, "2 background images for 1 laser images"),
+        (TOLD | {"laser": "l[12]*", "lamp": "l3*"}, "2 laser and 1 lamp images: it is open"),
+        (TOLD | {"header": "header.json"}, "the header gives sensor, medium, stage.direction already"),
+        (TOLD | {"saturation_dn": 1000}, "saturation_dn is 1000; images of uint8"),
+    ],
+)
+def test_wrong_descriptions(tmp_path: Path, told: dict, words: str):
+    refused(three(tmp_path, told), tmp_path, DescriptionError, words)
+
+
+def test_sixteen_bits_leave_no_room_for_a_sign(tmp_path: Path):
+    images = {"l.png": stripe_image().astype(np.uint16) * 200, "dark.png": stripe_image().astype(np.uint16)}
+    told = TOLD | {"laser": "l*", "background": "dark*", "bits": 16}
+    refused(folder_of(tmp_path, images, told), tmp_path, DescriptionError, "16 bits leave no room for its sign")
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("file,stage_mm\n", "is empty"),
+        ("file,stage\nl1.png,3\n", "columns file, stage; expected"),
+        ("stage_mm\n3\n", "columns stage_mm; expected file"),
+        ("file,stage_mm\nl1.png,3\nl1.png,4\n", "names l1.png more than once"),
+        ("file,stage_mm\nl1.png,3\nl9.png,4\n", "names l9.png, which .* does not hold"),
+        ("file,stage_mm\nl1.png,3\nl2.png,\n", "position of l2.png is missing"),
+        ("file,stage_mm\nl1.png,3\nl2.png,3.0\n", "l1.png and l2.png have the same position, 3 mm"),
+        ("file,stage_mm\nl1.png,3\nl2.png\n", "line 3: there are more or fewer cells"),
+        ("file;stage_mm\nl1.png;3,5\n", "stage_mm is '3,5'; expected a number with a decimal point"),
+        ("file,stage_mm\nl1.png,nan\n", "expected a finite number"),
+        ("file,stage_mm\n../l1.png,1\n", "line 2: ../l1.png lies outside the folder"),
+        ("file,stage_mm,background\nl1.png,1,/l2.png\n", "line 2: /l2.png lies outside the folder"),
+        ("file,stage_mm\n,1\n", "line 2: the file's name is missing"),
+        ("file,stage_mm,background\nl1.png,1,l2.png\nl3.png,2,\n", "a background for 1 of 2 laser images"),
+        ("file,pose_00\nl1.png,1\n", "only 1 of the 16 elements"),
+        ("file,light\nl1.png,laser\n", "column light, and there are patterns"),
+        ("file,stage_mm,light\nl1.png,3,sun\n", "the light is 'sun'"),
+    ],
+)
+def test_wrong_tables(tmp_path: Path, table: str, words: str):
+    folder = three(tmp_path, without("stage", table="each.csv", stage={"direction": [1.0, 0.0, 0.0]}))
+    (folder / "each.csv").write_text(table)
+    refused(folder, tmp_path, DescriptionError, words)
+
+
+def test_a_missing_table_and_description(tmp_path: Path):
+    with pytest.raises(DescriptionError, match="cannot read the table"):
+        read_rows(tmp_path / "each.csv")
+    folder = three(tmp_path)
+    (folder / "import.toml").unlink()
+    refused(folder, tmp_path, DescriptionError, "no description at .*import.toml")
+
+
+def test_repeated_images_are_meant(tmp_path: Path):
+    folder = three(tmp_path, TOLD | {"stage": TOLD["stage"] | {"step_mm": 0.0}, "repeated": True})
+    assert import_folder(folder, tmp_path / "a.h5").laser == 3
+
+
+def test_an_existing_capture_stays(tmp_path: Path):
+    folder, out = three(tmp_path), tmp_path / "a.h5"
+    out.write_bytes(b"precious")
+    with pytest.raises(OutputError, match="exists already"):
+        import_folder(folder, out)
+    assert out.read_bytes() == b"precious"
+    import_folder(folder, out, overwrite=True)
+    with Capture(out) as capture:
+        assert len(capture) == 3
+
+
+def test_an_interruption_leaves_nothing(tmp_path: Path):
+    def interrupt(done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with contextlib.suppress(KeyboardInterrupt):
+        import_folder(three(tmp_path), tmp_path / "a.h5", progress=interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    folder = three(tmp_path, extra=np.dstack([stripe_image(), lamp_image(), lamp_image()]))
+    monkeypatch.setattr("sys.argv", ["uwlts", "import", str(folder), "--out", str(tmp_path / "a.h5")])
+    assert run(cli.app) == 2
+    assert "error: extra.png is a colour image" in capsys.readouterr().err
+    (folder / "import.toml").write_text(tomli_w.dumps(TOLD | {"laser": "l*"}))
+    assert run(cli.app) == 0
+    printed = capsys.readouterr()
+    assert "with 3 laser and 0 lamp images" in printed.out and "warning: 1 images of the folder" in printed.err

@@ -1,0 +1,162 @@
+"""Cameras that OpenCV and ROS calibrated, in every writing that is about; those that are no such camera are refused."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Distortion
+from uwlts.storage.import_ import KnownCamera, read_intrinsics, with_intrinsics
+
+MATRIX = np.array([[2451.25, 0.0, 640.5], [0.0, 2450.75, 511.25], [0.0, 0.0, 1.0]])
+COEFFICIENTS = np.array([-0.125, 0.0625, 1e-3, -2e-3, 0.03125])
+KNOWN = KnownCamera(
+    fx_px=2451.25,
+    fy_px=2450.75,
+    cx_px=640.5,
+    cy_px=511.25,
+    size_px=(1280, 1024),
+    distortion=Distortion(k1=-0.125, k2=0.0625, p1=1e-3, p2=-2e-3, k3=0.03125),
+)
+
+ROS = """\
+image_width: 1280
+image_height: 1024
+camera_name: narrow
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [2451.25, 0.000000, 640.5, 0, 2450.75, 511.25, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.125, 0.0625, 0.001, -2.0e-03, 0.03125]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]
+"""
+
+MESSAGE = """\
+header:
+  seq: 0
+  stamp:
+    secs: 0
+  frame_id: "camera"
+height: 1024
+width: 1280
+distortion_model: "plumb_bob"
+D: [-0.125, 0.0625, 0.001, -0.002, 0.03125]
+K: [2451.25, 0.0, 640.5, 0.0, 2450.75, 511.25, 0.0, 0.0, 1.0]
+R: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+roi:
+  do_rectify: False
+---
+"""
+
+
+def written(path: Path, entries: dict[str, object]) -> Path:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in entries.items():
+        storage.write(name, value)
+    storage.release()
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["yaml", "yml", "xml", "json"])
+@pytest.mark.parametrize(
+    ("matrix", "coefficients"),
+    [
+        ("camera_matrix", "distortion_coefficients"),
+        ("cameraMatrix", "distCoeffs"),
+        ("Camera_Matrix", "dist_coeffs"),
+        ("Camera_Matrix", "Distortion_Coefficients"),
+        ("K", "D"),
+        ("M1", "D1"),
+    ],
+)
+def test_files_of_opencv(tmp_path: Path, suffix: str, matrix: str, coefficients: str):
+    # As a row or as a column.
+    shaped = COEFFICIENTS.reshape(1, 5) if matrix == "K" else COEFFICIENTS.reshape(5, 1)
+    entries = {"image_width": 1280, "image_height": 1024, "flags": 0, matrix: MATRIX, coefficients: shaped}
+    assert read_intrinsics(written(tmp_path / f"camera.{suffix}", entries)) == KNOWN
+
+
+@pytest.mark.parametrize(
+    "text",
+    [ROS, MESSAGE, MESSAGE.replace("D:", "d:").replace("K:", "k:"), f"%YAML:1.0\n---\n{ROS}"],
+    ids=["camera_info", "message", "ros2", "camera_info-of-opencv"],
+)
+def test_files_of_ros(tmp_path: Path, text: str):
+    (tmp_path / "camera.yaml").write_text(text)
+    assert read_intrinsics(tmp_path / "camera.yaml") == KNOWN
+
+
+def test_longer_models_pass_where_they_say_no_more(tmp_path: Path):
+    entries = {"K": MATRIX, "D": np.r_[COEFFICIENTS, np.zeros(3)]}
+    known = read_intrinsics(written(tmp_path / "camera.yaml", entries))
+    assert known.distortion == KNOWN.distortion and known.size_px is None
+    four = read_intrinsics(written(tmp_path / "four.yaml", {"K": MATRIX, "D": COEFFICIENTS[:4]}))
+    assert four.distortion == KNOWN.distortion.model_copy(update={"k3": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            ROS.replace("plumb_bob", "equidistant"),
+            "distortion model is 'equidistant'; this program's camera is a pinhole",
+        ),
+        (
+            ROS.replace("plumb_bob", "rational_polynomial").replace("0.03125]", "0.03125, 0.1, 0, 0]"),
+            "8 coefficients .rational or thin-prism model.*no choice of these five equals it",
+        ),
+        (ROS.replace("0.03125]", "0.03125, 0]"), "there are 6 distortion coefficients"),
+        (ROS.replace("camera_matrix", "matrix"), "has none of cameramatrix, .* it has imagewidth"),
+        (ROS.replace("distortion_coefficients", "bends"), "has none of distortioncoefficients"),
+        (ROS.replace("data: [2451.25, 0.000000", "data: [2451.25, 3.0"), "expected fx 0 cx, 0 fy cy, 0 0 1"),
+        (ROS.replace("data: [2451.25", "data: [-2451.25"), "with positive fx, fy"),
+        (ROS.replace("data: [2451.25, ", "data: ["), "has 8 elements; expected 3 x 3"),
+        (ROS.replace("2451.25", "wide"), "expected numbers"),
+        (ROS.replace("2451.25", ".nan"), "expected finite numbers"),
+        (ROS.replace("1280", "many"), "image size is 'many' x 1024"),
+        (ROS[: ROS.index("640.5")], "no valid YAML"),
+        ("[1, 2, 3]\n", "holds no table"),
+        ("", "holds no table"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  data: [ 1., 0.", "no complete file of OpenCV"),
+    ],
+)
+def test_what_is_no_such_camera(tmp_path: Path, text: str, words: str):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(DescriptionError, match=words):
+        read_intrinsics(tmp_path / "camera.yaml")
+
+
+def test_a_missing_or_binary_file(tmp_path: Path):
+    with pytest.raises(DescriptionError, match="cannot read the intrinsics"):
+        read_intrinsics(tmp_path / "camera.yaml")
+    (tmp_path / "camera.yaml").write_bytes(b"\x80\xff")
+    with pytest.raises(DescriptionError, match="cannot read the intrinsics"):
+        read_intrinsics(tmp_path / "camera.yaml")
+
+
+def test_the_sensor_takes_them_over():
+    sensor = load_sensor("thesis")
+    filled = with_intrinsics(sensor, KNOWN, source="camera.yaml")
+    assert filled.camera.focal_length_px() == pytest.approx(2451.0, rel=1e-12)
+    assert filled.camera.principal_point() == (640.5, 511.25) and filled.camera.distortion == KNOWN.distortion
+    assert filled.laser == sensor.laser and filled.media == sensor.media
+
+
+def test_intrinsics_of_another_camera_are_refused():
+    sensor = load_sensor("thesis")
+    other = KnownCamera(2451.0, 2451.0, 512.0, 640.0, Distortion(), (1024, 1280))
+    with pytest.raises(DescriptionError, match="1024 x 1280 pixels, the sensor's are 1280 x 1024"):
+        with_intrinsics(sensor, other, source="camera.yaml")
+    oblong = KnownCamera(2451.0, 2500.0, 640.0, 512.0, Distortion(), None)
+    with pytest.raises(DescriptionError, match="the focal lengths are 2451.0 and 2500.0 px"):
+        with_intrinsics(sensor, oblong, source="camera.yaml")

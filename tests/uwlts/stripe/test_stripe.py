@@ -1,0 +1,489 @@
+"""Stripe extraction against profiles whose centre is known in closed form."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import erf
+
+from uwlts.model.errors import ImageError, RangeError
+from uwlts.stripe import PeakRule, StripeOptions, StripeStatus, extract_stripe, method_names
+
+LENGTH = 120
+METHODS = method_names()
+
+
+def gaussian(centre, *, sigma, amplitude, length=LENGTH):
+    """(L, length) Gaussian stripes integrated over the pixels: one line per centre."""
+    x = np.arange(length) - np.asarray(centre, float)[:, None]
+    cumulative = erf((x + 0.5) / (sigma * math.sqrt(2))) - erf((x - 0.5) / (sigma * math.sqrt(2)))
+    return amplitude * sigma * math.sqrt(math.pi / 2) * cumulative
+
+
+def grey(values, *, top=255, dtype=np.uint8):
+    """Round and clip as a camera does."""
+    return np.clip(np.rint(values), 0, top).astype(dtype)
+
+
+def phases(count=64):
+    """Centres that cover the sub-pixel phase evenly."""
+    return LENGTH / 2 + (np.arange(count) + 0.5) / count
+
+
+def rows(image, **settings):
+    return extract_stripe(image, stripe_along="height", **settings)
+
+
+def position_bound(*, sigma, amplitude, noise):
+    """Cramer-Rao bound of the centre, px: position, amplitude and width unknown, white noise, pixel-integrated.
+
+    Numerical derivatives of the profile; the mean over phases of the inverse Fisher matrix's first element.
+    """
+    step, variances = 1e-4, []
+    for centre in phases(16):
+
+        def at(dc=0.0, ds=0.0, c=centre):
+            return gaussian([c + dc], sigma=sigma + ds, amplitude=amplitude)[0]
+
+        jacobian = np.stack(
+            [(at(dc=step) - at(dc=-step)) / (2 * step), at() / amplitude, (at(ds=step) - at(ds=-step)) / (2 * step)],
+            axis=1,
+        )
+        variances.append(np.linalg.inv(jacobian.T @ jacobian / noise**2)[0, 0])
+    return math.sqrt(np.mean(variances))
+
+
+# Largest error over the pixel phase without noise. Zero crossing: aliasing of the Gaussian weight, which falls as
+# exp(-2 pi^2 s^2), and at sigma 4 the flanks that still hold a few thousandths of the stripe; measured 0.005 at both
+# ends. The profile fit has the same flanks, and at sigma 0.7 the pixel's width makes the profile no Gaussian. The other
+# two weigh pixels in part at the ends of a window where the profile is not zero.
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [("profile-fit", 0.008), ("zero-crossing", 0.008), ("centre-of-mass", 0.02), ("quadratic", 0.04)],
+)
+@pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5, 2.0, 3.0, 4.0])
+def test_bias_over_the_pixel_phase(method, limit, sigma):
+    centre = phases()
+    image = (gaussian(centre, sigma=sigma, amplitude=150) + 20).astype(np.float32)
+    found = rows(image, options=StripeOptions(method=method))
+    assert (found.status == StripeStatus.OK).all()
+    assert np.abs(found.centre_px - centre).max() < limit
+
+
+@pytest.mark.parametrize("along", ["height", "width"])
+@pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 1023), (np.float32, 255)])
+def test_both_orientations_and_all_types(along, dtype, top):
+    centre = phases()
+    image = grey(gaussian(centre, sigma=1.7, amplitude=0.6 * top) + 0.05 * top, top=top, dtype=dtype)
+    found = extract_stripe(image if along == "height" else image.T, stripe_along=along)
+    # Rounding to grey levels: noise of 1/sqrt(12) level against a stripe of 150 levels, bound 0.003 px, 5 sigma.
+    assert np.abs(found.centre_px - centre).max() < 0.015
+    assert found.lines.tolist() == list(range(64))
+    u, v = found.pixels().T
+    across, line = (u, v) if along == "height" else (v, u)
+    assert np.array_equal(across, found.centre_px)
+    assert np.array_equal(line, np.arange(64))
+    assert found.centre_px.dtype == np.float64
+    assert found.amplitude.dtype == found.width_px.dtype == np.float32
+    assert found.status.dtype == np.uint8
+
+
+@pytest.mark.parametrize("shape", [(64, 97), (64, 128), (3, 64), (1, 71), (200, 101)])
+def test_lengths_that_are_no_whole_number_of_blocks(shape):
+    centre = np.full(shape[0], 25.3)
+    image = grey(gaussian(centre, sigma=1.2, amplitude=150, length=shape[1]) + 20)
+    found = rows(image)
+    assert found.centre_px.shape == (shape[0],)
+    assert np.abs(found.centre_px - 25.3).max() < 0.015
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
+def test_width_and_amplitude(sigma):
+    image = (gaussian(phases(), sigma=sigma, amplitude=150) + 20).astype(np.float32)
+    found = rows(image)
+    # The pixel's own width adds 1/12 to the variance and lowers the peak by the same share. The highest pixel misses
+    # the peak by up to 1 / (8 s^2) of it, s^2 = 1 + 1 + 1/12 after the low-pass, which lowers the half height by 3 %
+    # and, with the straight lines between pixels, widens a stripe of sigma 1 by 0.28 px or 12 %; less for wider ones.
+    # The amplitude of the Gaussian that fits falls with the square root of its width.
+    wide = math.sqrt(sigma**2 + 1 / 12)
+    assert found.width_px == pytest.approx(wide * math.sqrt(8 * math.log(2)), rel=0.13 / sigma)
+    assert found.amplitude == pytest.approx(150 * sigma / wide, rel=0.065 / sigma)
+
+
+@pytest.mark.parametrize(("sigma", "efficiency"), [(0.7, 0.7), (1.0, 0.85), (2.0, 0.8), (3.0, 0.75), (4.0, 0.6)])
+@pytest.mark.parametrize("amplitude", [40, 150])
+def test_white_noise_is_near_the_cramer_rao_bound(sigma, efficiency, amplitude):
+    rng = np.random.default_rng(1)
+    centre = LENGTH / 2 + rng.uniform(-0.5, 0.5, 3000)
+    image = gaussian(centre, sigma=sigma, amplitude=amplitude) + 20 + 2 * rng.standard_normal((3000, LENGTH))
+    found = rows(image.astype(np.float32), options=StripeOptions(method="zero-crossing"))
+    error = found.centre_px - centre
+    bound = position_bound(sigma=sigma, amplitude=amplitude, noise=2)
+    # Least efficiency: the measured 0.72 to 0.97 less five standard errors of a variance of 3000 samples
+    # (5 sqrt(2 / 3000) = 13 %). The bound takes the background as known. No estimator beats it by more than that error.
+    assert efficiency < bound**2 / error.var() < 1.15
+    assert abs(error.mean()) < 5 * error.std() / math.sqrt(3000)
+
+
+def test_zero_crossing_is_the_least_noisy_in_white_noise():
+    rng = np.random.default_rng(2)
+    centre = LENGTH / 2 + rng.uniform(-0.5, 0.5, 2000)
+    image = gaussian(centre, sigma=2, amplitude=60) + 20 + 2 * rng.standard_normal((2000, LENGTH))
+    image = image.astype(np.float32)
+    spread = {m: np.std(rows(image, options=StripeOptions(method=m)).centre_px - centre) for m in METHODS}
+    assert min(spread, key=spread.get) == "zero-crossing"
+
+
+# Left in, 0.2 levels per px would move the zero crossing by b 2^1.5 sigma^2 / A = 0.011 px and the centre of mass by
+# b 2 R^3 / 3 / (sqrt(2 pi) sigma A), R = 2.25 sigma, 0.03 px. The tilt still acts on the width found and thus on where
+# the windows of the other two end, within the error with the phase that they have anyway.
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [("profile-fit", 0.005), ("zero-crossing", 0.003), ("centre-of-mass", 0.012), ("quadratic", 0.02)],
+)
+def test_linear_background_does_not_shift(method, limit):
+    centre = phases()
+    profile = gaussian(centre, sigma=1.5, amplitude=120) + 20
+    plain = rows(profile.astype(np.float32), options=StripeOptions(method=method))
+    tilted = rows((profile + 0.2 * np.arange(LENGTH)).astype(np.float32), options=StripeOptions(method=method))
+    shift = tilted.centre_px - plain.centre_px
+    assert np.abs(shift).max() < limit
+    assert abs(shift.mean()) < 0.003
+
+
+def test_far_haze_step_and_symmetric_halo():
+    centre = phases()
+    x = np.arange(LENGTH)
+    profile = gaussian(centre, sigma=1.5, amplitude=150) + 20
+    step = rows((profile + 10.0 * (x > LENGTH / 2 + 15)).astype(np.float32))
+    halo = rows((profile + 15 * np.exp(-0.5 * ((x - centre[:, None]) / 10) ** 2)).astype(np.float32))
+    # Beyond the flanks (3 sigma + 5 px = 11 px) a step is not seen at all; a symmetric halo favours no side.
+    assert np.abs(step.centre_px - centre).max() < 0.008
+    assert np.abs(halo.centre_px - centre).max() < 0.008
+
+
+def test_step_within_the_flanks_moves_less_than_the_step_as_a_slope():
+    centre = phases()
+    sigma, amplitude, step = 2.0, 150.0, 10.0
+    image = gaussian(centre, sigma=sigma, amplitude=amplitude) + 20 + step * (np.arange(LENGTH) > centre[:, None] + 8)
+    error = rows(image.astype(np.float32)).centre_px - centre
+    # Wholly taken for a slope over the 17 px between the flanks: b 2^1.5 sigma^2 / A with b = 10 / 17, 0.044 px.
+    assert np.abs(error).max() < 0.05
+    assert np.abs(error).max() > 0.001, "the step lies outside what the extraction looks at"
+
+
+def test_background_image_is_subtracted():
+    rng = np.random.default_rng(3)
+    centre = phases()
+    scene = rng.uniform(0, 90, (64, LENGTH))
+    image, background = grey(gaussian(centre, sigma=1.5, amplitude=120) + scene), grey(scene)
+    with_it = rows(image, background=background)
+    # Two roundings, each 0.29 levels; bound 0.006 px for their sum at 120 levels, 5 sigma.
+    assert np.abs(with_it.centre_px - centre).max() < 0.03
+    without = rows(image)
+    assert not np.nanmax(np.abs(without.centre_px - centre)) < 0.03
+    wide = rows(image.astype(np.uint16), background=background.astype(np.uint16))
+    assert wide.centre_px == pytest.approx(with_it.centre_px, abs=1e-4)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("sigma", "over"), [(1.0, 1.5), (2.0, 2.0), (2.0, 5.0), (3.0, 2.0)])
+def test_moderate_saturation_is_unbiased(method, sigma, over):
+    centre = phases()
+    image = grey(gaussian(centre, sigma=sigma, amplitude=255 * over) + 20)
+    assert (np.count_nonzero(image == 255, axis=1) >= 2).any()
+    found = rows(image, options=StripeOptions(method=method))
+    assert (found.status == StripeStatus.OK).all()
+    error = found.centre_px - centre
+    # Where a plateau is cut out of pixels only the two pixels on the flanks tell the phase, so that the error swings
+    # with it, by less than half the 0.29 px rms of not knowing the phase, and cancels over the phases.
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert abs(error.mean()) < 0.01
+
+
+@pytest.mark.parametrize("rule", list(PeakRule))
+def test_wide_and_clipped_stripes_are_one_wherever_they_fall(rule):
+    centre = np.linspace(45, 75, 301)
+    for sigma, over in [(4, 1.5), (3, 4.0), (5, 0.6)]:
+        found = rows(grey(gaussian(centre, sigma=sigma, amplitude=255 * over) + 20), options=StripeOptions(peak=rule))
+        assert (found.status == StripeStatus.OK).all()
+        # Flanks 11 px from the middle hold up to a tenth of a stripe of sigma 5, unevenly by the pixel phase.
+        assert np.abs(found.centre_px - centre).max() < 0.1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("rule", list(PeakRule))
+@pytest.mark.parametrize("method", METHODS)
+def test_anything_at_all_gives_a_status_and_agreeing_fields(dtype, rule, method):
+    rng = np.random.default_rng(9)
+    blobs = np.where(rng.random((80, 90)) < 0.05, 255.0, 0.0).cumsum(axis=1) % 256
+    spikes, ramp = 200 * rng.random((80, 90)) ** 20, np.outer(np.arange(80), np.ones(90))
+    images = [rng.uniform(0, 255, (80, 90)), spikes, blobs, ramp]
+    seen = set()
+    for image in images:
+        for along in ("height", "width"):
+            options = StripeOptions(method=method, peak=rule, threshold_sigmas=2, end_lines=0)
+            found = extract_stripe(image.astype(dtype), stripe_along=along, options=options)
+            ok = found.status == StripeStatus.OK
+            for values in (found.centre_px, found.amplitude, found.width_px):
+                assert np.array_equal(np.isfinite(values), ok)
+            assert (found.centre_px[ok] > 0).all()
+            assert (found.width_px[ok] <= 16).all()
+            seen |= set(found.status.tolist())
+    assert {StripeStatus.OK, StripeStatus.NO_STRIPE} <= seen
+
+
+def test_plateau_wider_than_the_window_is_saturated():
+    image = grey(gaussian(phases(), sigma=6, amplitude=255 * 8, length=160) + 20)
+    found = rows(image)
+    assert (found.status == StripeStatus.SATURATED).all()
+    assert np.isnan(found.centre_px).all()
+    wider = rows(image, options=StripeOptions(half_window_px=32))
+    assert (wider.status == StripeStatus.OK).all()
+    assert np.abs(wider.centre_px - phases()).max() < 0.1
+
+
+def test_ten_bit_saturation_is_the_callers():
+    image = grey(gaussian(phases(), sigma=6, amplitude=1023 * 8) + 80, top=1023, dtype=np.uint16)
+    assert (rows(image, saturation=1023).status == StripeStatus.SATURATED).all()
+    assert (rows(image).status == StripeStatus.NO_STRIPE).all()
+
+
+def test_saturation_is_that_of_the_image_before_subtraction():
+    image = grey(gaussian(phases(), sigma=6, amplitude=255 * 8) + 20)
+    found = rows(image, background=np.full_like(image, 20))
+    assert (found.status == StripeStatus.SATURATED).all()
+
+
+def two_stripes(first, second, *, apart, where=40.0):
+    near, far = np.full(64, where + 0.3), np.full(64, where + 0.3 + apart)
+    profile = gaussian(near, sigma=1.5, amplitude=first) + gaussian(far, sigma=1.5, amplitude=second) + 20
+    return grey(profile + np.random.default_rng(4).standard_normal(profile.shape)), near, far
+
+
+@pytest.mark.parametrize("apart", [8, 14, 20, 24, 31, 47, 60])
+@pytest.mark.parametrize(("first", "second"), [(150, 120), (120, 150), (100, 100)])
+def test_comparable_second_stripe_is_ambiguous(apart, first, second):
+    image, _, _ = two_stripes(first, second, apart=apart)
+    assert (rows(image).status == StripeStatus.AMBIGUOUS).all()
+
+
+@pytest.mark.parametrize("apart", [31, 47, 60])
+def test_weak_second_stripe_is_ignored(apart):
+    image, near, _ = two_stripes(150, 60, apart=apart)
+    assert np.abs(rows(image).centre_px - near).max() < 0.1
+    strict = rows(image, options=StripeOptions(ambiguous_ratio=0.3))
+    assert (strict.status == StripeStatus.AMBIGUOUS).all()
+
+
+@pytest.mark.parametrize("apart", [22, 31, 47, 60])
+@pytest.mark.parametrize(("first", "second"), [(150, 120), (120, 150)])
+def test_first_and_last(apart, first, second):
+    image, near, far = two_stripes(first, second, apart=apart)
+    # Noise of one level on 120: bound 0.011 px; 5 sigma over 64 lines and the neighbour's influence on the flank.
+    assert np.abs(rows(image, options=StripeOptions(peak=PeakRule.FIRST)).centre_px - near).max() < 0.07
+    assert np.abs(rows(image, options=StripeOptions(peak=PeakRule.LAST)).centre_px - far).max() < 0.07
+
+
+@pytest.mark.parametrize("rule", list(PeakRule))
+def test_hot_pixels_are_no_stripe(rule):
+    rng = np.random.default_rng(5)
+    centre = np.full(256, 60.2)
+    image = grey(gaussian(centre, sigma=1.5, amplitude=80) + 20 + rng.standard_normal((256, LENGTH)))
+    for column in (12, 100):
+        image[:, column] = 255
+    found = rows(image, options=StripeOptions(peak=rule))
+    assert (found.status == StripeStatus.OK).all()
+    assert np.abs(found.centre_px - centre).max() < 0.1
+    image = grey(20 + rng.standard_normal((256, LENGTH)))
+    image[:, 57] = 200
+    assert (rows(image).status == StripeStatus.NO_STRIPE).all()
+
+
+@pytest.mark.parametrize("along", ["height", "width"])
+def test_stripe_at_the_border(along):
+    centre = np.linspace(-3, LENGTH + 2, 400)
+    image = grey(gaussian(centre, sigma=1.5, amplitude=150) + 20)
+    found = extract_stripe(image if along == "height" else image.T, stripe_along=along)
+    ok = found.status == StripeStatus.OK
+    assert np.abs(found.centre_px[ok] - centre[ok]).max() < 0.015
+    # 3 sigma of the low-passed stripe (1.8 px), rounded up, and five pixels of flank: 11 px, one more by rounding.
+    inside = (centre > 12) & (centre < LENGTH - 13)
+    assert ok[inside].all()
+    assert not ok[(centre < 4) | (centre > LENGTH - 5)].any()
+    near = ((centre > 2.5) & (centre < 9)) | ((centre < LENGTH - 3.5) & (centre > LENGTH - 10))
+    assert near.sum() > 30
+    assert (found.status[near] == StripeStatus.BORDER).all()
+    assert not (found.status == StripeStatus.AMBIGUOUS).any()
+
+
+@pytest.mark.parametrize("value", [0, 7, 255])
+@pytest.mark.parametrize("rule", list(PeakRule))
+def test_uniform_image_has_no_stripe(value, rule):
+    found = rows(np.full((50, 200), value, np.uint8), options=StripeOptions(peak=rule))
+    expected = StripeStatus.SATURATED if value == 255 else StripeStatus.NO_STRIPE
+    assert (found.status == expected).all()
+    assert np.isnan(found.centre_px).all()
+    assert np.isnan(found.amplitude).all()
+    assert np.isnan(found.width_px).all()
+    assert found.pixels().shape == (0, 2)
+    assert found.lines.shape == (0,)
+
+
+@pytest.mark.parametrize(("mean", "noise"), [(20, 1), (0, 2), (20, 5), (100, 15), (2, 5)])
+def test_false_alarms_on_noise(mean, noise):
+    rng = np.random.default_rng(6)
+    found = rows(grey(rng.normal(mean, noise, (4096, 1280))))
+    # Fewer than one line in a thousand; 4096 lines are enough to see a rate of twice that with 95 % confidence.
+    assert np.count_nonzero(found.status == StripeStatus.OK) < 4.1
+
+
+def test_dark_edges_and_slopes_are_no_stripe():
+    image = np.full((40, 200), 30, np.uint8)
+    image[:, 90:] = 180
+    assert (rows(image).status == StripeStatus.NO_STRIPE).all()
+    slope = np.tile(np.linspace(0, 255, 200).astype(np.uint8), (40, 1))
+    assert not (rows(slope[:, ::-1].copy()).status == StripeStatus.OK).any()
+
+
+@pytest.mark.parametrize("sigma", [1.5, 2.0, 3.0])
+def test_stripe_of_six_times_the_noise_is_found(sigma):
+    rng = np.random.default_rng(7)
+    centre = 640 + rng.uniform(-100, 100, 2000)
+    image = gaussian(centre, sigma=sigma, amplitude=18, length=1280) + 30 + 3 * rng.standard_normal((2000, 1280))
+    # The stripe jumps from line to line, so its ends have to stay.
+    found = rows(grey(image), options=StripeOptions(end_lines=0))
+    ok = found.status == StripeStatus.OK
+    assert ok.mean() > 0.95
+    # The bound is 0.22 to 0.31 px; 1 % of the lines may lie on noise instead.
+    assert (np.abs(found.centre_px[ok] - centre[ok]) < 5 * 0.35).mean() > 0.99
+
+
+def test_smoothing_along_lines_lowers_noise_and_is_off_by_default():
+    rng = np.random.default_rng(8)
+    centre = np.full(1000, 60.3)
+    image = (gaussian(centre, sigma=2, amplitude=60) + 20 + 2 * rng.standard_normal((1000, LENGTH))).astype(np.float32)
+    alone = rows(image).centre_px
+    together = rows(image, options=StripeOptions(smoothing_lines=5)).centre_px
+    # Five independent lines: sqrt(5) = 2.24 times less, a standard deviation of 1000 (200 independent) is good to 5 %.
+    assert alone.std() / together.std() == pytest.approx(math.sqrt(5), rel=0.2)
+    turned = extract_stripe(image.T.copy(), stripe_along="width", options=StripeOptions(smoothing_lines=5)).centre_px
+    assert turned == pytest.approx(together, abs=1e-5)
+    changed = image.copy()
+    changed[500] = 20
+    others = np.delete(rows(changed).centre_px - alone, 500)
+    # The profile fit weighs pixels by a noise that it measures on some 250 lines together, to 4 %; centres feel that in
+    # second order only.
+    assert np.abs(others).max() < 0.05 * alone.std(), "lines influence each other"
+    changed = rows(changed, options=StripeOptions(method="zero-crossing")).centre_px
+    alone = rows(image, options=StripeOptions(method="zero-crossing")).centre_px
+    assert np.array_equal(np.delete(changed, 500), np.delete(alone, 500)), "lines influence each other"
+
+
+@settings(deadline=None, max_examples=40)
+@given(centre=st.floats(25, 90), sigma=st.floats(0.8, 3.5), amplitude=st.floats(60, 200), slant=st.floats(-0.4, 0.4))
+def test_mirrored_and_shifted_images_give_mirrored_and_shifted_centres(centre, sigma, amplitude, slant):
+    truth = centre + slant * np.arange(12)
+    image = grey(gaussian(truth, sigma=sigma, amplitude=amplitude) + 10)
+    found, mirrored, shifted = rows(image), rows(image[:, ::-1]), rows(np.roll(image, 3, axis=1))
+    assert (found.status == StripeStatus.OK).all()
+    # Rounding at 60 levels and sigma 3.5: bound 0.012 px; 5 sigma plus the phase error of 0.008 px.
+    assert np.abs(found.centre_px - truth).max() < 0.07
+    # The same pixels through the same sums, in single precision.
+    assert LENGTH - 1 - mirrored.centre_px == pytest.approx(found.centre_px, abs=2e-3)
+    assert shifted.centre_px - 3 == pytest.approx(found.centre_px, abs=1e-3)
+
+
+def test_input_is_not_changed():
+    image = grey(gaussian(phases(), sigma=1.5, amplitude=150) + 20)
+    copy = image.copy()
+    extract_stripe(image, stripe_along="width")
+    rows(image)
+    assert np.array_equal(image, copy)
+
+
+GOOD = np.zeros((40, 70), np.uint8)
+NOT_FINITE = np.full((40, 70), np.nan, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        ([[1, 2], [3, 4]], "expected a NumPy array"),
+        (GOOD.astype(np.float64), "convert it to uint8"),
+        (GOOD.astype(complex), "convert it to uint8"),
+        (GOOD > 0, "convert it to uint8"),
+        (np.zeros((40, 70, 3), np.uint8), "choose one channel"),
+        (np.zeros(40, np.uint8), "choose one channel"),
+        (np.zeros((0, 70), np.uint8), "empty"),
+        (NOT_FINITE, "2800 pixels that are not finite"),
+        (np.zeros((40, 63), np.uint8), "the search needs 64"),
+        (np.zeros((40, 40000), np.uint8), "at most 32766"),
+    ],
+)
+def test_bad_images_are_refused(image, words):
+    with pytest.raises(ImageError, match=words):
+        rows(image)
+
+
+@pytest.mark.parametrize(
+    ("settings_", "words"),
+    [
+        ({"stripe_along": "rows"}, "stripe_along is 'rows'"),
+        ({"saturation": 0}, "saturation is 0"),
+        ({"saturation": math.nan}, "saturation is nan"),
+        ({"background": GOOD[:-1]}, "same camera settings"),
+        ({"background": GOOD.astype(np.uint16)}, "same camera settings"),
+        ({"background": NOT_FINITE}, "background has 2800 pixels"),
+    ],
+)
+def test_bad_settings_are_refused(settings_, words):
+    with pytest.raises(ImageError, match=words):
+        extract_stripe(GOOD, **({"stripe_along": "height"} | settings_))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"method": "parabola"},
+        {"peak": "middle"},
+        {"half_window_px": 7},
+        {"half_window_px": 16.0},
+        {"smoothing_px": 0.1},
+        {"smoothing_px": math.nan},
+        {"smoothing_lines": 4},
+        {"smoothing_lines": 0},
+        {"threshold_sigmas": 0},
+        {"threshold_floor": -1},
+        {"min_fwhm_px": 20},
+        {"ambiguous_ratio": 0},
+        {"ambiguous_ratio": 1.1},
+    ],
+)
+def test_bad_options_are_refused(wrong):
+    with pytest.raises(RangeError, match=next(iter(wrong))):
+        StripeOptions(**wrong)
+
+
+def test_lines_next_to_an_end_or_a_jump_are_left_out():
+    centre = np.where(np.arange(120) < 60, 40.0, 70.0)
+    image = grey(gaussian(centre, sigma=2, amplitude=150) + 10)
+    image[90:] = 10  # the stripe ends after line 89
+    image[20:22] = 10  # and is lost for two lines, which is no end
+    found = rows(image)
+    ends = np.flatnonzero(found.status == StripeStatus.END)
+    assert ends.tolist() == [58, 59, 60, 61, 88, 89]
+    assert np.isnan(found.centre_px[ends]).all()
+    assert np.flatnonzero(found.status == StripeStatus.NO_STRIPE).tolist() == [20, 21, *range(90, 120)]
+    kept = rows(image, options=StripeOptions(end_lines=0))
+    assert (kept.status[ends] == StripeStatus.OK).all()
+    more = rows(image, options=StripeOptions(end_lines=5))
+    assert np.flatnonzero(more.status == StripeStatus.END).tolist() == [*range(55, 65), *range(85, 90)]
+
+
+def test_a_stripe_shorter_than_its_two_ends_gives_no_points():
+    image = np.full((40, 128), 10, np.uint8)
+    image[20:23] = grey(gaussian(np.full(3, 60.0), sigma=2, amplitude=150, length=128) + 10)
+    assert (rows(image).status[20:23] == StripeStatus.END).all()

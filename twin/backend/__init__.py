@@ -1,0 +1,1 @@
+"""The compiler library that the renderer needs."""

@@ -1,0 +1,354 @@
+"""Finds, checks and installs the libLLVM with which Dr.Jit compiles its kernels.
+
+Call `prepare_llvm` before mitsuba or drjit is imported. Versions 14 to 16 are refused: with them the first kernel can
+abort the whole process (`LLVM ERROR: Cannot select: ... fminimum`), which no program can catch.
+
+`python -m twin.backend.llvm` shows which libraries there are, chooses one and runs a kernel with it;
+`python -m twin.backend.llvm --install` obtains one first where there is none. Exit status 0, or 2 when there is none.
+"""
+
+import argparse
+import ctypes
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from twin.backend import packages
+from uwlts.model.errors import SetupError
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+MINIMUM_MAJOR = 17
+"""The oldest version with which Dr.Jit's kernels do not abort."""
+RUNTIME_LIBRARY = "libatomic.so.1"
+"""Dr.Jit's own wheel is linked against it, and minimal systems without a compiler lack it."""
+DEBIAN_PACKAGES = tuple(f"libllvm{major}" for major in (19, 22, 21, 20, 18, 17))
+"""19 first: the version that Dr.Jit 1.5.0 was measured with."""
+DEBIAN_RUNTIME = "libatomic1"
+WHEEL = "karellen-llvm-core==23.1.4.post8"
+"""A wheel that ships the shared library. Dr.Jit 1.5.0 renders with this version of it."""
+PROBE_SECONDS = 120
+"""Loading takes about 0.1 s; on a slow network drive much longer."""
+TRIAL_SECONDS = 300
+"""A kernel takes a few seconds, and imports may come from a slow network drive."""
+SINGLE_PRECISION_INTEGERS = 2**24
+"""Integers below this are exact as 32-bit floats."""
+
+_NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.so(\..+)?")
+_NAMED_VERSION = re.compile(r"libLLVM(?:-(\d+)(?:\.(\d+))?|\.so\.(\d+)\.(\d+))")
+_SYSTEM_FOLDERS = (
+    "/usr/local/lib",
+    "/usr/local/lib64",
+    "/usr/lib",
+    "/usr/lib64",
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib/llvm*/lib",
+    "/usr/lib64/llvm*/lib",
+)
+_HOW_TO_INSTALL = """\
+Install what is missing:
+  Debian, Ubuntu:  apt-get install libllvm19 libatomic1   (as root; any of libllvm17 and newer)
+  Fedora:          dnf install llvm-libs libatomic   (as root)
+  Arch:            pacman -S llvm-libs gcc-libs   (as root)
+  without root:    python -m twin.backend.llvm --install"""
+# The number makes the kernel a new one, so that it is compiled rather than taken from Dr.Jit's cache on disk.
+_TRIAL = """
+from twin.backend.llvm import prepare_llvm
+prepare_llvm()
+import drjit as dr
+from drjit.llvm import Float
+dr.eval(dr.minimum(dr.arange(Float, 4) + {number!r}, 2))
+"""
+
+
+@dataclass(frozen=True)
+class LlvmLibrary:
+    """A libLLVM that Dr.Jit can use, with the version that the library itself states.
+
+    ``companions`` are libraries that it or Dr.Jit needs and the system lacks, to be loaded first, in this order.
+    """
+
+    path: Path
+    version: tuple[int, int, int]
+    companions: tuple[Path, ...] = ()
+
+    def __str__(self) -> str:
+        return f"libLLVM {'.'.join(map(str, self.version))}: {self.path}"
+
+
+@dataclass(frozen=True)
+class Unsuitable:
+    """A library that cannot be used, with the reason."""
+
+    path: Path
+    fault: str
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.fault}"
+
+
+def prepare_llvm() -> LlvmLibrary:
+    """Choose a libLLVM and set DRJIT_LIBLLVM_PATH, which Dr.Jit reads when it is imported.
+
+    Where Dr.Jit is imported already, its library is checked instead, because it cannot be exchanged any more.
+
+    Raises
+    ------
+    SetupError
+        There is no suitable libLLVM, or Dr.Jit was imported without one.
+    """
+    if "drjit" in sys.modules:
+        return _library_in_use()
+    library = find_llvm()
+    # The loader takes a library that is already in the process for one of the same name that libLLVM asks for.
+    for companion in library.companions:
+        ctypes.CDLL(str(companion))
+    os.environ[VARIABLE] = str(library.path)
+    return library
+
+
+def _library_in_use() -> LlvmLibrary:
+    """The libLLVM that an imported Dr.Jit holds."""
+    major, minor, patch = sys.modules["drjit"].detail.llvm_version()
+    if major < MINIMUM_MAJOR:
+        held = f"libLLVM {major}.{minor}.{patch}" if major > 0 else "no libLLVM"
+        raise SetupError(
+            f"Dr.Jit was imported before prepare_llvm() and holds {held}, but version {MINIMUM_MAJOR} or newer is "
+            f"needed. Call twin.backend.llvm.prepare_llvm() before the first import of drjit or mitsuba, or set "
+            f"{VARIABLE}."
+        )
+    return LlvmLibrary(Path(os.environ.get(VARIABLE, "libLLVM.so")), (major, minor, patch))
+
+
+# --- search -----------------------------------------------------------------------------------------------------------
+
+
+def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
+    """Choose the newest libLLVM that Dr.Jit can work with, and make sure that Dr.Jit's runtime library is there.
+
+    Parameters
+    ----------
+    folders
+        Where to look; without it everywhere (`search_folders`). A library named by the environment variable
+        DRJIT_LIBLLVM_PATH is the user's choice and the only one considered: it is used or refused, never replaced.
+
+    Raises
+    ------
+    SetupError
+        There is none, or the user's choice is unsuitable. The message lists what was found and how to install one.
+    """
+    if chosen := os.environ.get(VARIABLE):
+        library = examine(Path(chosen))
+        if isinstance(library, Unsuitable):
+            raise SetupError(
+                f"the environment variable {VARIABLE} names {library}\n"
+                f"Let it name a libLLVM of version {MINIMUM_MAJOR} or newer, or unset it to have one searched."
+            )
+    else:
+        library = _newest(folders)
+    return replace(library, companions=library.companions + _runtime_library(library.path.parent))
+
+
+def _newest(folders: Iterable[Path] | None) -> LlvmLibrary:
+    """The newest suitable library; one whose file name claims an older version than the best so far is not loaded."""
+    best: LlvmLibrary | None = None
+    unsuitable: list[Unsuitable] = []
+    for path in sorted(list_candidates(folders), key=named_version, reverse=True):
+        if best is not None and named_version(path) <= best.version:
+            break
+        examined = examine(path)
+        if isinstance(examined, Unsuitable):
+            unsuitable.append(examined)
+        elif best is None or examined.version > best.version:
+            best = examined
+    if best is None:
+        found = "".join(f"\n  {library}" for library in unsuitable) or "\n  none"
+        raise SetupError(
+            f"no suitable libLLVM: Dr.Jit needs the shared library of LLVM {MINIMUM_MAJOR} or newer. Found:{found}\n"
+            f"{_HOW_TO_INSTALL}\n"
+            f"or let the environment variable {VARIABLE} name a libLLVM."
+        )
+    return best
+
+
+def _runtime_library(beside: Path) -> tuple[Path, ...]:
+    """Nothing where the system has the library, else the one that lies beside libLLVM or in an own folder."""
+    if sys.platform != "linux":
+        return ()
+    try:
+        ctypes.CDLL(RUNTIME_LIBRARY)
+    except OSError as error:
+        for folder in (beside, *own_folders()):
+            for path in sorted(folder.glob(f"{RUNTIME_LIBRARY}*")):
+                return (path,)
+        raise SetupError(f"Dr.Jit needs {RUNTIME_LIBRARY}, which this machine lacks.\n{_HOW_TO_INSTALL}") from error
+    return ()
+
+
+def examine(path: Path) -> LlvmLibrary | Unsuitable:
+    """Load the library in a child process, ask for its version and judge it. The file name is not trusted."""
+    command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("llvm_probe.py")), str(path)]
+    try:
+        # The loader's messages are matched, so they must be the untranslated ones.
+        probe = subprocess.run(
+            command,
+            env=os.environ | {"LC_ALL": "C"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=PROBE_SECONDS,
+        )
+    except subprocess.TimeoutExpired:
+        return Unsuitable(path, f"loading it did not end within {PROBE_SECONDS} s")
+    if probe.returncode != 0:
+        last_line = (probe.stderr.strip().splitlines() or [""])[-1]
+        return Unsuitable(path, f"loading it ended the process, exit status {probe.returncode} {last_line}".rstrip())
+    return judge(path, **json.loads(probe.stdout))
+
+
+def judge(
+    path: Path, *, version: Sequence[int] | None = None, companions: Sequence[str] = (), fault: str | None = None
+) -> LlvmLibrary | Unsuitable:
+    """Turn what the probe reports about a library into a usable library or the reason against it."""
+    if fault is not None:
+        return Unsuitable(path, fault)
+    if version is None:
+        return Unsuitable(path, f"too old: it has no LLVMGetVersion; version {MINIMUM_MAJOR} or newer is needed")
+    major, minor, patch = version
+    if major < MINIMUM_MAJOR:
+        return Unsuitable(path, f"version {major}.{minor}.{patch}; version {MINIMUM_MAJOR} or newer is needed")
+    return LlvmLibrary(path, (major, minor, patch), tuple(map(Path, companions)))
+
+
+def named_version(path: Path) -> tuple[float, ...]:
+    """Version that a file name claims, e.g. (19, 1) for libLLVM.so.19.1; (inf,), to be looked at first, for none."""
+    match = _NAMED_VERSION.match(path.name)
+    return (math.inf,) if match is None else tuple(int(number) for number in match.groups() if number is not None)
+
+
+def list_candidates(folders: Iterable[Path] | None = None) -> list[Path]:
+    """Files named like a libLLVM in the folders, links resolved, each file once; unreadable folders hold none."""
+    found: dict[Path, None] = {}
+    for folder in search_folders() if folders is None else folders:
+        try:
+            inside = sorted(entry.name for entry in folder.iterdir())
+        except OSError:
+            continue
+        paths = (folder / name for name in inside if _NAME.fullmatch(name))
+        found |= dict.fromkeys(path.resolve() for path in paths if path.is_file())
+    return list(found)
+
+
+def search_folders() -> list[Path]:
+    """The project's own folders first, then those of the environment in use, then the usual ones of the system."""
+    folders = own_folders()
+    folders += [Path(folder) for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
+    folders += [Path(prefix, "lib") for prefix in (sys.prefix, os.environ.get("CONDA_PREFIX")) if prefix]
+    for pattern in _SYSTEM_FOLDERS:
+        folders += sorted(Path("/").glob(pattern.lstrip("/")))
+    return folders
+
+
+def own_folders() -> list[Path]:
+    """Folders into which a libLLVM can be unpacked without administrator rights, the preferred one first."""
+    root = Path(__file__).parents[2]
+    folders = [root / ".llvm"] if (root / "pyproject.toml").is_file() else []
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return [*folders, Path(cache, "uwlts", "llvm")] if os.path.isabs(cache) else folders
+
+
+# --- installation -----------------------------------------------------------------------------------------------------
+
+
+def install_llvm(
+    *,
+    folders: Sequence[Path] | None = None,
+    target: Path | None = None,
+    report: Callable[[str], object] = lambda line: None,
+) -> LlvmLibrary:
+    """Find a suitable libLLVM, or obtain one: with apt-get as root, else unpacked from Debian packages or a wheel.
+
+    Parameters
+    ----------
+    folders
+        Where to look for one that is there already; without it everywhere.
+    target
+        Folder to unpack into; without it `.llvm` in the source tree, or the user's cache folder.
+    report
+        Called with a line of text for each step.
+
+    Raises
+    ------
+    SetupError
+        None of the ways led to a library; the message gives the reason of each.
+    """
+    return packages.obtain(
+        lambda unpacked: find_llvm(None if folders is None else [*unpacked, *folders]),
+        what="libLLVM",
+        choose=_offered,
+        wheel=WHEEL,
+        target=target,
+        folders=own_folders(),
+        choice=VARIABLE,
+        report=report,
+    )
+
+
+def _offered(options: Sequence[str]) -> list[str]:
+    """The packages to take according to the package lists; SetupError where there is none."""
+    policy = packages.run_command(["apt-cache", *options, "policy", *DEBIAN_PACKAGES])
+    offered = set(re.findall(r"^(\S+):\n  Installed: .*\n  Candidate: (?!\(none\))", policy, flags=re.MULTILINE))
+    for package in DEBIAN_PACKAGES:
+        if package in offered:
+            return [package, DEBIAN_RUNTIME]
+    raise SetupError(f"apt-get: there is none of {', '.join(DEBIAN_PACKAGES)}")
+
+
+def run_trial_kernel() -> None:
+    """Compile and run a small kernel in a child process, where an abort inside LLVM does no harm.
+
+    Raises
+    ------
+    SetupError
+        The kernel did not run; the message holds the end of what was printed.
+    """
+    command = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
+    try:
+        trial = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS)
+    except subprocess.TimeoutExpired as error:
+        raise SetupError(f"Dr.Jit did not finish a trial kernel within {TRIAL_SECONDS} s") from error
+    if trial.returncode != 0:
+        end = "\n  ".join(trial.stderr.strip().splitlines()[-5:])
+        raise SetupError(f"Dr.Jit could not run a trial kernel (exit status {trial.returncode}):\n  {end}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line of this module; returns the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m twin.backend.llvm", description="Find or install the libLLVM for Dr.Jit."
+    )
+    parser.add_argument("--install", action="store_true", help="obtain a libLLVM if there is no suitable one")
+    options = parser.parse_args(arguments)
+    try:
+        if options.install:
+            print(install_llvm(report=partial(print, flush=True)))
+        else:
+            for path in list_candidates():
+                print(f"found: {examine(path)}")
+            print(f"chosen: {find_llvm()}")
+        run_trial_kernel()
+    except SetupError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

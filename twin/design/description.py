@@ -1,0 +1,248 @@
+"""Description of a study: a base sensor, free variables, objectives, constraints, and the choice of designs."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from twin.design.figures import FIGURES
+from twin.design.parameters import Follow
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import find, read_table, validated
+from uwlts.model.sensor import Description, Medium, NotNegative, Sensor
+
+FOLDER = "studies"
+OTHER_COLUMNS = ("design", "violation", "failure")
+"""Columns of results besides values and figures."""
+FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
+"""What follows the stand-off and could be free as well."""
+MOST_DESIGNS = 10**8
+Value = float | int | str | bool
+
+
+class Variable(Description):
+    """A free number of the sensor's description: from ``least`` to ``most``, or one of ``values``.
+
+    A grid takes ``steps`` of a range, evenly spaced, in their logarithm where ``scale`` is "log". ``whole`` rounds to
+    whole numbers; numbers that the description counts, such as pixels, are whole anyway.
+    """
+
+    least: float | None = None
+    most: float | None = None
+    steps: Annotated[int, Field(ge=2, le=100000)] = 11
+    scale: Literal["linear", "log"] = "linear"
+    whole: bool = False
+    values: tuple[Value, ...] | None = None
+
+    @model_validator(mode="after")
+    def _range_or_values(self) -> Variable:
+        ends = (self.least, self.most)
+        if (self.values is None) == (None in ends) or (self.values is not None and any(e is not None for e in ends)):
+            raise ValueError("give least and most, or values")
+        if self.values is not None:
+            if not self.values:
+                raise ValueError("values is empty")
+            if len({isinstance(value, str) for value in self.values}) > 1:
+                raise ValueError(f"values mix words and numbers, {self.values}: make them choices, or two studies")
+            return self
+        least, most = self.ends()
+        if not least < most:
+            raise ValueError(f"least {least:g} must be smaller than most {most:g}")
+        if self.scale == "log" and least <= 0:
+            raise ValueError(f"a log scale needs a least above 0, found {least:g}")
+        return self
+
+    def ends(self) -> tuple[float, float]:
+        """Least and most value of a range.
+
+        Raises
+        ------
+        DescriptionError
+            The variable is a list of values.
+        """
+        if self.least is None or self.most is None:
+            raise DescriptionError(f"a variable with the values {self.values} has no least and most")
+        return self.least, self.most
+
+    def at(self, share: float) -> Value:
+        """The value at a share from 0 to 1 of the range, not rounded, or of the list."""
+        if self.values is not None:
+            return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
+        least, most = self.ends()
+        if self.scale == "log":
+            return float(math.exp(math.log(least) + share * math.log(most / least)))
+        return least + share * (most - least)
+
+    def taken(self, value: Value) -> Value:
+        """The value as a design takes it: rounded if it has to be whole."""
+        return round(float(value)) if self.whole and self.values is None else value
+
+    def grid(self) -> list[Value]:
+        """All values of a grid."""
+        if self.values is not None:
+            return list(self.values)
+        return list(dict.fromkeys(self.taken(self.at(k / (self.steps - 1))) for k in range(self.steps)))
+
+
+class Objective(Description):
+    """A figure to make as small or as large as possible."""
+
+    figure: str
+    goal: Literal["minimise", "maximise"] = "minimise"
+
+
+class Constraint(Description):
+    """Bounds of a figure."""
+
+    least: float | None = None
+    most: float | None = None
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Constraint:
+        if self.least is None and self.most is None:
+            raise ValueError("give least, most, or both")
+        if self.least is not None and self.most is not None and self.least > self.most:
+            raise ValueError(f"least {self.least:g} is above most {self.most:g}")
+        return self
+
+
+class Sampling(Description):
+    """How designs are chosen: all of a grid, at random, by a Sobol sequence, or by an optimiser (NSGA-II).
+
+    ``designs`` is their number where it is not the grid's; ``batch`` designs are judged at a time.
+    """
+
+    kind: Literal["grid", "random", "sobol", "optimise"] = "grid"
+    designs: Annotated[int, Field(ge=1, le=MOST_DESIGNS)] = 4096
+    seed: Annotated[int, Field(ge=0)] = 0
+    batch: Annotated[int, Field(ge=1, le=100_000)] = 1000
+
+
+class Study(Description):
+    """A study as read from TOML.
+
+    ``sensor`` is the base sensor: a name or path, in whose place its table is kept, or the table itself.
+    ``variables`` are free numbers or words of the sensor's description, by their path (``camera.focal_length_mm``);
+    ``choices`` are named alternatives that set several paths at once, such as cameras that can be bought. ``follow``
+    is what is set anew for every design as one would on the bench, see `twin.design.parameters.followed`.
+    ``refine`` lets the best design be improved along the gradient; ``verify`` is how many of the best are rendered, in
+    addition to the base sensor.
+    """
+
+    title: str
+    sensor: dict[str, Any] = Field(default="thesis", validate_default=True)
+    medium: str = "water"
+    reflectance: Annotated[float, Field(gt=0, le=1)] = 0.5
+    water_depth_m: NotNegative = 100.0
+    variables: dict[str, Variable] = {}
+    choices: dict[str, dict[str, dict[str, Value]]] = {}
+    follow: tuple[Follow, ...] = ()
+    sampling: Sampling = Sampling()
+    objectives: Annotated[tuple[Objective, ...], Field(min_length=1)] = (Objective(figure="sigma_z_rms_mm"),)
+    constraints: dict[str, Constraint] = {}
+    refine: bool = True
+    verify: Annotated[int, Field(ge=0, le=1000)] = 2
+    verify_tolerance: Annotated[float, Field(gt=1)] = 1.5
+
+    @field_validator("sensor", mode="before")
+    @classmethod
+    def _table_of(cls, value: Any) -> Any:
+        # Workers elsewhere may not have the file.
+        return read_table(find(value, "sensors"), "sensors") if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _figures_known(self) -> Study:
+        asked = [objective.figure for objective in self.objectives] + list(self.constraints)
+        if unknown := [name for name in asked if name not in FIGURES]:
+            raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
+        if not self.variables and not self.choices:
+            raise ValueError("nothing is free: give variables or choices")
+        if twice := set(self.variables) & set(self.choices):
+            raise ValueError(f"{', '.join(sorted(twice))}: a choice needs a name of its own")
+        if empty := [name for name, options in self.choices.items() if not options]:
+            raise ValueError(f"choices.{empty[0]} has no options")
+        if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
+            raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
+        return self
+
+    @model_validator(mode="after")
+    def _set_once(self) -> Study:
+        chosen = {path for options in self.choices.values() for option in options.values() for path in option}
+        if twice := sorted(set(self.variables) & chosen):
+            raise ValueError(f"{twice[0]} is set by a variable and by a choice")
+        for what, path in FOLLOWING.items():
+            if what in self.follow and path in (*self.variables, *chosen):
+                raise ValueError(f"{path} is free, but follow sets it: leave '{what}' out of follow, or the path")
+        if unfit := [path for path in (*self.variables, *chosen) if path.startswith("laser.window.tilt")]:
+            raise ValueError(f"{unfit[0]}: the formulas do not know it; compare two rendered sensors instead")
+        return self
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Study:
+        count = math.prod(
+            variable.steps if variable.values is None else len(variable.values) for variable in self.free().values()
+        )
+        if self.sampling.kind == "grid" and count > MOST_DESIGNS:
+            raise ValueError(f"a grid of {count:.3g} designs; at most {MOST_DESIGNS:g}: take fewer steps, or sobol")
+        return self
+
+    def free(self) -> dict[str, Variable]:
+        """All that is free, in order: variables, then choices by the names of their options."""
+        return self.variables | {name: Variable(values=tuple(options)) for name, options in self.choices.items()}
+
+    def base(self) -> Sensor:
+        """The base sensor."""
+        return validated(Sensor, self.sensor, "the study's sensor")
+
+    def medium_of(self, sensor: Sensor) -> Medium:
+        """The study's medium of a sensor."""
+        return sensor.medium(self.medium)
+
+
+def load_study(name_or_path: str | Path, *, designs: int | None = None, verify: int | None = None) -> Study:
+    """Study by name (``baseline-angle``) or path; a sensor beside it is found by its file name.
+
+    ``designs`` and ``verify`` replace what the study says of them.
+
+    Raises
+    ------
+    DescriptionError
+        The study is not valid, or a path does not exist in the sensor's description.
+    """
+    path = find(name_or_path, FOLDER)
+    table = read_table(path, FOLDER)
+    beside = path.parent / str(table.get("sensor", ""))
+    if beside.suffix == ".toml" and beside.is_file():
+        table["sensor"] = str(beside)
+    if designs is not None and isinstance(table.get("sampling", {}), dict):
+        table["sampling"] = table.get("sampling", {}) | {"designs": designs}
+    if verify is not None:
+        table["verify"] = verify
+    study = validated(Study, table, path)
+    base = study.base()
+    study.medium_of(base)
+    known = base.model_dump()
+    for options in study.choices.values():
+        for name in (name for option in options.values() for name in option):
+            _value_at(known, name, path)
+    counted = [name for name in study.variables if type(_value_at(known, name, path)) is int]
+    whole = {name: study.variables[name].model_copy(update={"whole": True}) for name in counted}
+    return study.model_copy(update={"variables": study.variables | whole})
+
+
+def _value_at(known: dict[str, Any], name: str, source: Path) -> Any:
+    """The value at a path of the sensor's description; DescriptionError where there is none."""
+    table: Any = known
+    for key in name.split("."):
+        if not isinstance(table, dict) or key not in table:
+            there = ", ".join(table) if isinstance(table, dict) else "nothing"
+            raise DescriptionError(
+                f"{source}: the sensor's description has no '{name}': there is no '{key}', but {there}"
+            )
+        table = table[key]
+    if isinstance(table, dict):
+        raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(table)}")
+    return table

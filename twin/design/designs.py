@@ -1,0 +1,215 @@
+"""Designs of a study: how they are chosen, the sensors that they describe, and their figures by formulas."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from twin.design.description import OTHER_COLUMNS, Study, Value
+from twin.design.figures import FIGURES, Figures, figures_of
+from twin.design.parameters import followed, numbers_of, parameters_of, stacked
+from uwlts.model.errors import DesignError, Error
+from uwlts.model.library import validated
+from uwlts.model.sensor import Sensor
+
+Columns = dict[str, np.ndarray]
+"""A study's results by column: "design", what is free, `Figures`, "violation" and "failure", one row per design."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """One design: its number in the study, and the value of everything that is free."""
+
+    number: int
+    values: dict[str, Value]
+
+
+@dataclass(frozen=True)
+class EvaluatedDesign:
+    """A design with what the formulas say of it.
+
+    ``number`` is -1 for a sensor that is none of the study's designs; ``values`` are those of what is free, ``figures``
+    those of `Figures`, NaN where the design fails. ``violation`` is by how much the constraints are missed together (0:
+    not at all), ``failure`` why the design cannot work ("" if it can).
+    """
+
+    number: int
+    values: dict[str, Value]
+    figures: dict[str, float]
+    violation: float
+    failure: str
+
+    def table(self) -> dict[str, Value]:
+        """All columns of a study's results for this design."""
+        ends = {"violation": self.violation, "failure": self.failure}
+        return {"design": self.number} | self.values | self.figures | ends
+
+
+@dataclass(frozen=True)
+class Marked:
+    """A design to point out: its label, its sensor as built, and its values and figures."""
+
+    label: str
+    sensor: Sensor
+    design: EvaluatedDesign
+
+
+def sensor_of(study: Study, design: Design) -> Sensor:
+    """The design's sensor, before anything follows the stand-off.
+
+    Raises
+    ------
+    DescriptionError, RangeError
+        The values make no valid description.
+    """
+    changes: dict[str, Value] = {}
+    for name, value in design.values.items():
+        changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
+    return validated(Sensor, _changed(study.sensor, changes), f"design {design.number}")
+
+
+def built(study: Study, design: Design) -> Sensor:
+    """The design's sensor as it is to be built, with everything set that follows the stand-off."""
+    sensor = sensor_of(study, design)
+    found = followed(np, parameters_of([sensor], [study.medium_of(sensor)]), study.follow)
+    numbers = {
+        "focus": {"camera.focus_distance_mm": found.focus_mm},
+        "waist": {"laser.waist_distance_mm": found.waist_distance_mm},
+        "volume": {"volume.near_mm": found.near_mm, "volume.far_mm": found.far_mm},
+    }
+    changes = {path: float(value.item()) for name in study.follow for path, value in numbers[name].items()}
+    table = _changed(sensor.model_dump(exclude_none=True), changes)
+    return validated(Sensor, table, f"design {design.number}")
+
+
+def _changed(table: dict[str, Any], changes: Mapping[str, Value]) -> dict[str, Any]:
+    """A table with values at paths replaced; the table itself stays as it is."""
+    table = dict(table)
+    for path, value in changes.items():
+        *parents, key = path.split(".")
+        place = table
+        for parent in parents:
+            place[parent] = dict(place.get(parent, {}))
+            place = place[parent]
+        place[key] = value
+    return table
+
+
+def judged(study: Study, designs: Sequence[Design]) -> Columns:
+    """What the formulas say of N designs, as columns (N,).
+
+    "design" is the number; the values of what is free and all `Figures` follow by their names, then "violation" and
+    "failure", see `EvaluatedDesign`. A design that fails has figures NaN and an infinite violation.
+    """
+    numbers, failures = {}, [""] * len(designs)
+    for place, design in enumerate(designs):
+        try:
+            sensor = sensor_of(study, design)
+            numbers[place] = numbers_of(sensor, study.medium_of(sensor))
+        except Error as error:
+            failures[place] = str(error)
+    columns = {"design": np.array([design.number for design in designs])}
+    columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
+    columns |= {name: np.full(len(designs), math.nan) for name in FIGURES}
+    columns["violation"] = np.full(len(designs), math.inf)
+    if numbers:
+        places = np.array(list(numbers))
+        figures, reasons = figures_of(
+            stacked(list(numbers.values())),
+            reflectance=study.reflectance,
+            water_depth_m=study.water_depth_m,
+            follow=study.follow,
+        )
+        for place, reason in zip(places, reasons, strict=True):
+            failures[place] = reason
+        works = np.array([not reason for reason in reasons])
+        for name in FIGURES:
+            columns[name][places[works]] = getattr(figures, name)[works]
+        columns["violation"][places[works]] = violations(study, figures)[works]
+    return columns | {"failure": np.array(failures, dtype=object)}
+
+
+def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
+    """A sensor that is not one of the study's designs, evaluated; nothing in it follows the stand-off.
+
+    Raises
+    ------
+    DesignError
+        The sensor cannot work.
+    """
+    numbers = parameters_of([sensor], [study.medium_of(sensor)])
+    figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
+    if reason:
+        raise DesignError(f"{label}: {reason}")
+    table = sensor.model_dump()
+    # `load_study` has checked that the paths lead to values.
+    values: dict[str, Any] = {
+        name: label if name in study.choices else reduce(lambda place, key: place[key], name.split("."), table)
+        for name in study.free()
+    }
+    numbers = {name: column.item() for name, column in vars(figures).items()}
+    return EvaluatedDesign(-1, values, numbers, violations(study, figures).item(), "")
+
+
+def row_of(columns: Columns, place: int) -> EvaluatedDesign:
+    """One design of a study's columns."""
+    row = {name: one[place].item() if one.dtype != object else one[place] for name, one in columns.items()}
+    values = {name: value for name, value in row.items() if name not in (*FIGURES, *OTHER_COLUMNS)}
+    figures = {name: value for name, value in row.items() if name in FIGURES}
+    return EvaluatedDesign(row["design"], values, figures, row["violation"], row["failure"] or "")
+
+
+def violations(study: Study, figures: Figures) -> np.ndarray:
+    """By how much designs (N,) miss the constraints together, in parts of the bounds; 0 where all hold."""
+    total = np.zeros(len(figures.coverage))
+    for name, bounds in study.constraints.items():
+        values = getattr(figures, name)
+        for sign, bound in ((-1.0, bounds.least), (1.0, bounds.most)):
+            if bound is not None:
+                missed = np.where(np.isnan(values), math.inf, sign * (values - bound))
+                total += np.maximum(missed, 0.0) / (abs(bound) or 1.0)
+    return total
+
+
+def number_of_designs(study: Study) -> int:
+    """How many designs a study judges."""
+    if study.sampling.kind != "grid":
+        return study.sampling.designs
+    return math.prod(len(variable.grid()) for variable in study.free().values())
+
+
+def designs_of(study: Study, first: int, count: int) -> list[Design]:
+    """Designs ``first`` to ``first + count - 1`` of a grid (the last variable runs fastest), random or Sobol study."""
+    numbers = range(first, min(first + count, number_of_designs(study)))
+    free = study.free()
+    if study.sampling.kind == "grid":
+        grids = [variable.grid() for variable in free.values()]
+        places = np.unravel_index(np.array(numbers), [len(grid) for grid in grids])
+        chosen = ([grid[k] for grid, k in zip(grids, row, strict=True)] for row in zip(*places, strict=True))
+    else:
+        shares = _shares(study, numbers)
+        chosen = ([v.taken(v.at(float(s))) for v, s in zip(free.values(), row, strict=True)] for row in shares)
+    return [
+        Design(number, dict(zip(free, values, strict=True))) for number, values in zip(numbers, chosen, strict=True)
+    ]
+
+
+def _shares(study: Study, numbers: range) -> np.ndarray:
+    """Points (N, V) of the unit cube."""
+    variables, seed = len(study.free()), study.sampling.seed
+    if study.sampling.kind == "random":
+        return np.array([np.random.default_rng([seed, number]).random(variables) for number in numbers])
+    sequence = qmc.Sobol(variables, rng=np.random.default_rng(seed))
+    with warnings.catch_warnings():
+        # A part of the sequence need not be a power of two long: the whole counts.
+        warnings.simplefilter("ignore", UserWarning)
+        if numbers.start > 0:
+            sequence.fast_forward(numbers.start)
+        return sequence.random(len(numbers))

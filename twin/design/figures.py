@@ -1,0 +1,421 @@
+"""Figures of merit of designs by formulas, for many designs at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from types import ModuleType
+
+import numpy as np
+
+from twin.design.geometry import (
+    Array,
+    Vector,
+    across_mm,
+    added,
+    degrees,
+    direction_outside,
+    dot,
+    path_to,
+    pixels_per_mm,
+    scaled,
+    seen,
+    snell_root,
+    standoff_mm,
+)
+from twin.design.parameters import Follow, Parameters, followed
+from twin.design.stripe import centre_noise_px, exposure_ms, stripe_at
+from uwlts.model.errors import RangeError
+
+DEPTHS, PLACES = 5, 7
+"""Points of the measuring volume: so many depths, evenly from end to end of what the camera sees of it, and so many
+places along the stripe at each."""
+_EDGE_STEPS = 5
+_NEAREST_MM, _FARTHEST_MM = 1.0, 1e6
+"""Where the sheet is taken to leave the image at most: so far from the window's outer face, and from the pupil."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """What is where in the measuring volume, arrays that go with (N, DEPTHS, PLACES).
+
+    ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties by the
+    stripe's noise. ``lit`` is where the fan has a line in view of the image's other sides, ``in_view`` where the
+    camera sees it.
+    """
+
+    y_mm: Array
+    z_mm: Array
+    half_line_mm: Array
+    sigma_y_mm: Array
+    sigma_z_mm: Array
+    depth_per_px_mm: Array
+    along_per_px_mm: Array
+    centre_px: Array
+    stripe_px: Array
+    blur_px: Array
+    signal_e: Array
+    occlusion_rad: Array
+    lit: Array
+    in_view: Array
+    exposure_ms: Array
+    required_ms: Array
+    standoff_mm: Array
+
+
+def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
+    """Where the part of the measuring volume begins and ends that the camera sees, in the middle of the line.
+
+    Depths from the window's outer face. Where the sheet leaves the image follows from Newton's method in the inverse of
+    the depth, in which the pixel is nearly linear (exactly so without a window).
+    """
+    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
+    standoff, outer = standoff_mm(pose), p.outer_mm(xp)
+    other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
+    ends = []
+    for edge in (-0.5, other - 0.5):
+        inverse = 1 / standoff
+        for _ in range(_EDGE_STEPS):
+            depth = 1 / inverse
+            middle = scaled(pose.axis, (depth - standoff) / pose.axis[2])
+            view = seen(xp, lens, window, added((0.0 * standoff, 0.0 * standoff, standoff), middle))
+            by_z = pixels_per_mm(view, window, pose.axis)
+            change = -(depth**2) / pose.axis[2] * p.across(by_z)
+            inverse = inverse + (edge - p.across((view.x, view.y))) / change
+            inverse = xp.minimum(xp.maximum(inverse, 1 / _FARTHEST_MM), 1 / (outer + _NEAREST_MM))
+        ends.append(1 / inverse - outer)
+    near, far = xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
+    return xp.maximum(p.near_mm, near), xp.minimum(p.far_mm, far)
+
+
+def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
+    """Designs' sheets at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
+
+    A stripe's centre that is off by d px on its profile line is a point of the sheet that is off by (dY, dZ) =
+    J^-1 (d, 0), J being how the pixel across and along the stripe changes with Y and Z.
+    """
+    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
+    standoff = standoff_mm(pose)
+    outer = p.outer_mm(xp)
+    z = (outer + depth_mm - standoff) / pose.axis[2]
+    origin = (0.0 * standoff, 0.0 * standoff, standoff)
+    middle = added(origin, scaled(pose.axis, z))
+
+    def at(y: Array) -> Vector:
+        return added(middle, scaled(pose.fan, y))
+
+    side = p.along_width * p.width_px + (1 - p.along_width) * p.height_px
+    other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
+    ends = []
+    for edge in (-0.5, side - 0.5):
+        y = 0.0 * z
+        for _ in range(_EDGE_STEPS):
+            view = seen(xp, lens, window, at(y))
+            y = y + (edge - p.along((view.x, view.y))) / p.along(pixels_per_mm(view, window, pose.fan))
+        ends.append(y)
+    laser_window = p.laser_window(pose.axis)
+    offset = dot(added(middle, scaled(pose.origin, -1.0)), pose.fan)
+    height = dot(added(middle, scaled(pose.origin, -1.0)), pose.axis)
+    edges = [across_mm(xp, laser_window, height, xp.tan(angle)) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
+    low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
+    high = xp.minimum(xp.maximum(ends[0], ends[1]), edges[1])
+    half = 0.5 * (high - low)
+    y = 0.5 * (high + low) + half * places
+
+    point = at(y)
+    view = seen(xp, lens, window, point)
+    by_y, by_z = pixels_per_mm(view, window, pose.fan), pixels_per_mm(view, window, pose.axis)
+    determinant = p.across(by_y) * p.along(by_z) - p.across(by_z) * p.along(by_y)
+    stripe = stripe_at(xp, p, pose, window, point, view, reflectance=reflectance)
+    u = p.across((view.x, view.y))
+    lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
+    inside = lit & (u >= -0.5) & (u <= other - 0.5)
+    rate = stripe.rate_e_per_ms
+    brightest = _largest(xp, rate, lit)
+    required, used = exposure_ms(xp, p, brightest)
+    signal = rate * used
+    noise = centre_noise_px(xp, p, stripe, used)
+    towards_camera = direction_outside(xp, window, view.path)
+    from_laser = direction_outside(xp, laser_window, path_to(xp, laser_window, added(point, scaled(pose.origin, -1.0))))
+    return Field(
+        y_mm=y,
+        z_mm=z,
+        half_line_mm=half,
+        sigma_y_mm=noise * abs(p.along(by_z) / determinant),
+        sigma_z_mm=noise * abs(p.along(by_y) / determinant),
+        depth_per_px_mm=abs(p.along(by_y) / determinant),
+        along_per_px_mm=1 / abs(p.along(by_y)),
+        centre_px=noise,
+        stripe_px=stripe.sigma_px,
+        blur_px=stripe.blur_px,
+        signal_e=signal,
+        occlusion_rad=_angle(xp, towards_camera, from_laser),
+        lit=lit,
+        in_view=inside,
+        exposure_ms=used,
+        required_ms=required,
+        standoff_mm=standoff,
+    )
+
+
+def _angle(xp: ModuleType, a: Vector, b: Vector) -> Array:
+    """Angle between unit vectors."""
+    cross = added(a, scaled(b, -1.0))
+    return 2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(cross, cross) + 1e-24), 1.0))
+
+
+def _largest(xp: ModuleType, values: Array, where: Array) -> Array:
+    """Largest value of every design."""
+    if xp is np:
+        found = np.where(where, values, 0.0).max(axis=(1, 2), keepdims=True)
+        return np.where(found > 0, found, math.nan)
+    return xp.max(values)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of merit of N designs, one array (N,) each.
+
+    Depths are counted along the camera's axis from the window's outer face. Sigmas are standard uncertainties: the
+    largest in the part of the measuring volume that the camera sees, and ``sigma_z_rms_mm`` the root mean square over
+    it; near, middle and far are the ends and the middle of that part. Z runs along the laser's axis, Y along the
+    stripe, X across the sheet, along the stage.
+
+    Attributes
+    ----------
+    sigma_x_mm, sigma_y_mm, sigma_z_mm, sigma_z_rms_mm
+        X by the stage's resolution alone, the others by the stripe's noise.
+    sigma_z_near_mm, sigma_z_middle_mm, sigma_z_far_mm
+        Root mean squares along the stripe.
+    depth_per_px_mm, along_per_px_mm
+        In the middle: Z and Y per pixel.
+    coverage
+        Share of the volume that camera and laser reach.
+    standoff_mm, near_mm, far_mm, depth_mm
+        Where the sheet crosses the camera's axis, and the volume's depths and their difference.
+    line_near_mm, line_mm, line_far_mm, section_cm2
+        Length of the stripe at near end, middle and far end; area of the sheet that the camera sees.
+    occlusion_deg
+        Largest angle between the laser's and the camera's rays: steeper walls hide one from the other.
+    signal_e, exposure_ms, required_ms
+        Faintest signal in the volume; the exposure used, and the one that the wanted brightness takes.
+    stripe_px, blur_px, centre_px
+        Standard deviation of the stripe's image, the lens's part of it, and of the centre: largest in the volume.
+    speckle_limit_mm
+        Dorsch's limit along Z in the middle of the volume, for depolarised light.
+    laser_class
+        1, 2, 3 (3R), 4 (3B) or 5 (4) after IEC 60825-1 for a point source, through 7 mm at 100 mm from the line optics.
+    window_mm
+        Thickness that the camera's window needs for the pressure at the study's depth.
+    baseline_mm
+        How wide the sensor is.
+    """
+
+    sigma_x_mm: np.ndarray
+    sigma_y_mm: np.ndarray
+    sigma_z_mm: np.ndarray
+    sigma_z_rms_mm: np.ndarray
+    sigma_z_near_mm: np.ndarray
+    sigma_z_middle_mm: np.ndarray
+    sigma_z_far_mm: np.ndarray
+    depth_per_px_mm: np.ndarray
+    along_per_px_mm: np.ndarray
+    coverage: np.ndarray
+    standoff_mm: np.ndarray
+    near_mm: np.ndarray
+    far_mm: np.ndarray
+    depth_mm: np.ndarray
+    line_near_mm: np.ndarray
+    line_mm: np.ndarray
+    line_far_mm: np.ndarray
+    section_cm2: np.ndarray
+    occlusion_deg: np.ndarray
+    signal_e: np.ndarray
+    exposure_ms: np.ndarray
+    required_ms: np.ndarray
+    stripe_px: np.ndarray
+    blur_px: np.ndarray
+    centre_px: np.ndarray
+    speckle_limit_mm: np.ndarray
+    laser_class: np.ndarray
+    window_mm: np.ndarray
+    baseline_mm: np.ndarray
+
+
+FIGURES = tuple(field.name for field in fields(Figures))
+
+
+def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
+    """Root mean square of sigma Z (K,) along the stripe of one design, where Z is ``z_mm`` (K,), from the stand-off on.
+
+    The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view.
+    """
+    with np.errstate(all="ignore"):
+        pose = p.pose(np)
+        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
+        places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
+        f = field_of(np, p, depth, places, reflectance=reflectance)
+    counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
+    squares = np.where(counts, f.sigma_z_mm**2, 0.0)
+    return np.sqrt(squares.sum(axis=2) / np.maximum(counts.sum(axis=2), 1))[0]
+
+
+def figures_of(
+    p: Parameters, *, reflectance: float, water_depth_m: float, follow: Sequence[Follow] = ()
+) -> tuple[Figures, list[str]]:
+    """Figures of N designs, and why each of those fails that cannot work ("" for the others, whose figures hold)."""
+    if not 0 < reflectance <= 1:
+        raise RangeError(f"reflectance is {reflectance:g}; expected a number above 0, up to 1")
+    with np.errstate(all="ignore"):
+        p = followed(np, p, follow)
+        near, far = depths_in_view(np, p)
+        depths = near + (far - near) * np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
+        places = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
+        f = field_of(np, p, depths, places, reflectance=reflectance)
+        shape = np.broadcast_shapes(f.sigma_z_mm.shape, (len(np.atleast_1d(p.near_mm.ravel())), DEPTHS, PLACES))
+        full = {
+            one.name: np.broadcast_to(np.asarray(getattr(f, one.name), dtype=float), shape) for one in fields(Field)
+        }
+        figures = _reduced(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
+        reasons = _reasons(p, figures, full)
+    return figures, reasons
+
+
+def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
+    n = len(f["z_mm"])
+    inside = f["lit"] > 0
+    middle = DEPTHS // 2
+
+    def worst(name: str) -> np.ndarray:
+        return np.where(inside, f[name], -np.inf).max(axis=(1, 2))
+
+    def rms(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.where(where, values**2, 0.0).sum(axis=-1) / where.sum(axis=-1))
+
+    def one(values: object) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (n,)).copy()
+
+    per_depth = rms(f["sigma_z_mm"], inside)
+    flat = f["sigma_z_mm"].reshape(n, -1), inside.reshape(n, -1)
+    line = np.where(inside.any(axis=2), 2 * f["half_line_mm"][:, :, 0], 0.0)
+    z = f["z_mm"][:, :, 0]
+    at = (slice(None), middle, PLACES // 2)
+    contrast = p.speckle_coherence / math.sqrt(2)
+    speckle_px = contrast * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
+    return Figures(
+        sigma_x_mm=one(p.stage_resolution_mm / math.sqrt(12)),
+        sigma_y_mm=worst("sigma_y_mm"),
+        sigma_z_mm=worst("sigma_z_mm"),
+        sigma_z_rms_mm=rms(*flat),
+        sigma_z_near_mm=per_depth[:, 0],
+        sigma_z_middle_mm=per_depth[:, middle],
+        sigma_z_far_mm=per_depth[:, -1],
+        depth_per_px_mm=f["depth_per_px_mm"][at],
+        along_per_px_mm=f["along_per_px_mm"][at],
+        coverage=one(np.maximum(share, 0.0)) * inside.mean(axis=(1, 2)),
+        standoff_mm=one(f["standoff_mm"][:, 0, 0] - one(p.outer_mm(np))),
+        near_mm=one(p.near_mm),
+        far_mm=one(p.far_mm),
+        depth_mm=one(p.far_mm - p.near_mm),
+        line_near_mm=line[:, 0],
+        line_mm=line[:, middle],
+        line_far_mm=line[:, -1],
+        section_cm2=0.01 * np.trapezoid(line, z, axis=1),
+        occlusion_deg=degrees(worst("occlusion_rad")),
+        signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
+        exposure_ms=f["exposure_ms"][:, 0, 0],
+        required_ms=f["required_ms"][:, 0, 0],
+        stripe_px=worst("stripe_px"),
+        blur_px=worst("blur_px"),
+        centre_px=worst("centre_px"),
+        speckle_limit_mm=one(speckle_px) * f["depth_per_px_mm"][at],
+        laser_class=one(laser_class(p)),
+        window_mm=one(window_needed_mm(p, water_depth_m=water_depth_m)),
+        baseline_mm=one(np.hypot(p.pose(np).origin[0], p.pose(np).origin[1])),
+    )
+
+
+def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
+    """Why designs cannot work."""
+    n = len(figures.coverage)
+
+    def one(values: object) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (n,))
+
+    corner = np.hypot(p.width_px, p.height_px) / 2 * p.pixel_mm / p.focal_mm
+    glass = corner / snell_root(np, p.window_index, corner)
+    cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
+    spread = np.tan(p.fan_half_rad)
+    inside = spread / snell_root(np, p.laser_window_index, spread)
+    fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
+    fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
+    checks = (
+        (one(p.focus_mm - p.focal_mm) <= 0, "the lens would be focused within its focal length", None),
+        (
+            ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5),
+            "the sheet crosses the camera's axis {:.0f} mm behind the window's outer face, not in front of it",
+            -figures.standoff_mm,
+        ),
+        (
+            ~(figures.near_mm > 0),
+            "the measuring volume would begin {:.0f} mm behind the window's outer face",
+            -figures.near_mm,
+        ),
+        (
+            cone > one(p.window_aperture_mm),
+            "the cone of view is {:.0f} mm wide at the window's outer face, wider than its opening",
+            cone,
+        ),
+        (
+            fan > one(p.laser_window_aperture_mm),
+            "the laser's fan is {:.0f} mm wide at its window, wider than its opening",
+            fan,
+        ),
+        (~(figures.coverage > 0), "camera and laser reach no point of the measuring volume", None),
+        (fullest > 1, "the stripe saturates: at the given exposure it has {:.1f} times the full well", fullest),
+        (
+            ~(np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm) < 0.5 * figures.standoff_mm),
+            "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser",
+            None,
+        ),
+    )
+    reasons = [""] * n
+    for failed, text, value in checks:
+        for i in np.flatnonzero(failed):
+            reasons[i] = reasons[i] or text.format(*(() if value is None else (value[i],)))
+    return reasons
+
+
+CLASS_NAMES = {1: "1", 2: "2", 3: "3R", 4: "3B", 5: "4"}
+_PUPIL_MM, _AWAY_MM = 7.0, 100.0
+_CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W = 1e-3, 5e-3, 0.5
+
+_GRAVITY, _WATER_KG_PER_M3 = 9.81, 1030.0
+_SILICA_STRENGTH_MPA, _CLAMPED, _SAFETY = 60.0, 0.75, 4.0
+
+
+def laser_class(p: Parameters) -> np.ndarray:
+    """Class after IEC 60825-1:2014 as a number, see `CLASS_NAMES`: an estimate for a design, not a classification.
+
+    Limits for continuous visible light from a point source (Tables 3 to 8): class 1 up to 0.39 mW above 500 nm,
+    0.039 mW below 450 nm and C3 = 10^(0.02 (nm - 450)) times that between; class 2 up to 1 mW, 3R up to 5 mW, 3B up to
+    500 mW. What counts is the power through 7 mm at 100 mm from the line optics (condition 3), of a line that is
+    spread by its fan in air, where the fan is brightest per angle. Every laser counts alone.
+    """
+    seen = 2 * math.atan(0.5 * _PUPIL_MM / _AWAY_MM) / (2 * p.fan_half_rad)
+    gaussian = 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
+    tabulated = 2 * p.fan_half_rad * np.maximum.reduce(p.fan_powers)
+    peak = np.where(p.gaussian_fan > 0, gaussian, np.where(p.tabulated_fan > 0, tabulated, 1.0))
+    power = p.power_w * np.minimum(1.0, peak * seen)
+    nm = 1e6 * p.wavelength_mm
+    class_1 = 3.9e-5 * 10 ** (0.02 * (np.clip(nm, 450, 500) - 450))
+    limits = (class_1, _CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W)
+    return np.sum([power > limit for limit in limits], axis=0) + 1
+
+
+def window_needed_mm(p: Parameters, *, water_depth_m: float) -> np.ndarray:
+    """Thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S) (Harris 1999, thesis Eq. 3.2)."""
+    pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
+    opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
+    return 0.5 * opening * math.sqrt(_CLAMPED * _SAFETY * pressure_mpa / _SILICA_STRENGTH_MPA)

@@ -1,0 +1,292 @@
+"""Geometry of camera and sheet: rays through flat windows, distortion, and how the image moves with points.
+
+The formulas are written for arrays of any kind that has sqrt, sin and cos in its namespace ``xp``: NumPy, for many
+designs at once, or Dr.Jit, which differentiates them. Everything lies in the camera frame (mm); vectors are tuples of
+three arrays. The renderer has its own method, tracing rays through real faces, so that one can be checked against the
+other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+Array = Any
+"""A NumPy or Dr.Jit array, or a number that goes with one."""
+Vector = tuple[Array, Array, Array]
+
+_NEWTON_STEPS = 4
+_UNDISTORTING_STEPS, _UNDISTORTED_PX = 100, 1e-3
+"""Strong distortion converges slowly; what is left is far below what a drawing shows."""
+_TINY_MM = 1e-9
+"""Keeps the direction of a point on the window's normal defined; far below anything that matters."""
+
+
+def dot(a: Vector, b: Vector) -> Array:
+    """Inner product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def scaled(a: Vector, factor: Array) -> Vector:
+    """Vector times a number."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+def added(a: Vector, b: Vector) -> Vector:
+    """Sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The laser's fan: its origin, and unit vectors along its axis, along the stripe and across the sheet."""
+
+    origin: Vector
+    axis: Vector
+    fan: Vector
+    normal: Vector
+
+
+def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> Pose:
+    """Pose of a laser placed by baseline and triangulation angle; ``towards`` is the baseline's direction, (x, y, 0).
+
+    As `uwlts.model.placement.laser_pose`, in a form that can be derived.
+    """
+    sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
+    axis = (-sine * towards[0], -sine * towards[1], cosine)
+    across = (cosine * towards[0], cosine * towards[1], sine)
+    along = (-towards[1], towards[0], 0.0 * sine)
+    turn, keep = xp.sin(roll_rad), xp.cos(roll_rad)
+    normal = added(scaled(across, keep), scaled(along, turn))
+    fan = added(scaled(along, keep), scaled(across, -turn))
+    return Pose(scaled(towards, baseline_mm), axis, fan, normal)
+
+
+def standoff_mm(pose: Pose) -> Array:
+    """Depth at which the sheet crosses the camera's axis, from the entrance pupil."""
+    return dot(pose.normal, pose.origin) / pose.normal[2]
+
+
+@dataclass(frozen=True)
+class FlatWindow:
+    """A window: unit normal away from the module, distance to its inner face along the normal, thickness, indices."""
+
+    normal: Vector
+    distance_mm: Array
+    thickness_mm: Array
+    glass_index: Array
+    medium_index: Array
+
+    @property
+    def outer_mm(self) -> Array:
+        """Distance of the outer face along the normal."""
+        return self.distance_mm + self.thickness_mm
+
+    def layers(self, height_mm: Array) -> tuple[tuple[Array, Array], ...]:
+        """Extents along the normal up to a height, and indices, of the air, the glass and the medium."""
+        return (
+            (self.distance_mm, 1.0),
+            (self.thickness_mm, self.glass_index),
+            (height_mm - self.outer_mm, self.medium_index),
+        )
+
+
+@dataclass(frozen=True)
+class Path:
+    """Rays from a module's origin through its window to points outside.
+
+    ``slope`` is the tangent of the angle to the window's normal in air, ``slope_outside`` that in the medium,
+    ``across`` the unit vector square to the normal in which the ray leans, ``height_mm`` the point's distance from the
+    origin along the normal. ``apparent_mm`` is the ray's distance across over its slope in air, the distance from which
+    it seems to come sideways; ``growth_mm`` is the change of the distance across by the slope, the distance from which
+    a bundle seems to come in the plane of incidence.
+    """
+
+    slope: Array
+    slope_outside: Array
+    across: Vector
+    height_mm: Array
+    apparent_mm: Array
+    growth_mm: Array
+
+
+def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:
+    """The root sqrt(n^2 + (n^2 - 1) p^2) by which Snell's law divides the slope p that a ray has in air.
+
+    From n sin(b) = sin(a) with p = tan(a): tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2).
+    """
+    return xp.sqrt(index * index + (index * index - 1) * slope * slope)
+
+
+def across_mm(xp: ModuleType, window: FlatWindow, height_mm: Array, slope: Array) -> Array:
+    """Distance from the normal through the origin that a ray of some slope in air has at a height along the normal."""
+    return sum(extent * slope / snell_root(xp, n, slope) for extent, n in window.layers(height_mm))
+
+
+def traced(window: FlatWindow, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3, 3) where rays (N, 3) start and meet both faces of a window, and their directions behind it.
+
+    NaN for rays that lead away from the window.
+    """
+    normal = np.array(window.normal)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead = directions @ normal
+        sideways = directions / np.where(ahead > 0, ahead, np.nan)[:, None] - normal
+        slope = np.sqrt((sideways**2).sum(axis=1))
+        leaning = sideways / np.maximum(slope, 1e-300)[:, None]
+    at_faces = (
+        (window.distance_mm, window.distance_mm * slope),
+        (window.outer_mm, across_mm(np, window, window.outer_mm, slope)),
+    )
+    points = [origin + height * normal + aside[:, None] * leaning for height, aside in at_faces]
+    points = [np.broadcast_to(origin, directions.shape), *points]
+    outside = slope / snell_root(np, window.medium_index, slope)
+    return np.stack(points, axis=1), normal + outside[:, None] * leaning
+
+
+def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
+    """The ray to points beyond a window, by Snell's law, with the module's origin at 0.
+
+    A ray of slope p in air has in a layer of index n the slope p S(n), S(n) = 1 / sqrt(n^2 + (n^2 - 1) p^2), so that it
+    goes p M(p) across, M being the sum of every layer's extent times its S. Newton's method solves p M = rho; its
+    derivative is the sum of extent times n^2 S^3.
+    """
+    height = dot(point, window.normal)
+    sideways = added(point, scaled(window.normal, -height))
+    rho = xp.sqrt(dot(sideways, sideways) + _TINY_MM**2)
+    layers = window.layers(height)
+
+    def reach(p: Array) -> tuple[Array, Array, Array]:
+        total, growth, last = 0.0, 0.0, None
+        for extent, n in layers:
+            last = 1 / snell_root(xp, n, p)
+            total, growth = total + extent * last, growth + extent * n * n * last**3
+        return total, growth, last
+
+    p = rho / reach(0.0 * rho)[0]
+    for _ in range(_NEWTON_STEPS):
+        total, growth, _ = reach(p)
+        p = p + (rho - p * total) / growth
+    total, growth, last = reach(p)
+    return Path(p, p * last, scaled(sideways, 1 / rho), height, total, growth)
+
+
+def direction_outside(xp: ModuleType, window: FlatWindow, path: Path) -> Vector:
+    """Unit vectors of rays in the medium, away from the module."""
+    along = added(window.normal, scaled(path.across, path.slope_outside))
+    return scaled(along, 1 / xp.sqrt(1 + path.slope_outside * path.slope_outside))
+
+
+def length_outside_mm(xp: ModuleType, window: FlatWindow, path: Path) -> Array:
+    """Path length of rays through the medium."""
+    return (path.height_mm - window.outer_mm) * xp.sqrt(1 + path.slope_outside * path.slope_outside)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole with Brown-Conrady distortion: focal length and principal point in px."""
+
+    focal_px: Array
+    cx: Array
+    cy: Array
+    k1: Array
+    k2: Array
+    k3: Array
+    p1: Array
+    p2: Array
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Points as the camera sees them: pixels x, y, the ray there, and what a shift of the image point does to pixels.
+
+    ``jacobian`` holds dx/da, dx/db, dy/da, dy/db in px for the image point (a, b), slopes in air, before distortion.
+    """
+
+    x: Array
+    y: Array
+    path: Path
+    slopes: tuple[Array, Array]
+    jacobian: tuple[Array, Array, Array, Array]
+
+
+def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Image points (x, y) of slopes (a, b), and the radial factor; distortion after Brown 1971, in OpenCV's form."""
+    r2 = a * a + b * b
+    radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
+    y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
+    return x, y, radial
+
+
+def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """Rays (N, 3) of pixels (N, 2); distortion undone by fixed-point steps. NaN where they do not converge."""
+    wanted = (pixels - (lens.cx, lens.cy)) / lens.focal_px
+    found = wanted.copy()
+    missed = np.full(len(found), np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(_UNDISTORTING_STEPS):
+            x, y, radial = distorted(lens, *found.T)
+            image = np.stack([x, y], axis=1)
+            missed = np.abs(image - wanted).max(axis=1)
+            found += (wanted - image) / radial[:, None]
+        found[~(missed * lens.focal_px < _UNDISTORTED_PX)] = np.nan
+    return np.column_stack([found, np.ones(len(found))])
+
+
+def seen(xp: ModuleType, lens: Lens, window: FlatWindow, point: Vector) -> Seen:
+    """Pixels at which points beyond the window appear."""
+    path = path_to(xp, window, point)
+    ray = added(window.normal, scaled(path.across, path.slope))
+    a, b = ray[0] / ray[2], ray[1] / ray[2]
+    r2 = a * a + b * b
+    x, y, radial = distorted(lens, a, b)
+    slope = 2 * (lens.k1 + r2 * (2 * lens.k2 + r2 * 3 * lens.k3))
+    mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
+    jacobian = (
+        lens.focal_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),
+        lens.focal_px * mixed,
+        lens.focal_px * mixed,
+        lens.focal_px * (radial + slope * b * b + 2 * lens.p2 * a + 6 * lens.p1 * b),
+    )
+    return Seen(lens.focal_px * x + lens.cx, lens.focal_px * y + lens.cy, path, (a, b), jacobian)
+
+
+def slopes_per_mm(view: Seen, window: FlatWindow, along: Vector) -> tuple[Array, Array]:
+    """How the image point's slopes (a, b) change per mm that a point moves along a direction.
+
+    From p M(p, h) = rho: the slope p changes by (d rho - p S dh) / growth, h being the point's height; and what goes
+    square to the plane of incidence is seen from the apparent distance M.
+    """
+    path = view.path
+    up = dot(along, window.normal)
+    sideways = added(along, scaled(window.normal, -up))
+    radial = dot(sideways, path.across)
+    steeper = (radial - path.slope_outside * up) / path.growth_mm
+    turned = scaled(added(sideways, scaled(path.across, -radial)), 1 / path.apparent_mm)
+    change = added(scaled(path.across, steeper), turned)
+    ray_z = window.normal[2] + path.across[2] * path.slope
+    a, b = view.slopes
+    return (change[0] - a * change[2]) / ray_z, (change[1] - b * change[2]) / ray_z
+
+
+def pixels_per_mm(view: Seen, window: FlatWindow, along: Vector) -> tuple[Array, Array]:
+    """How the pixels (x, y) change per mm that a point moves along a direction."""
+    da, db = slopes_per_mm(view, window, along)
+    xa, xb, ya, yb = view.jacobian
+    return xa * da + xb * db, ya * da + yb * db
+
+
+def window_normal(xp: ModuleType, *, tilt_x_rad: Array, tilt_y_rad: Array) -> Vector:
+    """Unit normal in the module's frame, as `uwlts.model.sensor.Window.normal`."""
+    cosine = xp.cos(tilt_x_rad)
+    return cosine * xp.sin(tilt_y_rad), -xp.sin(tilt_x_rad), cosine * xp.cos(tilt_y_rad)
+
+
+def degrees(angle: Array) -> Array:
+    """An angle in rad in degrees."""
+    return angle * (180 / math.pi)

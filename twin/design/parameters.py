@@ -1,0 +1,402 @@
+"""Parameters of designs for the formulas: plain arrays, one value per design, taken from sensor descriptions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from types import ModuleType
+from typing import Literal
+
+import numpy as np
+from numpy.polynomial import Chebyshev
+from numpy.typing import ArrayLike
+
+from twin.design.geometry import (
+    Array,
+    FlatWindow,
+    Lens,
+    Pose,
+    Vector,
+    dot,
+    path_to,
+    pose_at,
+    standoff_mm,
+    window_normal,
+)
+from twin.sensor.speckle import coherence, pixel_contrast
+from uwlts.model.errors import DescriptionError
+from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import Medium, Sensor
+
+Follow = Literal["focus", "waist", "volume"]
+
+_DIFFUSE_ROUGHNESS_UM = 5.0
+"""Rms height of a diffuse surface, for the loss of speckle contrast in light of some line width."""
+_GRAINS_PX = (0.02, 64.0)
+"""Speckle grains for which the averaging over pixels is known; others count as these."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """One array of numbers per quantity, all of the same shape or 1; units are part of the names.
+
+    ``placed`` is the pose (origin, axis, fan, normal) of lasers that are placed by their axis, NaN for those placed by
+    baseline and angle. ``along_width`` is 1 where the stripe runs along the image's width, else 0. ``fan_nodes_rad``
+    and ``fan_powers`` hold tabulated profiles (relative power per angle; lists of arrays), empty where none has one.
+    """
+
+    baseline_mm: Array
+    angle_rad: Array
+    roll_rad: Array
+    placed: tuple[Vector, Vector, Vector, Vector]
+    along_width: Array
+    width_px: Array
+    height_px: Array
+    pixel_mm: Array
+    focal_mm: Array
+    cx_px: Array
+    cy_px: Array
+    k1: Array
+    k2: Array
+    k3: Array
+    p1: Array
+    p2: Array
+    f_number: Array
+    focus_mm: Array
+    window_mounted: Array
+    window_distance_mm: Array
+    window_thickness_mm: Array
+    window_tilt_x_rad: Array
+    window_tilt_y_rad: Array
+    window_index: Array
+    window_passes: Array
+    window_aperture_mm: Array
+    wavelength_mm: Array
+    power_w: Array
+    fan_half_rad: Array
+    lit_from_rad: Array
+    lit_to_rad: Array
+    gaussian_fan: Array
+    tabulated_fan: Array
+    fan_nodes_rad: tuple[Array, ...]
+    fan_powers: tuple[Array, ...]
+    waist_mm: Array
+    waist_distance_mm: Array
+    beam_quality: Array
+    laser_window_distance_mm: Array
+    laser_window_thickness_mm: Array
+    laser_window_index: Array
+    laser_window_passes: Array
+    laser_window_aperture_mm: Array
+    medium_index: Array
+    extinction_per_mm: Array
+    quantum_efficiency: Array
+    full_well_e: Array
+    read_noise_e: Array
+    dark_e_per_ms: Array
+    offset_e: Array
+    prnu: Array
+    step_e: Array
+    bits: Array
+    exposure_ms: Array
+    exposure_level: Array
+    longest_ms: Array
+    ambient_w_per_mm2: Array
+    speckle_coherence: Array
+    stage_resolution_mm: Array
+    near_mm: Array
+    far_mm: Array
+
+    def pose(self, xp: ModuleType) -> Pose:
+        """Pose of the laser in the camera frame."""
+        towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
+        by_angle = pose_at(
+            xp, baseline_mm=self.baseline_mm, angle_rad=self.angle_rad, roll_rad=self.roll_rad, towards=towards
+        )
+        if not np.isfinite(self.placed[0][0]).any():
+            return by_angle
+        if xp is not np:
+            return Pose(*self.placed)
+        vectors = (by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal)
+        chosen = [
+            tuple(np.where(np.isfinite(given), given, found) for given, found in zip(own, found_vector, strict=True))
+            for own, found_vector in zip(self.placed, vectors, strict=True)
+        ]
+        return Pose(*chosen)
+
+    def along(self, pixels: tuple[Array, Array]) -> Array:
+        """The one of a pair for x and y that belongs to the pixel along the stripe."""
+        return self.along_width * pixels[0] + (1 - self.along_width) * pixels[1]
+
+    def across(self, pixels: tuple[Array, Array]) -> Array:
+        """The one of a pair for x and y that belongs to the pixel across the stripe."""
+        return self.along_width * pixels[1] + (1 - self.along_width) * pixels[0]
+
+    def lens(self) -> Lens:
+        """The camera's lens."""
+        focal = self.focal_mm / self.pixel_mm
+        return Lens(focal, self.cx_px, self.cy_px, self.k1, self.k2, self.k3, self.p1, self.p2)
+
+    def window(self, xp: ModuleType) -> FlatWindow:
+        """The camera's window; unmounted one of no thickness in the pupil, with nothing but air behind it."""
+        normal = window_normal(xp, tilt_x_rad=self.window_tilt_x_rad, tilt_y_rad=self.window_tilt_y_rad)
+        return FlatWindow(
+            normal,
+            self.window_mounted * self.window_distance_mm * normal[2],
+            self.window_mounted * self.window_thickness_mm,
+            self.window_index,
+            self.medium_index,
+        )
+
+    def outer_mm(self, xp: ModuleType) -> Array:
+        """Depth on the camera's axis from which the volume counts: of the window's outer face, mounted or not."""
+        normal = window_normal(xp, tilt_x_rad=self.window_tilt_x_rad, tilt_y_rad=self.window_tilt_y_rad)
+        return self.window_distance_mm + self.window_thickness_mm / normal[2]
+
+    def laser_window(self, axis: Vector) -> FlatWindow:
+        """The laser's window, taken as square to its axis."""
+        distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
+        return FlatWindow(axis, distance, thickness, self.laser_window_index, self.medium_index)
+
+    def pixel_contrast(self, xp: ModuleType) -> Array:
+        """Speckle contrast of a pixel, averaged over its area and two polarisations that do not interfere."""
+        return self._averaged(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
+
+    def centre_contrast(self, xp: ModuleType, sigma_px: Array) -> Array:
+        """What that contrast would be if neighbours across a stripe erred independently, to the same effect.
+
+        Speckle is alike in neighbours where grains are as large as pixels. A stripe of standard deviation s is shifted
+        by what changes across it at the frequency f = 1 / (2 pi s). Of the squared contrast, summed over all
+        neighbours, the lens's and the pixel's transfer functions OTF(f g) and sinc^2(f) leave that part.
+        """
+        frequency = 1 / (2 * math.pi * sigma_px)
+        v = xp.minimum(frequency * self.grain_px(), 0.999)
+        lens = 2 / math.pi * (xp.acos(v) - v * xp.sqrt(1 - v * v))
+        pixel = xp.sin(math.pi * frequency) / (math.pi * frequency)
+        whole = self._averaged(xp, _line_series()) * self.speckle_coherence / math.sqrt(2)
+        return whole * xp.sqrt(lens) * pixel
+
+    def grain_px(self) -> Array:
+        """Size of speckle grains, lambda N (1 + m), in px."""
+        return self.wavelength_mm * self.working_f_number() / self.pixel_mm
+
+    def _averaged(self, xp: ModuleType, series: Chebyshev) -> Array:
+        """The exponential of a series in the logarithm of the grain."""
+        grain = xp.log(self.grain_px())
+        shift, scale = map(float, series.mapparms())
+        t = shift + scale * xp.minimum(xp.maximum(grain, math.log(_GRAINS_PX[0])), math.log(_GRAINS_PX[1]))
+        # Clenshaw's recurrence.
+        ahead, beyond = 0.0 * t, 0.0 * t
+        for coefficient in series.coef[:0:-1]:
+            ahead, beyond = 2 * t * ahead + (float(coefficient) - beyond), ahead
+        return xp.exp(t * ahead + (float(series.coef[0]) - beyond))
+
+    def working_f_number(self) -> Array:
+        """N (1 + m) with the magnification m at the focus distance."""
+        return self.f_number * (1 + self.focal_mm / (self.focus_mm - self.focal_mm))
+
+
+def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> Parameters:
+    """Parameters of N sensors, each in its medium, as float64 arrays (N, 1, 1); errors as `numbers_of`."""
+    return stacked([numbers_of(sensor, medium) for sensor, medium in zip(sensors, media, strict=True)])
+
+
+def stacked(rows: Sequence[Parameters]) -> Parameters:
+    """Parameters of N sensors, each of plain numbers, as arrays (N, 1, 1)."""
+    names = [field.name for field in fields(Parameters) if field.name not in ("placed", "fan_nodes_rad", "fan_powers")]
+    columns = {name: _column([getattr(row, name) for row in rows]) for name in names}
+    placed = np.array([row.placed for row in rows])
+    origin, axis, fan, normal = (_vector([_column(placed[:, i, k]) for k in range(3)]) for i in range(4))
+    nodes = max(len(row.fan_nodes_rad) for row in rows)
+
+    def filled(table: Sequence[float]) -> list[float]:
+        # Short tables are filled up with their last node, which adds nothing.
+        return [*table, *[table[-1]] * (nodes - len(table))]
+
+    angles = np.array([filled(row.fan_nodes_rad) for row in rows])
+    powers = np.array([filled(row.fan_powers) for row in rows])
+    return Parameters(
+        **columns,
+        placed=(origin, axis, fan, normal),
+        fan_nodes_rad=tuple(map(_column, angles.T)),
+        fan_powers=tuple(map(_column, powers.T)),
+    )
+
+
+def _vector(parts: Sequence[Array]) -> Vector:
+    x, y, z = parts
+    return x, y, z
+
+
+def _column(values: ArrayLike) -> np.ndarray:
+    return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
+
+
+def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
+    """Parameters of one sensor in a medium, as plain numbers.
+
+    Raises
+    ------
+    DescriptionError
+        A window is left out although the medium is not air.
+    RangeError
+        A wavelength lies outside the tables of a medium or glass.
+    DesignError
+        A laser placed by its axis has no sheet.
+    """
+    camera, laser, detector, exposure = sensor.camera, sensor.laser, sensor.detector, sensor.exposure
+    window, wavelength = camera.window, laser.wavelength_nm
+    index = medium.refractive_index(wavelength)
+    if not (window.mounted and laser.window.mounted) and index != 1:
+        raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
+    glass, laser_glass = (w.index(wavelength) if w.mounted else 1.0 for w in (window, laser.window))
+    by_axis = laser.origin_mm is not None
+    placed = [np.full(3, math.nan)] * 4
+    if by_axis:
+        pose = laser_pose(sensor)
+        placed = [pose.origin_mm, pose.axis, pose.fan, pose.normal]
+    origin, axis, fan, normal = (_vector(vector.tolist()) for vector in placed)
+    table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
+    half = math.radians(laser.fan_angle_deg / 2)
+    lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
+    cx, cy = camera.principal_point()
+    d, angle = camera.distortion, laser.triangulation_angle_deg
+    numbers = {
+        "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
+        "angle_rad": math.nan if by_axis or angle is None else math.radians(angle),
+        "roll_rad": math.radians(laser.roll_deg),
+        "along_width": float(camera.stripe_along == "width"),
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "pixel_mm": 1e-3 * camera.pixel_size_um,
+        "focal_mm": camera.focal_length_mm,
+        "cx_px": cx,
+        "cy_px": cy,
+        "k1": d.k1,
+        "k2": d.k2,
+        "k3": d.k3,
+        "p1": d.p1,
+        "p2": d.p2,
+        "f_number": camera.f_number,
+        "focus_mm": camera.focus_distance_mm,
+        "window_mounted": float(window.mounted),
+        "window_distance_mm": window.distance_mm,
+        "window_thickness_mm": window.thickness_mm,
+        "window_tilt_x_rad": math.radians(window.tilt_x_deg),
+        "window_tilt_y_rad": math.radians(window.tilt_y_deg),
+        "window_index": glass,
+        "window_passes": _passes(glass, index, window.absorption_per_mm() * window.thickness_mm * window.mounted),
+        "window_aperture_mm": window.aperture_diameter_mm if window.mounted else math.inf,
+        "wavelength_mm": 1e-6 * wavelength,
+        "power_w": 1e-3 * laser.power_mw,
+        "fan_half_rad": half,
+        "lit_from_rad": lit[0],
+        "lit_to_rad": lit[1],
+        "gaussian_fan": float(laser.fan_profile == "gaussian"),
+        "tabulated_fan": float(bool(table)),
+        "waist_mm": laser.waist_radius_mm,
+        "waist_distance_mm": laser.waist_distance_mm,
+        "beam_quality": laser.beam_quality_m2,
+        "laser_window_distance_mm": laser.window.distance_mm * laser.window.mounted,
+        "laser_window_thickness_mm": laser.window.thickness_mm * laser.window.mounted,
+        "laser_window_index": laser_glass,
+        "laser_window_passes": _passes(
+            laser_glass, index, laser.window.absorption_per_mm() * laser.window.thickness_mm * laser.window.mounted
+        ),
+        "laser_window_aperture_mm": laser.window.aperture_diameter_mm if laser.window.mounted else math.inf,
+        "medium_index": index,
+        "extinction_per_mm": medium.extinction_per_mm(wavelength),
+        "quantum_efficiency": detector.quantum_efficiency,
+        "full_well_e": detector.full_well_e,
+        "read_noise_e": detector.read_noise_e,
+        "dark_e_per_ms": 1e-3 * detector.dark_current_e_per_s * detector.dark_current_growth(),
+        "offset_e": math.hypot(detector.dsnu_e, detector.dsnu_row_e, detector.dsnu_column_e),
+        "prnu": detector.prnu,
+        "step_e": 1 / detector.gain_dn_per_e(),
+        "bits": detector.bits,
+        "exposure_ms": math.nan if isinstance(exposure.laser_ms, str) else exposure.laser_ms,
+        "exposure_level": exposure.auto_level,
+        "longest_ms": exposure.longest_ms,
+        "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
+        "speckle_coherence": float(
+            coherence(_DIFFUSE_ROUGHNESS_UM, linewidth_nm=laser.linewidth_nm, wavelength_nm=wavelength, index=index)
+        )
+        if laser.linewidth_nm > 0
+        else 1.0,
+        "stage_resolution_mm": sensor.stage.resolution_mm,
+        "near_mm": sensor.volume.near_mm,
+        "far_mm": sensor.volume.far_mm,
+    }
+    nodes = _normalised(table) if table else ((0.0, 0.0),)
+    return Parameters(
+        **{name: float(value) for name, value in numbers.items()},
+        placed=(origin, axis, fan, normal),
+        fan_nodes_rad=tuple(float(angle) for angle, _ in nodes),
+        fan_powers=tuple(float(power) for _, power in nodes),
+    )
+
+
+def _passes(glass_index: float, medium_index: float, depth: float) -> float:
+    """Share of light that passes both faces and the glass, square to them (Fresnel; Beer and Lambert)."""
+    lost = (
+        ((glass_index - 1) / (glass_index + 1)) ** 2,
+        ((glass_index - medium_index) / (glass_index + medium_index)) ** 2,
+    )
+    return (1 - lost[0]) * (1 - lost[1]) * math.exp(-depth)
+
+
+def _normalised(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """Angles in rad and powers per rad that integrate to 1."""
+    angles, powers = np.radians([a for a, _ in table]), np.array([p for _, p in table])
+    return tuple(zip(angles, powers / np.trapezoid(powers, angles), strict=True))
+
+
+@cache
+def _pixel_series() -> Chebyshev:
+    """Logarithm of the contrast that averaging over a pixel leaves, by that of the grain in px; good to 0.5 %."""
+    grains = np.geomspace(*_GRAINS_PX, 60)
+    return Chebyshev.fit(np.log(grains), np.log([pixel_contrast(float(grain)) for grain in grains]), 12)
+
+
+@cache
+def _line_series() -> Chebyshev:
+    """Half the logarithm of the squared contrast summed over the neighbours across the stripe, by that of the grain.
+
+    The sum over the lags of the correlation of pixels' averages is the correlation's integral over all lags across, and
+    its mean over pairs of points of a pixel along: (4 / pi) g^2 int OTF(f g) sinc^2(f) df, since the correlation
+    |2 J1(z) / z|^2 has the spectrum (4 / pi) g^2 OTF, with OTF(v) = 2 / pi (acos v - v sqrt(1 - v^2)) up to v = 1
+    (Goodman, Speckle Phenomena in Optics, Ch. 4).
+    """
+    grains = np.geomspace(*_GRAINS_PX, 60)
+    # Gauss-Legendre over 0 to 1 in v, in pieces, for sinc^2 swings 1 / g times.
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    pieces = 200
+    v = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1)) / pieces).ravel()
+    w = np.tile(weights / (2 * pieces), pieces)
+    transfer = 2 / math.pi * (np.arccos(v) - v * np.sqrt(1 - v * v))
+    sums = np.array([4 / math.pi * g * 2 * (w * transfer * np.sinc(v / g) ** 2).sum() for g in grains])
+    return Chebyshev.fit(np.log(grains), 0.5 * np.log(sums), 12)
+
+
+def followed(xp: ModuleType, parameters: Parameters, follow: Sequence[Follow]) -> Parameters:
+    """Parameters with what is adjusted on the bench set to the stand-off.
+
+    "focus" focuses the lens where the stand-off appears to be through window and medium; "waist" focuses the laser on
+    it; "volume" moves the measuring volume, in its own depth, so that it lies about the stand-off as it did.
+    """
+    pose, window = parameters.pose(xp), parameters.window(xp)
+    depth = standoff_mm(pose)
+    point = (0.0 * depth, 0.0 * depth, depth)
+    changes: dict[str, Array] = {}
+    if "focus" in follow:
+        changes["focus_mm"] = path_to(xp, window, point).apparent_mm
+    if "waist" in follow:
+        away = tuple(p - o for p, o in zip(point, pose.origin, strict=True))
+        changes["waist_distance_mm"] = xp.sqrt(dot(away, away))
+    if "volume" in follow:
+        middle = 0.5 * (parameters.near_mm + parameters.far_mm)
+        moved = depth - parameters.outer_mm(xp) - middle
+        changes |= {"near_mm": parameters.near_mm + moved, "far_mm": parameters.far_mm + moved}
+    return replace(parameters, **changes)

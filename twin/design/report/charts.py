@@ -1,0 +1,727 @@
+"""Charts of a study: figures over what is free, the Pareto front, all designs at once, rendering against formulas."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+import plotly.graph_objects as go
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import Delaunay, KDTree, QhullError
+
+from twin.design.choice import pareto
+from twin.design.description import Value, Variable
+from twin.design.figures import CLASS_NAMES
+from twin.design.report.tables import (
+    Judged,
+    bound_text,
+    bounds_of,
+    label_of,
+    listed,
+    misses,
+    number_text,
+    rounded,
+    value_text,
+    words_of,
+)
+from twin.design.verification import Agreement
+from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
+
+RED, GREEN, PALE = "#c22f2f", "#2e8b57", "#c3cad2"
+_LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
+"""Colours of the lines on which constraints are just met."""
+_SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
+"""Symbols of marked designs, of plotly and of matplotlib."""
+_AWAY = (-26, 26, -54, 54, -82, 82)
+"""How far from a marked design its label stands, in px; the designs in turn."""
+_SHOWN = (
+    "sigma_z_rms_mm",
+    "sigma_z_mm",
+    "depth_per_px_mm",
+    "line_mm",
+    "standoff_mm",
+    "required_ms",
+    "occlusion_deg",
+    "coverage",
+    "section_cm2",
+    "sigma_y_mm",
+    "speckle_limit_mm",
+)
+"""Figures shown besides objectives and constraints, the most informative first."""
+_MOST_PANELS, _PANEL_COLUMNS, _PANEL_INCHES, _BAR_INCHES = 9, 3, (4.0, 3.1), 0.17
+MOST_POINTS, MOST_LINES = 20_000, 5_000
+_MOST_DOTS, _MOST_OF_CURVE, _MOST_BARS, _MOST_DIMENSIONS = 2000, 500, 40, 12
+"""More designs, points of a curve, bars and axes would hide each other."""
+_FEW, _IN_SVG = 300, 2500
+"""More points are drawn smaller; more than the second number with WebGL, which does not slow the page down."""
+_SEED = 0
+_LOG_AXIS = {"type": "log", "dtick": "D2"}
+_WIDE_RANGE = 30.0
+"""A figure whose largest value is so many times the least gets a logarithmic axis."""
+_INTERVALS = 100
+_MOST_STEPS, _NODES = 100, 60
+_PER_CELL, _CELLS = 8, (4, 40)
+_LEVELS, _WIDE, _MARGIN = 12, 15.0, 0.02
+_BESIDE = 1e-4
+"""Part of a bound by which its line is drawn on the side that misses it: a figure in steps may equal the bound."""
+
+_plain_text = matplotlib.rc_context({"text.parse_math": False})
+"""Names given by users hold no formulas, whatever dollar signs they have."""
+
+
+@dataclass(frozen=True, eq=False)
+class Interactive:
+    """A plotly figure for a page, and what it shows, in a sentence."""
+
+    figure: go.Figure
+    caption: str
+
+
+@dataclass(frozen=True, eq=False)
+class Static:
+    """A matplotlib figure for a page, and what it shows, in a sentence."""
+
+    figure: Figure
+    caption: str
+
+
+@dataclass(frozen=True)
+class Point:
+    """A marked design: its label, its values by name, its number among the marked ones, and whether it is chosen."""
+
+    label: str
+    values: Mapping[str, Value]
+    number: int
+    chosen: bool
+
+    def value(self, name: str) -> float:
+        """A number of the design, NaN where there is none."""
+        value = self.values.get(name)
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+    @property
+    def colour(self) -> str:
+        """Colour of its symbol and label."""
+        return RED if self.chosen else INK
+
+
+def shown_figures(judged: Judged) -> list[str]:
+    """Figures to show: objectives, constraints, then the most informative others; those that are known."""
+    names = [o.figure for o in judged.study.objectives] + list(judged.study.constraints) + list(_SHOWN)
+    return [name for name in dict.fromkeys(names) if np.isfinite(judged.figure(name)[judged.works]).any()]
+
+
+# --- panels of static figures -----------------------------------------------------------------------------------------
+
+
+def _panels(figures: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[Figure, list[Axes], list[str]]:
+    """A figure with axes for each of the first figures of merit, and their names."""
+    names = list(figures[:_MOST_PANELS])
+    columns = min(_PANEL_COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    figure, axes = new_figure(_PANEL_INCHES[0] * columns, height * rows, rows=rows, columns=columns)
+    for unused in axes[len(names) :]:
+        unused.remove()
+    return figure, list(axes[: len(names)]), names
+
+
+def _mark(axes: Axes, points: Sequence[Point], x: str, y: str) -> None:
+    """Draw marked designs as symbols, the chosen one in red."""
+    for point in points:
+        at = point.value(x), point.value(y)
+        if all(map(math.isfinite, at)):
+            marker = _SYMBOLS[point.number % len(_SYMBOLS)][1]
+            axes.plot(
+                *at,
+                marker,
+                color=point.colour,
+                markeredgecolor="white",
+                markersize=10 if point.chosen else 8,
+                label=point.label,
+                zorder=6,
+            )
+
+
+def _bound_lines(axes: Axes, judged: Judged, name: str) -> None:
+    for bounded, _, bound in bounds_of(judged.study):
+        if bounded == name:
+            axes.axhline(bound, color=RED, linewidth=1.2, linestyle="--")
+
+
+def _dashed(judged: Judged) -> str:
+    return "Dashed: bounds." if bounds_of(judged.study) else ""
+
+
+# --- curves and bars --------------------------------------------------------------------------------------------------
+
+
+@_plain_text
+def curves(judged: Judged, marked: Sequence[Point], x: str) -> Static:
+    """Figures over one variable: a curve for every combination of what else is free, or the best of all."""
+    others = [name for name in judged.study.free() if name != x]
+    groups: dict[str, list[int]] = {}
+    for place in np.flatnonzero(judged.works):
+        groups.setdefault(_combination(judged, others, int(place)), []).append(int(place))
+    caption = ""
+    if len(groups) > len(COLOURS):
+        groups = {"best": judged.best_first.tolist()}
+        caption = f"{listed([words_of(o) for o in others]).capitalize()} also vary: the best design of every place. "
+    found = {name: _first_at(judged, x, np.array(places), best=bool(caption)) for name, places in groups.items()}
+    figure, panels, names = _panels(shown_figures(judged))
+    for axes, name in zip(panels, names, strict=True):
+        for colour, (group, places) in zip(COLOURS, found.items(), strict=False):
+            values, meets = (judged.columns[x][places], judged.figure(name)[places]), judged.feasible[places]
+            axes.plot(*values, color=colour, linewidth=1.3, label=group or "designs")
+            axes.scatter(*values, s=16, color=np.where(meets, colour, "white"), edgecolors=colour, zorder=3)
+        _bound_lines(axes, judged, name)
+        _mark(axes, marked, x, name)
+        axes.set(xlabel=label_of(x), title=label_of(name), xscale=judged.study.variables[x].scale)
+    legend_below(figure)
+    missed = "Hollow: misses a constraint. " if (judged.works & ~judged.feasible).any() else ""
+    return Static(figure, f"{caption}{missed}{_dashed(judged)}".strip())
+
+
+def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
+    return ", ".join(judged.text(name, place) for name in names)
+
+
+def _first_at(judged: Judged, x: str, places: np.ndarray, *, best: bool) -> np.ndarray:
+    """Places by ascending x, thinned out where there are many; of the best, which come first, one per interval."""
+    values = np.asarray(judged.columns[x], dtype=float)[places]
+    if best:
+        share = share_of(judged.study.variables[x], values)
+        places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
+        values = np.asarray(judged.columns[x], dtype=float)[places]
+    places = places[np.argsort(values, kind="stable")]
+    return places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_OF_CURVE)).round().astype(int))]
+
+
+@_plain_text
+def bars(judged: Judged) -> Static:
+    """Figures of every combination of choices, the best first."""
+    places = judged.best_first[:_MOST_BARS]
+    labels = [_combination(judged, list(judged.study.free()), place) for place in places]
+    height = max(_PANEL_INCHES[1], _BAR_INCHES * len(places))
+    figure, panels, names = _panels(shown_figures(judged), height=height)
+    for number, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, PALE))
+        # Long names stand at the left only.
+        axes.set_yticks(range(len(places)), labels if number % _PANEL_COLUMNS == 0 else [""] * len(places))
+        axes.invert_yaxis()
+        axes.set_title(label_of(name))
+        for bounded, _, bound in bounds_of(judged.study):
+            if bounded == name:
+                axes.axvline(bound, color=RED, linewidth=1.2, linestyle="--")
+    count = f"The best {len(places)} of {int(judged.works.sum()):,} designs." if len(places) == _MOST_BARS else ""
+    grey = " Grey: misses a constraint." if not judged.feasible[places].all() else ""
+    return Static(figure, f"{count}{grey} {_dashed(judged)}".strip())
+
+
+def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
+    """Shares from 0 to 1 of a variable's range."""
+    values, (least, most) = np.asarray(values, dtype=float), variable.ends()
+    if variable.scale == "log":
+        return np.log(values / least) / math.log(most / least)
+    return (values - least) / (most - least)
+
+
+# --- maps over two variables ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """Figures over two variables: values (ny, nx) by name at x (nx,) and y (ny,), NaN where no design works.
+
+    ``reasons`` (ny, nx) says where and why designs there do not do, "" where they do or nothing is known. ``smooth``
+    says whether neighbours are of one kind, so that contours make sense, ``dots`` whether designs are shown as well.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    values: dict[str, np.ndarray]
+    reasons: np.ndarray
+    smooth: bool
+    dots: bool
+    caption: str
+
+
+def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None:
+    """The map of figures over two variables; None where the designs span no area.
+
+    A grid shows its designs, others are interpolated linearly. Where more is free, every cell shows its best design.
+    """
+    axes = [np.unique(np.asarray(judged.columns[name], dtype=float)) for name in (x, y)]
+    alone = len(judged.study.free()) == 2
+    scattered = len(axes[0]) * len(axes[1]) > 2 * len(judged)
+    if scattered and alone:
+        return _interpolated(judged, x, y, figures)
+    variables = [judged.study.variables[name] for name in (x, y)]
+    if scattered:
+        cells = int(np.clip(math.sqrt(len(judged) / _PER_CELL), *_CELLS))
+        axes = [_cell_middles(variable, cells) for variable in variables]
+    else:
+        axes = [
+            found if len(found) <= _MOST_STEPS else _cell_middles(variable, _MOST_STEPS)
+            for found, variable in zip(axes, variables, strict=True)
+        ]
+    return _best_of_cells(judged, (x, y), axes, figures, smooth=not scattered, alone=alone)
+
+
+def _cell_middles(variable: Variable, count: int) -> np.ndarray:
+    return np.array([variable.at((k + 0.5) / count) for k in range(count)])
+
+
+def _best_of_cells(
+    judged: Judged, names: tuple[str, str], axes: list[np.ndarray], figures: Sequence[str], *, smooth: bool, alone: bool
+) -> Map:
+    at = [_nearest(axis, judged.columns[name]) for axis, name in zip(axes, names, strict=True)]
+    cell = at[1] * len(axes[0]) + at[0]
+    best = np.full(len(axes[0]) * len(axes[1]), -1)
+    # Of several designs the last one written stays: failed ones first, then from the worst to the best.
+    order = np.concatenate([np.flatnonzero(~judged.works), judged.best_first[::-1]])
+    best[cell[order]] = order
+    shape = (len(axes[1]), len(axes[0]))
+    used = np.where(best >= 0, best, 0)
+    works = (best >= 0) & judged.works[used]
+    values = {name: np.where(works, judged.figure(name)[used], np.nan).reshape(shape) for name in figures}
+    texts = [judged.failures[k] if k >= 0 else "" for k in best]
+    reasons = _reasons(judged, values, np.array(texts, dtype=object).reshape(shape))
+    others = [words_of(name) for name in judged.study.free() if name not in names]
+    caption = (
+        ""
+        if alone
+        else (
+            f"{listed(others).capitalize()} also vary: each place shows the design there that misses the constraints "
+            f"least and then has the best {words_of(judged.study.objectives[0].figure)}."
+        )
+    )
+    return Map(axes[0], axes[1], values, reasons, smooth=smooth, dots=not smooth, caption=caption)
+
+
+def _nearest(axis: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Places of the axis's nearest values."""
+    between = (axis[1:] + axis[:-1]) / 2
+    return np.searchsorted(between, np.asarray(values, dtype=float))
+
+
+def _interpolated(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None:
+    variables = [judged.study.variables[name] for name in (x, y)]
+    places = np.column_stack(
+        [share_of(variable, judged.columns[name]) for variable, name in zip(variables, (x, y), strict=True)]
+    )
+    shares = np.linspace(0, 1, _NODES)
+    nodes = np.stack(np.meshgrid(shares, shares), axis=-1)
+    try:
+        mesh = Delaunay(places[judged.works])
+    except (QhullError, ValueError):
+        return None
+    known = np.column_stack([judged.figure(name)[judged.works] for name in figures])
+    found = LinearNDInterpolator(mesh, known)(nodes)
+    # A node belongs to its nearest design: near one that fails nothing is known.
+    nearest = KDTree(places).query(nodes)[1]
+    found[~judged.works[nearest]] = np.nan
+    if not np.isfinite(found[..., 0]).any():
+        return None
+    values = {name: found[..., k] for k, name in enumerate(figures)}
+    texts = np.array(judged.failures, dtype=object)[nearest]
+    axes = [np.array([variable.at(share) for share in shares]) for variable in variables]
+    caption = f"Interpolated linearly between {int(judged.works.sum()):,} designs (dots); white: too far from any."
+    return Map(axes[0], axes[1], values, _reasons(judged, values, texts), smooth=True, dots=True, caption=caption)
+
+
+def _reasons(judged: Judged, values: dict[str, np.ndarray], failures: np.ndarray) -> np.ndarray:
+    """What is said of places that do not do: why designs fail there, or which constraints they miss."""
+    reasons = np.where(failures.astype(bool), failures, "").astype(object)
+    bounded = [name for name in judged.study.constraints if name in values]
+    for place in np.ndindex(reasons.shape):
+        if not reasons[place] and bounded:
+            reasons[place] = "; ".join(misses(judged.study, {name: float(values[name][place]) for name in bounded}))
+    return reasons
+
+
+@_plain_text
+def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Static | None:
+    """The figures over two variables beside each other; None where the designs span no area."""
+    figures = shown_figures(judged)
+    found = map_of(judged, x, y, figures)
+    if found is None:
+        return None
+    figure, panels, names = _panels(figures)
+    variables = [judged.study.variables[name] for name in (x, y)]
+    dots = np.flatnonzero(sample(judged.works, np.zeros(len(judged), bool), _MOST_DOTS)) if found.dots else []
+    for number, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        _fill(axes, found, name)
+        _shade(axes, found)
+        if len(judged.study.free()) == 2:
+            _draw_limits(axes, found, judged)
+        if len(dots):
+            at = [judged.columns[free][dots] for free in (x, y)]
+            axes.plot(*at, ".", color=INK, markersize=1.0, alpha=0.5, rasterized=True)
+        _mark(axes, marked, x, y)
+        axes.grid(visible=False)
+        axes.set(xlabel=label_of(x), ylabel="" if number % _PANEL_COLUMNS else label_of(y), title=label_of(name))
+        axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
+        axes.set(xlim=_with_margin(variables[0]), ylim=_with_margin(variables[1]))
+    legend_below(figure)
+    outside = [
+        point.label
+        for point in marked
+        if not all(_inside(variable, point.value(name)) for name, variable in zip((x, y), variables, strict=True))
+    ]
+    beyond = f" Outside the ranges: {listed(outside)}." if outside else ""
+    missed = "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
+    parts = [found.caption, missed if (found.reasons != "").any() else "", beyond]
+    return Static(figure, " ".join(part.strip() for part in parts if part))
+
+
+def _with_margin(variable: Variable) -> tuple[float, float]:
+    """Ends of an axis, a little beyond the range so that designs on its border are seen wholly."""
+    low, high = variable.ends()
+    if variable.scale == "log":
+        factor = (high / low) ** _MARGIN
+        return low / factor, high * factor
+    return low - _MARGIN * (high - low), high + _MARGIN * (high - low)
+
+
+def _inside(variable: Variable, value: float) -> bool:
+    low, high = variable.ends()
+    return low <= value <= high
+
+
+def _fill(axes: Axes, found: Map, name: str) -> None:
+    """Draw a figure as filled contours, or as cells where neighbours differ in kind; wide ranges in their logarithm."""
+    values = found.values[name]
+    good = values[(found.reasons == "") & np.isfinite(values)]
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return
+    # Few extreme values must not take all the colours.
+    low, high = float(np.quantile(known, 0.02)), float(np.quantile(good if len(good) > 10 else known, 0.98))
+    high = max(high, low + 1e-12 + 1e-9 * abs(low))
+    log = low > 0 and high > _WIDE * low
+    norm = LogNorm(low, high) if log else Normalize(low, high)
+    if found.smooth and min(values.shape) > 1:
+        steps = np.geomspace(low, high, _LEVELS + 1) if log else MaxNLocator(_LEVELS).tick_values(low, high)
+        drawn = axes.contourf(found.x, found.y, np.ma.masked_invalid(values), levels=steps, norm=norm, extend="both")
+    else:
+        drawn = axes.pcolormesh(found.x, found.y, values, norm=norm, shading="nearest", rasterized=True)
+    ticks = np.geomspace(low, high, 5).tolist() if log else None
+    bar = axes.figure.colorbar(drawn, ax=axes, ticks=ticks)
+    if ticks is not None:
+        bar.set_ticks(ticks, labels=[number_text(tick, 2) for tick in ticks], minor=False)
+        bar.ax.minorticks_off()
+
+
+def _shade(axes: Axes, found: Map) -> None:
+    """Draw grey over places where constraints are missed, darker where nothing works."""
+    works = np.isfinite(np.stack(list(found.values.values()))).any(axis=0)
+    for where, colour, strength in ((works, "#e4e7eb", 0.72), (~works, "#969ea8", 1.0)):
+        shaded = np.where((found.reasons != "") & where, 1.0, np.nan)
+        if np.isfinite(shaded).any():
+            shades = ListedColormap([colour])
+            axes.pcolormesh(
+                found.x,
+                found.y,
+                shaded,
+                cmap=shades,
+                alpha=strength,
+                shading="nearest",
+                rasterized=True,
+                linewidth=0,
+                antialiased=False,
+            )
+
+
+def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
+    """Draw the lines on which constraints are just met."""
+    for (name, sign, bound), colour in zip(bounds_of(judged.study), _LIMITS * 10, strict=False):
+        values = found.values.get(name, np.empty(0))
+        level = bound + sign * _BESIDE * (abs(bound) or 1.0)
+        if min(values.shape) > 1 and (values < level).any() and (values > level).any():
+            axes.contour(found.x, found.y, np.ma.masked_invalid(values), levels=[level], colors=colour, linestyles="--")
+            axes.plot([], [], color=colour, linestyle="--", label=bound_text(name, sign, bound))
+
+
+# --- rendering --------------------------------------------------------------------------------------------------------
+
+
+@_plain_text
+def verification_chart(found: Agreement) -> Static | None:
+    """Scatter as predicted and as rendered, and the systematic error, over Z."""
+    if not found.z_mm:
+        return None
+    figure, (scatter, error) = new_figure(9.6, 3.2, columns=2)
+    z, predicted, rendered, off = (
+        np.array([math.nan if value is None else value for value in values])
+        for values in (found.z_mm, found.predicted_mm, found.rendered_mm, found.error_mm)
+    )
+    scatter.plot(z, 1e3 * predicted, "o--", markersize=4, label="predicted by formulas")
+    scatter.plot(z, 1e3 * rendered, "o-", color=RED, markersize=4, label="rendered and measured")
+    error.plot(z, 1e3 * off, "o-", color=INK, markersize=4)
+    error.axhline(0, color=INK, linewidth=0.8)
+    scatter.set(xlabel="Z from the stand-off (mm)", ylabel="scatter along Z, σ (µm)")
+    scatter.set_ylim(bottom=0)
+    error.set(xlabel="Z from the stand-off (mm)", ylabel="systematic error (µm)")
+    legend_below(figure)
+    caption = "Left: standard deviation of the points along Z. Right: their mean distance from the true plane."
+    return Static(figure, caption)
+
+
+# --- the Pareto front -------------------------------------------------------------------------------------------------
+
+
+def trade_off(judged: Judged) -> tuple[tuple[str, int], tuple[str, int]]:
+    """The two figures to weigh against each other, each with 1 to minimise or -1 to maximise.
+
+    The study's first two objectives; of a study with one, also the first other figure with a constraint or, without
+    any, the length of the line.
+    """
+    wanted = [(o.figure, 1 if o.goal == "minimise" else -1) for o in judged.study.objectives]
+    wanted += [(name, 1 if c.least is None else -1) for name, c in judged.study.constraints.items()]
+    wanted += [("line_mm", -1), ("depth_mm", -1)]
+    second = next((one for one in wanted[1:] if one[0] != wanted[0][0] and _varies(judged, one[0])), wanted[-1])
+    return wanted[0], second
+
+
+def _varies(judged: Judged, name: str) -> bool:
+    values = judged.figure(name)[judged.works]
+    values = values[np.isfinite(values)]
+    return len(values) > 1 and float(np.ptp(values)) > 1e-9 * float(np.abs(values).max())
+
+
+def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Interactive | None:
+    """All designs that work over two figures, and the front of those that meet the constraints."""
+    (x, x_sign), (y, y_sign) = trade_off(judged)
+    values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
+    known = judged.works & np.isfinite(values).all(axis=1)
+    if not known.any():
+        return None
+    front = pareto(np.where((judged.of_interest & known)[:, None], values, np.nan))
+    shown = sample(known, front, MOST_POINTS)
+    figure = go.Figure()
+    layers = (
+        ("misses a constraint", shown & ~judged.feasible, "#b3bcc6"),
+        ("meets all constraints", shown & judged.feasible & ~front, BLUE),
+    )
+    size = 4 if shown.sum() > _FEW else 7
+    for name, chosen, colour in layers:
+        if chosen.any():
+            marker = {"color": colour, "size": size, "opacity": 0.55}
+            _add_designs(figure, judged, np.flatnonzero(chosen), x, y, name=name, marker=marker)
+    order = np.flatnonzero(front)[np.argsort(values[front, 0])]
+    figure.add_scatter(
+        x=rounded(judged.figure(x)[order]),
+        y=rounded(judged.figure(y)[order]),
+        mode="lines+markers",
+        name=f"Pareto front ({len(order):,} of the designs)",
+        line={"color": GREEN, "width": 2},
+        marker={"size": 6, "color": GREEN},
+        text=hover_texts(judged, order, x, y),
+        hovertemplate="%{text}<extra></extra>",
+    )
+    axis = {"gridcolor": FAINT, "linecolor": INK, "ticks": "outside", "zeroline": False, "automargin": True}
+    figure.update_layout(
+        template="none",
+        height=520,
+        margin={"l": 70, "r": 20, "t": 30, "b": 56},
+        font={"size": 13, "color": INK},
+        xaxis=axis | {"title": {"text": escaped(label_of(x)), "standoff": 10}},
+        yaxis=axis | {"title": {"text": escaped(label_of(y)), "standoff": 12}},
+        legend={"orientation": "h", "y": -0.16, "yanchor": "top", "x": 0, "itemsizing": "constant"},
+        hovermode="closest",
+        hoverlabel={"namelength": -1, "bgcolor": "white", "font": {"color": INK}},
+        separators=". ",
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+    )
+    ends = []
+    for axis, name in (("xaxis", x), ("yaxis", y)):
+        numbers = np.append(judged.figure(name)[known], [point.value(name) for point in marked])
+        ends.append((float(np.nanmin(numbers)), float(np.nanmax(numbers))))
+        if ends[-1][0] > 0 and ends[-1][1] > _WIDE_RANGE * ends[-1][0]:
+            figure.update_layout({axis: _LOG_AXIS})
+    _add_marked(figure, marked, x, y, ends=ends)
+    better = " and ".join(
+        f"{'less' if sign > 0 else 'more'} {words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
+    )
+    thin = f" {int(shown.sum()):,} of {int(known.sum()):,} designs are drawn." if shown.sum() < known.sum() else ""
+    none = "" if judged.feasible.any() else " None meets all constraints: the front is that of all that work."
+    more = " Further objectives are left out here." if len(judged.study.objectives) > 2 else ""
+    return Interactive(
+        figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}"
+    )
+
+
+def _add_marked(
+    figure: go.Figure, points: Sequence[Point], x: str, y: str, *, ends: Sequence[tuple[float, float]]
+) -> None:
+    """Add marked designs with their labels, which stand towards the middle between the ``ends`` of the x axis."""
+    layout: Any = figure.layout
+    logs = [layout[axis].type == "log" for axis in ("xaxis", "yaxis")]
+    low, high = (math.log10(end) if logs[0] else end for end in ends[0])
+    for point in points:
+        at, label = [point.value(x), point.value(y)], escaped(point.label)
+        if not all(map(math.isfinite, at)):
+            continue
+        places = [math.log10(value) if log else value for value, log in zip(at, logs, strict=True)]
+        left = places[0] > (low + high) / 2
+        figure.add_scatter(
+            x=rounded(at[:1]),
+            y=rounded(at[1:]),
+            mode="markers",
+            showlegend=False,
+            name=label,
+            marker={
+                "symbol": _SYMBOLS[point.number % len(_SYMBOLS)][0],
+                "size": 15 if point.chosen else 11,
+                "color": point.colour,
+                "line": {"color": "white", "width": 1.5},
+            },
+            hovertemplate=f"<b>{label}</b><br>{escaped(label_of(x))}: %{{x}}<br>%{{y}}<extra></extra>",
+        )
+        figure.add_annotation(
+            x=places[0],
+            y=places[1],
+            text=f"<b>{label}</b>",
+            ax=-30 if left else 30,
+            ay=_AWAY[point.number % len(_AWAY)],
+            xanchor="right" if left else "left",
+            arrowcolor=point.colour,
+            arrowwidth=1.2,
+            arrowhead=0,
+            standoff=7,
+            bgcolor="rgba(255,255,255,0.88)",
+            borderpad=2,
+            font={"color": point.colour, "size": 12.5},
+        )
+
+
+def escaped(text: str) -> str:
+    """Text in which plotly finds no tags."""
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _add_designs(
+    figure: go.Figure, judged: Judged, places: np.ndarray, x: str, y: str, *, name: str, marker: dict[str, Any]
+) -> None:
+    kind = go.Scattergl if len(places) > _IN_SVG else go.Scatter
+    figure.add_trace(
+        kind(
+            x=rounded(judged.figure(x)[places]),
+            y=rounded(judged.figure(y)[places]),
+            mode="markers",
+            name=name,
+            marker=marker,
+            customdata=judged.columns["design"][places].tolist(),
+            hovertemplate=f"design %{{customdata}}<br>{escaped(label_of(x))}: %{{x}}<br>{escaped(label_of(y))}: %{{y}}"
+            f"<extra>{name}</extra>",
+        )
+    )
+
+
+def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the candidates (N,), drawn at random, all kept ones among them."""
+    others = np.flatnonzero(candidates & ~kept)
+    room = max(0, most - int(kept.sum()))
+    if len(others) > room:
+        others = np.random.default_rng(_SEED).choice(others, room, replace=False)
+    chosen = kept.copy()
+    chosen[others] = True
+    return chosen
+
+
+def hover_texts(judged: Judged, places: np.ndarray, *figures: str) -> list[str]:
+    """What is said of designs on hover: number, values of what is free, and figures."""
+    names = list(dict.fromkeys([*judged.study.free(), *figures]))
+    return [
+        "<br>".join(
+            [f"design {judged.columns['design'][place]}"]
+            + [escaped(f"{words_of(name)}: {judged.text(name, place)}") for name in names]
+        )
+        for place in places
+    ]
+
+
+# --- all at once ------------------------------------------------------------------------------------------------------
+
+
+def parallel_chart(judged: Judged) -> Interactive | None:
+    """Every design that meets the constraints as a line over all that is free, wanted and bounded."""
+    if not judged.feasible.any():
+        return None
+    chosen = sample(judged.feasible, judged.front, MOST_LINES)
+    places = np.flatnonzero(chosen)
+    figures = [o.figure for o in judged.study.objectives] + list(judged.study.constraints)
+    names = list(dict.fromkeys([*judged.study.free(), *figures]))[:_MOST_DIMENSIONS]
+    dimensions = [_dimension(judged, name, places) for name in names]
+    objective = judged.study.objectives[0]
+    colours = judged.figure(objective.figure)[places]
+    low, high = float(colours.min()), float(np.quantile(colours, 0.95))
+    figure = go.Figure(
+        go.Parcoords(
+            dimensions=dimensions,
+            labelangle=-12,
+            labelside="top",
+            labelfont={"size": 12},
+            tickfont={"size": 11},
+            rangefont={"size": 1, "color": "rgba(0,0,0,0)"},
+            line={
+                "color": rounded(colours),
+                "colorscale": "Viridis",
+                "showscale": True,
+                "cmin": low,
+                "cmax": high if high > low else low + max(abs(low), 1e-9),
+                "reversescale": objective.goal == "maximise",
+                "colorbar": {"title": {"text": escaped(label_of(objective.figure)), "side": "right"}, "thickness": 14},
+            },
+        )
+    )
+    figure.update_layout(
+        template="none",
+        height=470,
+        margin={"l": 80, "r": 40, "t": 110, "b": 30},
+        font={"size": 12, "color": INK},
+        paper_bgcolor="white",
+    )
+    total = int(judged.feasible.sum())
+    count = f"{len(places):,} of {total:,} designs" if len(places) < total else f"All {total:,} designs"
+    return Interactive(figure, f"{count} that meet all constraints. Drag along an axis to keep only what passes there.")
+
+
+def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, Any]:
+    values = judged.columns[name][places]
+    label = escaped(label_of(name))
+    variable = judged.study.free().get(name)
+    if variable is not None and variable.values is not None:
+        options = list(variable.values)
+        codes = [options.index(value) for value in values.tolist()]
+        # Ticks hold plain text, in which nothing is a tag.
+        texts = [textwrap.shorten(value_text(name, option, unit=False), 24, placeholder="…") for option in options]
+        return {
+            "label": label,
+            "values": codes,
+            "tickvals": list(range(len(options))),
+            "ticktext": texts,
+            "range": [-0.3, len(options) - 0.7],
+        }
+    if name == "laser_class":
+        classes = sorted(CLASS_NAMES)
+        return {
+            "label": label,
+            "values": rounded(values),
+            "tickvals": classes,
+            "ticktext": [CLASS_NAMES[one] for one in classes],
+            "range": [classes[0] - 0.3, classes[-1] + 0.3],
+        }
+    low, high = float(values.min()), float(values.max())
+    margin = 0.0 if high > low else max(abs(low) * 0.05, 1e-6)
+    return {"label": label, "values": rounded(values), "range": [low - margin, high + margin]}

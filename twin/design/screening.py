@@ -1,0 +1,308 @@
+"""Judging of all designs of a study by formulas, a batch at a time, into parts from which a stopped sweep continues.
+
+Results are Parquet parts in a folder, each with the rows of a batch of designs, read together as a table. A part is
+named after its first design. It appears whole, and a part that two machines have written is the same part: nothing is
+lost when one of them is stopped, and nothing counts twice. An optimised study gets its designs from NSGA-II (Deb et
+al. 2002).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import random
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pyarrow as pa
+import pyarrow.parquet as pq
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import Trial, TrialState
+
+from twin.design.description import Study, Variable
+from twin.design.designs import Columns, Design, designs_of, judged, number_of_designs
+from uwlts.model.errors import CaptureError, DescriptionError, OutputError
+from uwlts.runtime.workers import Lost, Workers
+from uwlts.storage.files import written_aside
+
+
+def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
+    """The part that begins with a design, or what stands for it while it is lost with the process that made it."""
+    return folder / f"{'lost' if lost else 'part'}-{first:09d}.parquet"
+
+
+def as_part(columns: Columns) -> bytes:
+    """A batch's columns as the content of a part."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.table(columns), sink)
+    return sink.getvalue().to_pybytes()
+
+
+def write_part(folder: Path, first: int, content: bytes, *, lost: bool = False) -> None:
+    """Write a part, replacing what another run has written of the same batch."""
+    with written_aside(part_path(folder, first, lost=lost), overwrite=True) as aside:
+        aside.write_bytes(content)
+    if not lost:
+        part_path(folder, first, lost=True).unlink(missing_ok=True)
+
+
+def parts(folder: Path) -> list[Path]:
+    """All parts in a folder, by their first designs, and lost ones that have not been made since."""
+    lost = [path for path in folder.glob("lost-*.parquet") if not path.with_name(f"part{path.name[4:]}").exists()]
+    return sorted([*folder.glob("part-*.parquet"), *lost], key=lambda path: path.name[5:])
+
+
+def rows_in(path: Path) -> int:
+    """How many designs a part holds, 0 if there is none or it is damaged."""
+    try:
+        return pq.read_metadata(path).num_rows if path.is_file() else 0
+    except (pa.ArrowInvalid, OSError):
+        return 0
+
+
+def read_parts(folder: Path) -> Columns:
+    """Columns of all designs of a folder, in the order of their numbers; empty where there are none.
+
+    Raises
+    ------
+    CaptureError
+        A part is damaged or foreign.
+    """
+    columns: Columns = {}
+    tables = []
+    for path in parts(folder):
+        try:
+            tables.append(pq.read_table(path))
+        except (pa.ArrowException, OSError) as error:
+            raise CaptureError(
+                f"{path} is damaged: {error}; remove it, and the sweep judges its designs anew"
+            ) from error
+    if not tables:
+        return columns
+    try:
+        table = pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException as error:
+        raise CaptureError(f"the parts in {folder} are not of one study: {error}") from error
+    numbers = table.column("design").to_numpy()
+    _, first = np.unique(numbers, return_index=True)
+    for name in table.column_names:
+        columns[name] = table.column(name).to_numpy(zero_copy_only=False)[first]
+    return columns
+
+
+def write_csv(path: Path, columns: Columns, *, names: Iterable[str] | None = None) -> None:
+    """Write columns as CSV, replacing an older file."""
+    chosen = list(columns if names is None else names)
+    with written_aside(path, overwrite=True) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(chosen)
+        writer.writerows(zip(*(columns[name].tolist() for name in chosen), strict=True))
+
+
+def made_folder(folder: Path) -> Path:
+    """The folder, made if there is none."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
+    return folder
+
+
+JOURNAL = "optimiser.log"
+_NAME = "sweep"
+_POPULATION = 64
+
+
+class Search:
+    """The optimiser's memory lies in a journal in the study's folder, which several machines may share."""
+
+    def __init__(self, study: Study, folder: Path):
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        self._study = study
+        self._space = {name: _distribution(variable) for name, variable in study.free().items()}
+        journal = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+        # Several machines must not propose the same designs: the seed is for the first of them only.
+        known = _NAME in optuna.get_all_study_names(journal)
+        sampler = optuna.samplers.NSGAIISampler(
+            population_size=_POPULATION, seed=None if known else study.sampling.seed
+        )
+        self._optuna = optuna.create_study(
+            storage=journal,
+            sampler=sampler,
+            study_name=_NAME,
+            load_if_exists=True,
+            directions=["minimize" if objective.goal == "minimise" else "maximize" for objective in study.objectives],
+        )
+
+    def ask(self, count: int) -> list[Design]:
+        """New designs."""
+        trials = [self._optuna.ask(self._space) for _ in range(count)]
+        free = self._study.free()
+        return [Design(trial.number, {name: free[name].taken(trial.params[name]) for name in free}) for trial in trials]
+
+    def report(self, columns: Columns) -> None:
+        """Report columns of designs as `judged` returns them; those reported before are left alone."""
+        trials = {trial.number: trial for trial in self._optuna.get_trials(deepcopy=False)}
+        for place, number in enumerate(columns["design"].tolist()):
+            trial = trials.get(number)
+            if trial is None or trial.state != TrialState.RUNNING:
+                continue
+            values = [float(columns[objective.figure][place]) for objective in self._study.objectives]
+            violation = float(columns["violation"][place])
+            if math.isfinite(violation) and all(map(math.isfinite, values)):
+                Trial(self._optuna, trial._trial_id).set_constraint("violation", violation)
+                self._optuna.tell(number, values)
+            else:
+                self._optuna.tell(number, state=TrialState.FAIL)
+
+
+def _distribution(variable: Variable) -> BaseDistribution:
+    if variable.values is not None:
+        return CategoricalDistribution(variable.values)
+    return FloatDistribution(*variable.ends(), log=variable.scale == "log")
+
+
+Progress = Callable[[str, int, int], None]
+PLAN, PARTS = "plan.json", "screen"
+_FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
+"""What may be different when a sweep is gone on with, besides the number of random, Sobol or optimised designs."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Designs to judge together, the first of which names the part."""
+
+    study: Study
+    designs: tuple[Design, ...] | None
+    first: int
+    count: int
+
+    def all(self) -> list[Design]:
+        """The designs."""
+        return designs_of(self.study, self.first, self.count) if self.designs is None else list(self.designs)
+
+
+def judged_part(batch: Batch) -> bytes:
+    """What the formulas say of a batch, as the content of its part."""
+    return as_part(judged(batch.study, batch.all()))
+
+
+def screen(
+    study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda what, done, total: None
+) -> None:
+    """Judge all designs of a study that are not judged yet, into parts below ``folder``.
+
+    Raises
+    ------
+    DescriptionError
+        The folder holds another study.
+    OutputError
+        A part cannot be written.
+    SetupError
+        The workers' cluster is gone.
+    """
+    keep_to_plan(study, folder)
+    place = made_folder(folder / PARTS)
+    if study.sampling.kind == "optimise":
+        _optimise(study, folder, place, workers, progress)
+        return
+    total, size = number_of_designs(study), study.sampling.batch
+    batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
+    waiting = [batch for batch in batches if rows_in(part_path(place, batch.first)) < batch.count]
+    # Several machines begin at different places, and look before each batch whether another has done it.
+    random.shuffle(waiting)
+    done = total - sum(batch.count for batch in waiting)
+    progress("screening", done, total)
+
+    def left() -> Iterator[Batch]:
+        nonlocal done
+        for batch in waiting:
+            if rows_in(part_path(place, batch.first)) < batch.count:
+                yield batch
+            else:
+                done += batch.count
+
+    for batch, result in workers.completed(judged_part, left()):
+        write_part(place, batch.first, _content(batch, result), lost=isinstance(result, Lost))
+        done += batch.count
+        progress("screening", done, total)
+
+
+def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
+    """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
+    search = Search(study, folder)
+    known = read_parts(place)
+    if known:
+        search.report(known)
+    total = study.sampling.designs
+    # Other machines may add designs of their own.
+    while (done := sum(map(rows_in, parts(place)))) < total:
+        progress("optimising", done, total)
+        asked = search.ask(min(study.sampling.batch, total - done))
+        share = -(-len(asked) // workers.count)
+        batches = [
+            Batch(study, tuple(asked[i : i + share]), asked[i].number, len(asked[i : i + share]))
+            for i in range(0, len(asked), share)
+        ]
+        for batch, result in workers.completed(judged_part, batches):
+            content = _content(batch, result)
+            write_part(place, batch.first, content)
+            table = pq.read_table(pa.BufferReader(content))
+            search.report({name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names})
+            done += batch.count
+            progress("optimising", done, total)
+
+
+def _content(batch: Batch, result: bytes | Lost) -> bytes:
+    """A part's content; of a batch whose worker died, all designs fail with the reason, until it is tried again."""
+    if not isinstance(result, Lost):
+        return result
+    designs = batch.all()
+    columns = judged(batch.study, [])
+    columns = {name: np.full(len(designs), np.nan) for name in columns} | {
+        "design": np.array([design.number for design in designs]),
+        "violation": np.full(len(designs), np.inf),
+        "failure": np.array([result.reason] * len(designs), dtype=object),
+    }
+    for name in batch.study.free():
+        columns[name] = np.array([design.values[name] for design in designs])
+    return as_part(columns)
+
+
+def keep_to_plan(study: Study, folder: Path) -> None:
+    """Write down what a folder's study is, or make sure that it is the same.
+
+    Raises
+    ------
+    DescriptionError
+        The folder holds another study, or other files.
+    """
+    made_folder(folder)
+    plan = json.loads(study.model_dump_json(exclude=set(_FREE_TO_CHANGE)))
+    del plan["sampling"]["designs"]
+    plan["sensor"] = json.loads(study.base().model_dump_json())
+    path = folder / PLAN
+    if path.is_file():
+        try:
+            known = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise DescriptionError(f"{path} cannot be read: {error}; give another folder, or --overwrite") from error
+        if known != plan:
+            other = ", ".join(key for key in plan if not isinstance(known, dict) or known.get(key) != plan[key])
+            raise DescriptionError(
+                f"{folder} holds a study with another {other}: give another folder, or --overwrite to start afresh"
+            )
+        return
+    if any(not path.name.startswith(".") for path in folder.iterdir()):
+        if path.is_file():
+            # Another machine has just begun.
+            return keep_to_plan(study, folder)
+        raise DescriptionError(f"{folder} holds other files: give a folder of its own")
+    with written_aside(path, overwrite=True) as aside:
+        aside.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,264 @@
+"""The served twin's bench: scene, stage and laser as its camera sees them, and faults NAME[:ARGUMENT][@FRAME]."""
+
+import math
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from twin.devices.gige_camera import GigeCamera
+from twin.devices.grbl_controller import GrblController, StageState
+from twin.recording.studio import Studio
+from twin.scene.description import Motion, Shot
+from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
+from uwlts.model.errors import DescriptionError, DesignError
+from uwlts.model.sensor import Stage
+
+_FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A fault's effect, and its argument unless given; None where it takes none.
+
+    ``ahead`` is for what has to be known before the camera begins with a frame.
+    """
+
+    inject: Callable[[GrblController, GigeCamera, float], None]
+    argument: float | None = None
+    whole: bool = True
+    signed: bool = False
+    ahead: bool = False
+
+
+_KINDS = {
+    "drop": _Kind(lambda stage, camera, frames: camera.drop(int(frames)), 1),
+    "repeat": _Kind(lambda stage, camera, frames: camera.repeat(int(frames)), 1),
+    "cut": _Kind(lambda stage, camera, frames: camera.cut(int(frames)), 1),
+    "delay": _Kind(lambda stage, camera, seconds: camera.delay(seconds), 1.0, whole=False, ahead=True),
+    "camera-disconnect": _Kind(lambda stage, camera, _: camera.disconnect()),
+    "stage-disconnect": _Kind(lambda stage, camera, _: stage.disconnect()),
+    "mute": _Kind(lambda stage, camera, _: stage.mute()),
+    "stall": _Kind(lambda stage, camera, _: stage.stall()),
+    "stop-short": _Kind(lambda stage, camera, steps: stage.stop_short(int(steps)), 40),
+    "lose-steps": _Kind(lambda stage, camera, steps: stage.lose_steps(int(steps)), 40, signed=True),
+    "alarm": _Kind(lambda stage, camera, code: stage.alarm(int(code)), 1),
+    "hold": _Kind(lambda stage, camera, _: stage.hold()),
+    "restart": _Kind(lambda stage, camera, _: stage.restart()),
+    "garbage": _Kind(lambda stage, camera, _: stage.garbage()),
+    "break-laser": _Kind(lambda stage, camera, _: stage.break_laser()),
+}
+NAMES = tuple(_KINDS)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that comes with a frame, counted from 1 as the camera is asked for them."""
+
+    name: str
+    argument: float | None
+    frame: int
+
+    @property
+    def ahead(self) -> bool:
+        """Whether it has to be injected before its frame is begun, which is when the one before is done."""
+        return _KINDS[self.name].ahead
+
+    def inject(self, stage: GrblController, camera: GigeCamera) -> None:
+        """Let it happen."""
+        # Kinds without an argument ignore it.
+        _KINDS[self.name].inject(stage, camera, 0.0 if self.argument is None else self.argument)
+
+    def __str__(self) -> str:
+        return f"{self.name}{'' if self.argument is None else f':{self.argument:g}'} at frame {self.frame}"
+
+
+def parse_fault(text: str) -> Fault:
+    """A fault from NAME[:ARGUMENT][@FRAME]; the first frame and the kind's own argument unless given.
+
+    Raises
+    ------
+    DescriptionError
+        There is no such fault, or its argument is none.
+    """
+    found = _FORM.fullmatch(text)
+    if not found or found["name"] not in _KINDS:
+        raise DescriptionError(f"'{text}' is no fault: write NAME[:ARGUMENT][@FRAME] with one of {', '.join(NAMES)}")
+    kind, argument = _KINDS[found["name"]], found["argument"]
+    if argument is not None and kind.argument is None:
+        raise DescriptionError(f"the fault {found['name']} takes no argument, '{argument}' was given")
+    value = kind.argument
+    if argument is not None:
+        try:
+            value = int(argument) if kind.whole else float(argument)
+        except ValueError as error:
+            wanted = "a whole number" if kind.whole else "a number of seconds"
+            raise DescriptionError(f"the argument of {found['name']} is '{argument}', not {wanted}") from error
+        if not math.isfinite(value) or (value <= 0 and not kind.signed):
+            raise DescriptionError(f"the argument of {found['name']} is '{argument}'; it must be positive")
+    return Fault(found["name"], value, int(found["frame"] or 1))
+
+
+# Keeps the random numbers of the walks, which follow the place, apart from those of the noise, which follow the frame.
+_WALKS, _NOISE = 0, 1
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where the scene's motion lies on the stage: it starts at ``start_mm`` of the stage's own positions."""
+
+    motion: Motion
+    start_mm: float
+
+    @classmethod
+    def on(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
+        """The motion in the middle of the travel, on a whole step, unless ``start_mm`` says where it starts.
+
+        Raises
+        ------
+        DescriptionError
+            The motion does not lie within the travel.
+        """
+        way_mm = (motion.count - 1) * motion.step_mm
+        if start_mm is None:
+            start_mm = round((stage.travel_mm - way_mm) / 2 / stage.resolution_mm) * stage.resolution_mm
+        low, high = sorted((start_mm, start_mm + way_mm))
+        # A motion as long as the travel may lie beyond its end by half the step to which its start was rounded.
+        if not -stage.resolution_mm <= low <= high <= stage.travel_mm + stage.resolution_mm:
+            raise DescriptionError(
+                f"the scene's motion would run from {low:g} to {high:g} mm of the stage, whose travel is 0 to "
+                f"{stage.travel_mm:g} mm: start it elsewhere, or shorten it"
+            )
+        return cls(motion, start_mm)
+
+    @property
+    def offset_mm(self) -> float:
+        """Stage position of the scene's position 0."""
+        return self.start_mm - self.motion.start_mm
+
+    def shot(self, position_mm: float, light: Literal["lamp", "laser"]) -> Shot:
+        """The shot at a position of the stage; errors of the stage between the scan's positions are interpolated."""
+        scene_mm, motion = position_mm - self.offset_mm, self.motion
+        error_mm = 0.0
+        if motion.position_errors_mm:
+            places = motion.start_mm + motion.step_mm * np.arange(motion.count)
+            order = np.argsort(places)
+            error_mm = float(np.interp(scene_mm, places[order], np.array(motion.position_errors_mm)[order]))
+        return Shot(stage_mm=scene_mm, travelled_mm=scene_mm + error_mm, light=light)
+
+
+@dataclass(frozen=True)
+class FrameRates:
+    """How many frames were made, how many of them had to be rendered, and what both kinds took in s."""
+
+    frames: int = 0
+    rendered: int = 0
+    rendering_s: float = 0.0
+    repeating_s: float = 0.0
+
+    def __str__(self) -> str:
+        repeated = self.frames - self.rendered
+        parts = [
+            f"{count} {what} at {count / seconds:.1f} frames/s"
+            for count, what, seconds in (
+                (self.rendered, "rendered", self.rendering_s),
+                (repeated, "of the same place", self.repeating_s),
+            )
+            if count
+        ]
+        return ", ".join([f"{self.frames} frames", *parts])
+
+
+class Bench:
+    """Renders frames for a stage; used by one thread.
+
+    Parameters
+    ----------
+    studio
+        Sensor and scene.
+    state
+        What is true of stage and laser at the moment of the call.
+    track
+        Where the scene lies on the stage.
+    lamp
+        Whether the lamp is on while the laser is off.
+
+    Raises
+    ------
+    DesignError
+        The detector does not have 8 bit.
+    """
+
+    def __init__(self, studio: Studio, *, state: Callable[[], StageState], track: Track, lamp: bool):
+        detector, camera = studio.sensor.detector, studio.sensor.camera
+        if detector.bits != 8:
+            raise DesignError(f"the served camera gives 8 bit, the sensor's detector {detector.bits}: set bits = 8")
+        self.rates = FrameRates()
+        self._studio, self._state, self._track, self._lamp = studio, state, track, lamp
+        self._pattern = (
+            fixed_pattern(detector, height=camera.height_px, width=camera.width_px)
+            if studio.options.effects.fixed_pattern
+            else None
+        )
+        self._travelled_mm = math.nan
+        self._seen: dict[str, np.ndarray] = {}
+
+    def frame(self, exposure_ms: float) -> np.ndarray:
+        """Image (height_px, width_px) of uint8 of this moment; noise differs from call to call."""
+        began, state, known = time.perf_counter(), self._state(), len(self._seen)
+        at_rest = self._track.shot(state.position_mm, "laser").travelled_mm == self._travelled_mm
+        light = exposure_ms * self._electrons_per_ms(state)
+        effects, seed = self._studio.options.effects, self._studio.options.seed
+        rng = np.random.default_rng([seed, _NOISE, self.rates.frames]) if effects.noise else None
+        image = grey_values(
+            light, self._studio.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern
+        )
+        self._count(repeated=at_rest and len(self._seen) == known, seconds=time.perf_counter() - began)
+        return image
+
+    def _count(self, *, repeated: bool, seconds: float) -> None:
+        rates = replace(self.rates, frames=self.rates.frames + 1)
+        if repeated:
+            self.rates = replace(rates, repeating_s=rates.repeating_s + seconds)
+        else:
+            self.rates = replace(rates, rendered=rates.rendered + 1, rendering_s=rates.rendering_s + seconds)
+
+    def _electrons_per_ms(self, state: StageState) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W), without noise; the latest place's are kept."""
+        travelled_mm = self._track.shot(state.position_mm, "laser").travelled_mm
+        if travelled_mm != self._travelled_mm:
+            self._travelled_mm, self._seen = travelled_mm, {}
+        if state.power == 0:
+            return self._light("lamp" if self._lamp else "day", state)
+        laser = self._light("laser", state)
+        if state.power >= 1:
+            return laser
+        # A laser frame holds the daylight, which a weaker laser leaves as it is.
+        day = self._light("day", state)
+        return day + np.float32(state.power) * np.maximum(laser - day, 0)
+
+    def _light(self, light: Literal["lamp", "laser", "day"], state: StageState) -> np.ndarray:
+        if light not in self._seen:
+            if light == "day":
+                self._seen[light] = self._daylight(self._track.shot(state.position_mm, "lamp"))
+            else:
+                self._seen[light] = self._rendered(self._track.shot(state.position_mm, light))
+        return self._seen[light]
+
+    def _rendered(self, shot: Shot) -> np.ndarray:
+        options = self._studio.options
+        # Whole um, which are all different places; seeds must not be negative.
+        place = round(1e3 * shot.travelled_mm) % 2**32
+        seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
+        return self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
+
+    def _daylight(self, shot: Shot) -> np.ndarray:
+        """What is left when laser and lamp are off."""
+        studio, sensor = self._studio, self._studio.sensor
+        if not (studio.options.effects.ambient and sensor.lamp.ambient_w_per_m2 > 0):
+            return np.zeros((sensor.camera.height_px, sensor.camera.width_px), np.float32)
+        irradiance = studio.renderer.daylight(studio.pose(shot), spp=studio.options.spp)
+        return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)

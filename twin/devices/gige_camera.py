@@ -1,0 +1,401 @@
+"""A GigE Vision camera on the loopback interface, whose images are sent at the speed of a real cable."""
+
+import ctypes
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass, replace
+from types import SimpleNamespace, TracebackType
+from typing import Self
+
+import numpy as np
+
+from uwlts.model.errors import HardwareError, ImageError
+from uwlts.runtime.aravis_library import load_aravis
+
+# What 1 Gbit/s carries, and how many packets go out together, as sleeps are not exact.
+_BYTES_PER_S, _TOGETHER = 125e6, 8
+# Headers of IP, UDP and GVSP are counted in the size of a packet.
+_OVERHEAD_BYTES = 36
+_LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
+
+
+def image_packets(
+    image: np.ndarray, *, time_ns: int, number: int, region: tuple[int, int, int, int], packet_bytes: int
+) -> list[bytes]:
+    """Leader, parts of the region, and trailer of an image.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        The whole image.
+    time_ns, number
+        Its time stamp in ns, and its number of 16 bits.
+    region
+        Left, top, width and height in px; what lies beyond the image is dark.
+    packet_bytes
+        Size of a packet with all its headers.
+    """
+    x, y, width, height = region
+    seen = np.zeros((height, width), np.uint8)
+    part = image[y : y + height, x : x + width]
+    seen[: part.shape[0], : part.shape[1]] = part
+    pixels, room = seen.tobytes(), packet_bytes - _OVERHEAD_BYTES
+    leader = struct.pack(">HHQIIIIIHH", 0, _IMAGE, time_ns, _MONO8, width, height, x, y, 0, 0)
+    parts = [pixels[start : start + room] for start in range(0, len(pixels), room)]
+    bodies = [(_LEADER, leader), *((_PAYLOAD, each) for each in parts), (_TRAILER, struct.pack(">II", _IMAGE, height))]
+    return [struct.pack(">HHI", 0, number, kind << 24 | index) + body for index, (kind, body) in enumerate(bodies)]
+
+
+def send_paced(stream: socket.socket, packets: list[bytes], to: tuple[str, int]) -> None:
+    """Send packets one after the other, no faster than the cable would; hosts lose what comes much faster."""
+    began, sent_bytes = time.perf_counter(), 0
+    for index, packet in enumerate(packets):
+        stream.sendto(packet, to)
+        sent_bytes += len(packet)
+        ahead_s = sent_bytes / _BYTES_PER_S - (time.perf_counter() - began)
+        if index % _TOGETHER == _TOGETHER - 1 and ahead_s > 0:
+            time.sleep(ahead_s)
+
+
+LOOPBACK = "127.0.0.1"
+# GigE Vision's control port.
+PORT = 3956
+# Jumbo packets, as on a bench. With Aravis's 2000 bytes there are 670 packets in an image.
+_PACKET_BYTES = 9000
+# Commands are answered between looks for a trigger. At 1000 per s and more the thread would never rest.
+_LOOKS_FOR_TRIGGER_HZ = 200.0
+# Hosts repeat a command that is not answered within 500 ms.
+_LONGEST_WAIT_S = 0.1
+_NAME_BYTES = 32
+_SERIAL_BYTES = 16
+# Frames are counted in 16 bits, without 0.
+_LAST_NUMBER = 2**16 - 1
+# Of a frame that is cut every tenth packet is lost, at least one, but never the first, by which hosts know of it.
+_CUT_EVERY = 10
+# GLib's number of the type double.
+_DOUBLE_TYPE = 15 << 2
+
+_FILL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
+
+
+class _Register:
+    """Addresses of the fake camera's registers, of GigE Vision and its own."""
+
+    MAKER, MODEL, STREAM_PORT, PACKET_SIZE, STREAM_IP = 0x48, 0x68, 0xD00, 0xD04, 0xD18
+    WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
+    EXPOSURE_US, ACQUISITION, OFFSET_X, OFFSET_Y = 0x120, 0x124, 0x130, 0x134
+    TRIGGER_SOFTWARE, DEVICE_ID = 0x30C, 0xD8
+
+
+_REGION = (_Register.OFFSET_X, _Register.OFFSET_Y, _Register.WIDTH, _Register.HEIGHT)
+
+_FUNCTIONS = {
+    "arv_gv_fake_camera_new": (c_void_p, [c_char_p, c_char_p]),
+    "arv_gv_fake_camera_get_fake_camera": (c_void_p, [c_void_p]),
+    "arv_gv_fake_camera_is_running": (c_int, [c_void_p]),
+    "arv_fake_camera_set_fill_pattern": (None, [c_void_p, _FILL, c_void_p]),
+    "arv_fake_camera_set_trigger_frequency": (None, [c_void_p, c_double]),
+    "arv_fake_camera_write_memory": (c_int, [c_void_p, c_uint32, c_uint32, c_char_p]),
+    "arv_fake_camera_write_register": (c_int, [c_void_p, c_uint32, c_uint32]),
+    "arv_fake_camera_read_register": (c_int, [c_void_p, c_uint32, ctypes.POINTER(c_uint32)]),
+    "arv_fake_camera_is_in_software_trigger_mode": (c_int, [c_void_p]),
+    "g_value_init": (c_void_p, [c_void_p, c_size_t]),
+    "g_value_set_double": (None, [c_void_p, c_double]),
+    "g_object_set_property": (None, [c_void_p, c_char_p, c_void_p]),
+    "g_object_unref": (None, [c_void_p]),
+}
+
+
+@dataclass(frozen=True)
+class _Shot:
+    """An image with the time in ns at which its exposure began."""
+
+    image: np.ndarray
+    time_ns: int
+
+
+@dataclass(frozen=True)
+class _Faults:
+    """How many of the next frames are lost, repeat the one before, lack packets, or come late by so many seconds."""
+
+    drop: int = 0
+    repeat: int = 0
+    cut: int = 0
+    delay: int = 0
+    delay_s: float = 0.0
+
+
+class GigeCamera:
+    """Serves a camera of 8 bit; a context manager.
+
+    ``frame(exposure_ms)`` returns the whole image (height_px, width_px) of uint8. It is called in one thread, always
+    the same. An exception of it leaves the frame out and is kept in ``failure``.
+
+    A trigger that comes while an image is being made replaces the one before, which stays without an answer.
+
+    Raises
+    ------
+    HardwareError
+        Another camera is served on this machine.
+    SetupError
+        Aravis is not installed.
+    """
+
+    def __init__(
+        self,
+        frame: Callable[[float], np.ndarray],
+        *,
+        width_px: int = 1280,
+        height_px: int = 1024,
+        maker: str = "UWLTS",
+        model: str = "Twin",
+        serial: str = "1",
+        first_number: int = 1,
+    ):
+        for name, text, room in (("maker", maker, _NAME_BYTES), ("model", model, _NAME_BYTES), ("serial", serial, 16)):
+            if not text.isascii() or not 0 < len(text) < room:
+                raise HardwareError(f"{name} is '{text}': it must have 1 to {room - 1} ASCII characters")
+        self.failure: BaseException | None = None
+        self._frame = frame
+        self._size = (height_px, width_px)
+        self._maker, self._model, self._serial = maker, model, serial
+        self._library = _functions()
+        # The library keeps no reference to it.
+        self._callback = _FILL(self._fill)
+        self._server: int | None = None
+        self._stream: socket.socket
+        self._camera = 0
+        self._lock = threading.Lock()
+        self._faults = _Faults()
+        self._number = first_number - 1
+        self._sent = 0
+        self._making: Future[_Shot] | None = None
+        self._answer: _Shot | None = None
+        self._last: _Shot | None = None
+        self._maker_thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gige-camera")
+        self._stopping = threading.Event()
+
+    @property
+    def address(self) -> str:
+        """Address by which `uwlts` opens this camera."""
+        return f"gige:{LOOPBACK}"
+
+    @property
+    def exposure_ms(self) -> float:
+        """Exposure that the host has set, in ms."""
+        with self._lock:
+            if self._server is None:
+                raise HardwareError("the camera is disconnected: its exposure is not known")
+            return 1e-3 * self._read(_Register.EXPOSURE_US)
+
+    @property
+    def frames_sent(self) -> int:
+        """Number of frames sent, wholly or in part."""
+        return self._sent
+
+    def drop(self, frames: int = 1) -> None:
+        """Lose the next frames altogether."""
+        self._inject(drop=frames)
+
+    def repeat(self, frames: int = 1) -> None:
+        """Send the frame before, with its time stamp, in place of each of the next frames."""
+        self._inject(repeat=frames)
+
+    def cut(self, frames: int = 1) -> None:
+        """Lose a tenth of the packets of each of the next frames."""
+        self._inject(cut=frames)
+
+    def delay(self, seconds: float, frames: int = 1) -> None:
+        """Begin the exposure of each of the next frames so much later."""
+        self._inject(delay=frames, delay_s=seconds)
+
+    def _inject(self, **faults: float) -> None:
+        with self._lock:
+            self._faults = replace(self._faults, **faults)
+
+    def disconnect(self) -> None:
+        """Be gone, as if the cable were pulled: nothing is sent and no command answered any more."""
+        with self._lock:
+            server, self._server = self._server, None
+            self._making = self._answer = None
+        if server is not None:
+            # Waits for the library's thread, which calls back; an object on its way out must not be touched.
+            self._library.g_object_unref(server)
+            self._stream.close()
+
+    def connect(self) -> None:
+        """Be there, as if the cable were plugged in and the camera switched on."""
+        if self._server is not None:
+            return
+        library = self._library
+        _refuse_second_camera()
+        self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._stream.bind((LOOPBACK, 0))
+        with _nothing_beyond_loopback():
+            self._server = library.arv_gv_fake_camera_new(LOOPBACK.encode(), self._serial.encode())
+        if not library.arv_gv_fake_camera_is_running(self._server):
+            self.disconnect()
+            raise HardwareError(f"Aravis's camera does not start on {LOOPBACK}: is the loopback interface up?")
+        self._silence_library()
+        self._camera = library.arv_gv_fake_camera_get_fake_camera(self._server)
+        height, width = self._size
+        texts = {
+            _Register.MAKER: (self._maker, _NAME_BYTES),
+            _Register.MODEL: (self._model, _NAME_BYTES),
+            _Register.DEVICE_ID: (self._serial, _SERIAL_BYTES),
+        }
+        for register, (text, room) in texts.items():
+            library.arv_fake_camera_write_memory(self._camera, register, room, text.encode().ljust(room, b"\0"))
+        numbers = {
+            _Register.SENSOR_WIDTH: width,
+            _Register.WIDTH: width,
+            _Register.SENSOR_HEIGHT: height,
+            _Register.HEIGHT: height,
+            _Register.PACKET_SIZE: _PACKET_BYTES,
+        }
+        for register, number in numbers.items():
+            library.arv_fake_camera_write_register(self._camera, register, number)
+        library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
+        library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
+
+    def _fill(self, _buffer: int, _data: None, exposure_us: int, _gain: int, _pixel_format: int) -> None:
+        """Called by the library when a frame is due; what it sends itself is lost."""
+        shot = self._due(1e-3 * exposure_us)
+        if shot is None:
+            return
+        with self._lock:
+            if self._server is None:
+                return
+            faults = self._faults
+            if faults.repeat and self._last is not None:
+                shot, faults = self._last, replace(faults, repeat=faults.repeat - 1)
+            self._last = shot
+            self._number = self._number % _LAST_NUMBER + 1
+            self._faults = replace(faults, drop=max(faults.drop - 1, 0), cut=max(faults.cut - 1, 0))
+            names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
+            host, port, packet_bytes = map(self._read, names)
+            x, y, width, height = map(self._read, _REGION)
+        if not faults.drop:
+            packets = image_packets(
+                shot.image,
+                time_ns=shot.time_ns,
+                number=self._number,
+                region=(x, y, width, height),
+                packet_bytes=packet_bytes & 0xFFFF,
+            )
+            if faults.cut:
+                lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
+                packets = [packet for index, packet in enumerate(packets) if index not in lost]
+            send_paced(self._stream, packets, (socket.inet_ntoa(struct.pack(">I", host)), port & 0xFFFF))
+            self._sent += 1
+
+    def _due(self, exposure_ms: float) -> _Shot | None:
+        """The image to send now, if it is ready; else it is being made."""
+        triggered = bool(self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera))
+        with self._lock:
+            answer, self._answer = self._answer, None
+            if answer is not None or self._server is None:
+                return answer
+            before = self._making
+            making = self._maker_thread.submit(self._make, exposure_ms) if before is None or triggered else before
+            self._making = making
+        if before is not None and before is not making:
+            before.cancel()
+        if not wait([making], timeout=_LONGEST_WAIT_S).done:
+            if triggered:
+                making.add_done_callback(self._send_when_ready)
+            return None
+        with self._lock:
+            return self._take(making)
+
+    def _send_when_ready(self, made: Future[_Shot]) -> None:
+        """Called in the second thread; a trigger from inside has the library ask again."""
+        with self._lock:
+            if self._server is None or not self._read(_Register.ACQUISITION):
+                return
+            self._answer = self._take(made)
+            if self._answer is not None:
+                self._library.arv_fake_camera_write_register(self._camera, _Register.TRIGGER_SOFTWARE, 1)
+
+    def _take(self, made: Future[_Shot]) -> _Shot | None:
+        """The image made for the latest trigger; none if it failed, or was made for an earlier one."""
+        if made is not self._making:
+            return None
+        self._making = None
+        self.failure = made.exception() or self.failure
+        return None if made.exception() else made.result()
+
+    def _make(self, exposure_ms: float) -> _Shot:
+        with self._lock:
+            faults = self._faults
+            self._faults = replace(faults, delay=max(faults.delay - 1, 0))
+        if faults.delay:
+            self._stopping.wait(faults.delay_s)
+        began_ns = time.monotonic_ns()
+        image = self._frame(exposure_ms)
+        if image.shape != self._size or image.dtype != np.uint8:
+            raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
+        return _Shot(image, began_ns)
+
+    def _silence_library(self) -> None:
+        """Have the library lose all packets of its own."""
+        value = (c_uint64 * 3)()
+        self._library.g_value_init(value, _DOUBLE_TYPE)
+        self._library.g_value_set_double(value, 1.0)
+        self._library.g_object_set_property(self._server, b"gvsp-lost-ratio", value)
+
+    def _read(self, register: int) -> int:
+        number = c_uint32()
+        self._library.arv_fake_camera_read_register(self._camera, register, ctypes.byref(number))
+        return number.value
+
+    def close(self) -> None:
+        """End the service."""
+        self._stopping.set()
+        self.disconnect()
+        self._maker_thread.shutdown(cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _functions() -> SimpleNamespace:
+    """The library's functions with their types, for this module alone."""
+    library, functions = load_aravis(), SimpleNamespace()
+    for name, (result, arguments) in _FUNCTIONS.items():
+        function = library[name]
+        function.restype, function.argtypes = result, arguments
+        setattr(functions, name, function)
+    return functions
+
+
+def _refuse_second_camera() -> None:
+    """Check that the port is free, which Aravis does not report."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.bind((LOOPBACK, PORT))
+        except OSError as error:
+            raise HardwareError(
+                f"UDP port {PORT} of {LOOPBACK} cannot be used ({error.strerror}): another camera is served there; "
+                "end that program first"
+            ) from error
+
+
+@contextmanager
+def _nothing_beyond_loopback() -> Iterator[None]:
+    """Hold the broadcast address of all networks, at which Aravis would listen too, while the camera starts."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
+        guard.bind(("255.255.255.255", PORT))
+        yield

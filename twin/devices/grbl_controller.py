@@ -1,0 +1,252 @@
+"""A Grbl 1.1h controller with one axis and a laser, on a pseudo terminal: the twin's stage.
+
+It answers byte for byte as the firmware does on an Arduino Uno: greeting, ``$`` commands, settings, status reports,
+real-time characters, G-code with modal state, planner and receive buffers, soft limits, homing, alarms. Programs open
+`GrblController.port` as they would open /dev/ttyACM0. As on the Uno, opening the port restarts the controller and
+closing it does not; ``gated`` adds the hardware interlock by which the laser has power only while the port is open.
+
+Left out: the Y and Z axes (error:20), arcs, probing, jogging, overrides, hard limits, parking, check mode.
+
+The stage's position is counted in mm from the lower end of travel, where the limit switch is if $23 is 1.
+"""
+
+import errno
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import TracebackType
+
+from twin.devices.grbl_firmware import GrblFirmware
+
+# The thesis's bench, as docs/hardware-stage.md sets it up.
+BENCH_SETTINGS: dict[int, float] = {
+    0: 10,
+    1: 255,
+    2: 0,
+    3: 0,
+    4: 0,
+    5: 0,
+    6: 0,
+    10: 1,
+    11: 0.01,
+    12: 0.002,
+    13: 0,
+    20: 1,
+    21: 0,
+    22: 1,
+    23: 1,
+    24: 60,
+    25: 600,
+    26: 25,
+    27: 2,
+    30: 1000,
+    31: 0,
+    32: 1,
+    100: 80,
+    101: 250,
+    102: 250,
+    110: 900,
+    111: 500,
+    112: 500,
+    120: 50,
+    121: 10,
+    122: 10,
+    130: 750,
+    131: 200,
+    132: 200,
+}
+_BUSY_MS, _IDLE_MS = 2, 20
+
+
+@dataclass(frozen=True)
+class StageState:
+    """What is true of the stage and the laser at this moment; ``power`` is 0 when no light comes out."""
+
+    position_mm: float
+    moving: bool
+    laser_on: bool
+    power: float
+    port_open: bool
+
+
+class GrblController:
+    """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
+
+    Parameters
+    ----------
+    settings : mapping
+        Settings by number, in place of `BENCH_SETTINGS`.
+    position_mm : float
+        Where the stage stands when the power comes on.
+    speed_up : float
+        How much faster than real its time runs.
+    version, options : str
+        What it says it is: 1.1h, and the code letters of its build in ``$I``.
+    boot_s : float
+        Time of its own from a restart to the greeting: the Uno's boot loader.
+    resets_when_opened : bool
+        As the Uno does through DTR.
+    gated : bool
+        Whether the laser's supply is cut while the port is closed.
+    """
+
+    def __init__(
+        self,
+        *,
+        settings: Mapping[int, float] | None = None,
+        position_mm: float = 100.0,
+        speed_up: float = 1.0,
+        version: str = "1.1h",
+        options: str = "V",
+        boot_s: float = 1.6,
+        resets_when_opened: bool = True,
+        gated: bool = False,
+    ):
+        self._speed_up, self._origin = speed_up, time.monotonic()
+        self._lock, self._ending = threading.RLock(), threading.Event()
+        self._resets_when_opened, self._gated, self._port_open = resets_when_opened, gated, False
+        self._powered, self._muted, self._laser_broken = True, False, False
+        self._firmware = GrblFirmware(
+            {**BENCH_SETTINGS, **(settings or {})},
+            position_mm=position_mm,
+            version=version,
+            options=options,
+            boot_s=boot_s,
+            clock=self._now,
+            say=self._say,
+        )
+
+    def __enter__(self) -> "GrblController":
+        self._master, slave = os.openpty()
+        # Raw from the start, or the terminal would echo the greeting back as a command.
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        os.close(slave)
+        os.set_blocking(self._master, False)
+        self._thread = threading.Thread(target=self._run, name="grbl", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join()
+        self.disconnect()
+
+    def state(self) -> StageState:
+        """The truth, for whoever renders what the sensor sees."""
+        with self._lock:
+            lit = self._powered and not self._laser_broken and (self._port_open or not self._gated)
+            power = self._firmware.laser_power() if lit else 0.0
+            speed = self._firmware.axis.at(self._now())[1]
+            return StageState(self._firmware.stage_mm, speed != 0, power > 0, power, self._port_open)
+
+    # Faults
+
+    def disconnect(self) -> None:
+        """Pull the cable out: the line is gone and, with it, the controller's power."""
+        with self._lock:
+            if self._powered:
+                self._firmware.axis.stop(self._now())
+                self._powered = False
+                os.close(self._master)
+
+    def mute(self, silent: bool = True) -> None:
+        """Break the wire on which the controller answers; it still receives."""
+        with self._lock:
+            self._muted = silent
+
+    def stall(self) -> None:
+        """Let the current or next movement stand still until a reset, while the controller says it runs."""
+        with self._lock:
+            self._firmware.axis.stick(self._now())
+
+    def stop_short(self, steps: int) -> None:
+        """End the next movement this many steps before its target: commands or pulses lost in the controller."""
+        with self._lock:
+            self._firmware.short_steps = steps
+
+    def lose_steps(self, steps: int) -> None:
+        """Let the motor slip by this many steps, signed; the controller, which measures nothing, cannot know."""
+        with self._lock:
+            self._firmware.shift_mm += steps * self._firmware.step_mm
+
+    def alarm(self, code: int) -> None:
+        """Raise an alarm."""
+        with self._lock:
+            self._firmware.raise_alarm(code)
+
+    def garbage(self, data: bytes = b"\xff\xfe<Id|MPos:1#\x80,0\r\n") -> None:
+        """Put noise on the line to the computer."""
+        with self._lock:
+            self._say(data)
+
+    def restart(self) -> None:
+        """Restart as after a dip of the supply: the laser goes off, position and queue are forgotten."""
+        with self._lock:
+            self._firmware.restart()
+
+    def hold(self) -> None:
+        """Press the feed hold button, or let noise do so."""
+        with self._lock:
+            self._firmware.hear(b"!")
+
+    def break_laser(self, broken: bool = True) -> None:
+        """Let no light come out, whatever the pin says."""
+        with self._lock:
+            self._laser_broken = broken
+
+    # The line
+
+    def _run(self) -> None:
+        poll = select.poll()
+        poll.register(self._master, select.POLLIN)
+        # Until a program has opened it once, a pseudo terminal does not say that it is closed.
+        os.close(os.open(self.port, os.O_RDWR | os.O_NOCTTY))
+        while not self._ending.is_set():
+            patience_ms = _BUSY_MS if self._firmware.busy else _IDLE_MS
+            events = dict(poll.poll(patience_ms)).get(self._master, 0)
+            with self._lock:
+                if not self._powered:
+                    return
+                self._notice_port(closed=bool(events & select.POLLHUP and not events & select.POLLIN))
+                if events & select.POLLIN:
+                    self._receive()
+                self._firmware.work()
+            if events & select.POLLHUP:
+                # Polling a closed port does not wait.
+                time.sleep(_BUSY_MS / 1000)
+
+    def _notice_port(self, *, closed: bool) -> None:
+        opened = not closed and not self._port_open
+        self._port_open = not closed
+        if opened and self._resets_when_opened:
+            self._firmware.restart()
+
+    def _receive(self) -> None:
+        try:
+            data = os.read(self._master, 4096)
+        except OSError as error:
+            # The last program has closed the port.
+            if error.errno == errno.EIO:
+                return
+            raise
+        self._firmware.hear(data)
+
+    def _say(self, data: bytes) -> None:
+        if self._muted or not self._powered:
+            return
+        try:
+            os.write(self._master, data)
+        except OSError as error:
+            # Nobody reads, or nobody is there: a serial line does not mind.
+            if error.errno not in (errno.EAGAIN, errno.EIO):
+                raise
+
+    def _now(self) -> float:
+        return (time.monotonic() - self._origin) * self._speed_up

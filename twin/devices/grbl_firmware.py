@@ -1,0 +1,446 @@
+"""Grbl 1.1 for one axis: its answers, states and alarms, and its reading of G-code blocks."""
+
+import re
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
+
+from twin.devices.grbl_motion import Axis
+
+_WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
+# Command to its modal group; the axis commands of group 0 exclude each other as well.
+_GROUPS = {
+    "G4": "once",
+    "G53": "once",
+    "G92": "once",
+    "G92.1": "once",
+    "G0": "motion",
+    "G1": "motion",
+    "G80": "motion",
+    "G17": "plane",
+    "G90": "distance",
+    "G91": "distance",
+    "G94": "feed",
+    "G20": "units",
+    "G21": "units",
+    "G40": "cutter",
+    "G49": "length",
+    "G54": "system",
+    "G61": "control",
+    "M0": "stop",
+    "M2": "stop",
+    "M30": "stop",
+    "M3": "spindle",
+    "M4": "spindle",
+    "M5": "spindle",
+    "M7": "coolant",
+    "M8": "coolant",
+    "M9": "coolant",
+}
+_VALUES = "XFSPNT"
+
+
+class GrblError(Exception):
+    """A line that Grbl answers with ``error:code``."""
+
+    def __init__(self, code: int):
+        super().__init__(f"error:{code}")
+        self.code = code
+
+
+@dataclass(frozen=True)
+class Block:
+    """The commands of a line by modal group, its values by letter, and whether G53 is among them."""
+
+    commands: dict[str, str]
+    values: dict[str, float]
+    machine_coordinates: bool
+
+
+def parse_block(line: str) -> Block:
+    """Words of a line without spaces and comments, in capitals; GrblError with Grbl's number."""
+    commands: dict[str, str] = {}
+    values: dict[str, float] = {}
+    machine_coordinates, position = False, 0
+    while position < len(line):
+        found = _WORD.match(line, position)
+        if not found:
+            raise GrblError(2 if line[position].isalpha() else 1)
+        position, letter, number = found.end(), found[1], float(found[2])
+        if letter in "GM":
+            command = f"{letter}{number:g}"
+            if command not in _GROUPS:
+                raise GrblError(20)
+            if command == "G53":
+                machine_coordinates = True
+            elif commands.setdefault(_GROUPS[command], command) != command:
+                raise GrblError(21)
+        elif letter not in _VALUES:
+            raise GrblError(20)
+        elif letter in values:
+            raise GrblError(25)
+        elif letter in "FSPNT" and number < 0:
+            raise GrblError(4)
+        else:
+            values[letter] = number
+    _refuse_incomplete(commands, values, machine_coordinates)
+    return Block(commands, values, machine_coordinates)
+
+
+def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machine_coordinates: bool) -> None:
+    once, motion = commands.get("once"), commands.get("motion")
+    if once == "G4" and "P" not in values:
+        raise GrblError(28)
+    if "P" in values and once != "G4":
+        raise GrblError(36)
+    if once == "G92" and "X" not in values:
+        raise GrblError(26)
+    if once == "G92" and motion:
+        raise GrblError(24)
+    if machine_coordinates and motion == "G80":
+        raise GrblError(30)
+    if once == "G4" and "X" in values:
+        raise GrblError(31)
+
+
+_DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}
+_PLANNER_BLOCKS, _RECEIVE_BYTES, _LONGEST_LINE = 15, 127, 79
+_WCO_IDLE, _WCO_BUSY = 10, 30
+
+
+class GrblFirmware:
+    """One controller. Not safe between threads.
+
+    Parameters
+    ----------
+    settings : mapping
+        All settings by number.
+    position_mm : float
+        Where the stage stands when the power comes on.
+    version, options : str
+        What it says it is, and the code letters of its build.
+    boot_s : float
+        Time from a restart to the greeting.
+    clock : callable
+        Its time in s.
+    say : callable
+        Takes the bytes for the computer.
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[int, float],
+        *,
+        position_mm: float,
+        version: str,
+        options: str,
+        boot_s: float,
+        clock: Callable[[], float],
+        say: Callable[[bytes], None],
+    ):
+        self._settings, self._version, self._options, self._boot_s = dict(settings), version, options, boot_s
+        self._now, self._say = clock, say
+        self.axis = Axis(self._settings[120])
+        self.shift_mm, self.short_steps, self._starts = position_mm, 0, 0
+        self.restart()
+
+    @property
+    def stage_mm(self) -> float:
+        """Where the stage stands."""
+        return self.axis.at(self._now())[0] + self.shift_mm
+
+    @property
+    def step_mm(self) -> float:
+        """Way of one step."""
+        return 1 / self._settings[100]
+
+    @property
+    def busy(self) -> bool:
+        """Whether something goes on without more characters coming."""
+        return self._booted_s is not None or self._job is not None or self.axis.pending > 0
+
+    def laser_power(self) -> float:
+        """Share of the time in which the laser's pin is on."""
+        return self._spindle(self._now()) / self._settings[30]
+
+    def hear(self, data: bytes) -> None:
+        """Characters from the computer; while it starts they are lost."""
+        for byte in data if self._booted_s is None else b"":
+            if byte == 0x18:
+                self._soft_reset()
+            elif byte in b"?!~":
+                self._realtime(chr(byte))
+            elif byte < 0x80 and len(self._input) < _RECEIVE_BYTES:
+                self._input.append(byte)
+
+    def _send(self, text: str) -> None:
+        self._say(f"{text}\r\n".encode("ascii"))
+
+    def restart(self) -> None:
+        """Restart: the laser is off, position and queue are forgotten."""
+        now = self._now()
+        self.shift_mm += self.axis.at(now)[0]
+        self.axis.place(0.0)
+        self._mode = "Alarm" if self._settings[22] else "Idle"
+        self._clear(booted_s=now + self._boot_s)
+
+    def _clear(self, *, booted_s: float | None) -> None:
+        self._booted_s = booted_s
+        self._starts += 1
+        self._input = bytearray()
+        self._job: Generator[None, None, None] | None = None
+        self._critical, self._reports_to_offset = False, 0
+        self._modal = {"motion": "G0", "distance": "G90", "units": "G21", "spindle": "M5"}
+        self._feed_mm_min, self._s, self._offset_mm = 0.0, 0.0, 0.0
+
+    def _soft_reset(self) -> None:
+        now = self._now()
+        self.axis.advance(now)
+        if self._mode == "Home" or (self.axis.pending and (not self.axis.held or self.axis.braking(now))):
+            self._send(f"ALARM:{6 if self._mode == 'Home' else 3}")
+            self._mode = "Alarm"
+        self.axis.stop(now)
+        if self._mode != "Alarm":
+            self._mode = "Idle"
+        self._clear(booted_s=None)
+        self._greet()
+
+    def _greet(self) -> None:
+        self._send(f"\r\nGrbl {self._version} ['$' for help]")
+        if self._mode == "Alarm":
+            self._send("[MSG:'$H'|'$X' to unlock]")
+
+    def raise_alarm(self, code: int) -> None:
+        """Stop everything and say why."""
+        self.axis.stop(self._now())
+        self._mode, self._job, self._modal["spindle"] = "Alarm", None, "M5"
+        self._send(f"ALARM:{code}")
+        if code in (1, 2):
+            self._critical = True
+            self._send("[MSG:Reset to continue]")
+        else:
+            self._clear(booted_s=None)
+            self._greet()
+
+    def _realtime(self, character: str) -> None:
+        now = self._now()
+        if character == "?" and self._mode != "Home" and not self._critical:
+            self._send(self._report(now))
+        elif character == "!" and self._mode == "Idle":
+            self.axis.hold(now)
+        elif character == "~":
+            self.axis.resume(now)
+
+    def work(self) -> None:
+        """Whatever the main loop does between two interrupts."""
+        now = self._now()
+        self.axis.advance(now)
+        if self._booted_s is not None:
+            if now < self._booted_s:
+                return
+            self._booted_s = None
+            self._greet()
+        while not self._critical and (self._job is not None or (self._ready() and not self.axis.held)):
+            if self._job is None:
+                self._job = self._answer(self._next_line())
+            job = self._job
+            try:
+                next(job)
+                return
+            except StopIteration:
+                # An alarm or a reset within the job has thrown it away already.
+                self._job = None if self._job is job else self._job
+
+    def _ready(self) -> bool:
+        return b"\n" in self._input or b"\r" in self._input
+
+    def _next_line(self) -> str:
+        end = min(at for at in (self._input.find(b"\n"), self._input.find(b"\r")) if at >= 0)
+        line = self._input[:end].decode("ascii")
+        del self._input[: end + 1]
+        return "".join(line.split(";")[0].split()).upper()
+
+    def _answer(self, line: str) -> Generator[None, None, None]:
+        starts = self._starts
+        try:
+            if len(line) > _LONGEST_LINE:
+                raise GrblError(11)
+            if line.startswith("$"):
+                yield from self._system_command(line)
+            elif line and self._mode == "Alarm":
+                raise GrblError(9)
+            elif line:
+                yield from self._execute(parse_block(line))
+        except GrblError as error:
+            self._send(f"error:{error.code}")
+        else:
+            # What an alarm has thrown away is not acknowledged.
+            if not self._critical and self._starts == starts:
+                self._send("ok")
+
+    def _report(self, now: float) -> str:
+        self.axis.advance(now)
+        position, speed = self.axis.at(now)
+        steps = round(position * self._settings[100]) / self._settings[100]
+        if self.axis.held:
+            state = f"Hold:{int(self.axis.braking(now))}"
+        else:
+            state = "Run" if self._mode == "Idle" and self.axis.pending else self._mode
+        machine = int(self._settings[10]) & 1
+        x = steps if machine else steps - self._offset_mm
+        fields = [state, f"{'MPos' if machine else 'WPos'}:{x:.3f},0.000,0.000"]
+        if int(self._settings[10]) & 2:
+            fields.append(f"Bf:{_PLANNER_BLOCKS - self.axis.pending},{_RECEIVE_BYTES - len(self._input)}")
+        fields.append(f"FS:{abs(speed) * 60:.0f},{self._spindle(now):.0f}")
+        if self._switch_pressed(position):
+            fields.append("Pn:X")
+        if self._reports_to_offset == 0:
+            self._reports_to_offset = _WCO_IDLE if state == "Idle" else _WCO_BUSY
+            fields.append(f"WCO:{self._offset_mm:.3f},0.000,0.000")
+        self._reports_to_offset -= 1
+        return f"<{'|'.join(fields)}>"
+
+    def _switch_pressed(self, position: float) -> bool:
+        stage_mm = position + self.shift_mm
+        # Half a step, so that rounding does not press it.
+        slack = 0.5 / self._settings[100]
+        return stage_mm < -slack if int(self._settings[23]) & 1 else stage_mm > self._settings[130] + slack
+
+    def _spindle(self, now: float) -> float:
+        """The S in force at the pin; laser mode darkens G0 and holds, and M4 while nothing moves."""
+        if self._modal["spindle"] == "M5" or self._mode == "Alarm":
+            return 0.0
+        if self._settings[32]:
+            moves = self.axis.at(now)[1] != 0
+            at_rest_by_hold = self.axis.held and not self.axis.braking(now)
+            dark = self._modal["motion"] == "G0" or at_rest_by_hold or (self._modal["spindle"] == "M4" and not moves)
+            return 0.0 if dark else min(self._s, self._settings[30])
+        return min(self._s, self._settings[30])
+
+    def _done(self) -> Generator[None, None, None]:
+        """Wait until all movements are done."""
+        while self.axis.pending or self.axis.held:
+            yield
+
+    def _pause(self, seconds: float) -> Generator[None, None, None]:
+        end_s = self._now() + seconds
+        while self._now() < end_s:
+            yield
+
+    def _system_command(self, line: str) -> Generator[None, None, None]:
+        idle = self._mode == "Alarm" or not self.axis.pending
+        if line == "$G":
+            modes = " ".join((self._modal["motion"], "G54 G17", self._modal["units"], self._modal["distance"], "G94"))
+            self._send(f"[GC:{modes} {self._modal['spindle']} M9 T0 F{self._feed_mm_min:.0f} S{self._s:.0f}]")
+        elif line == "$X":
+            if self._mode == "Alarm":
+                self._mode = "Idle"
+                self._send("[MSG:Caution: Unlocked]")
+        elif not idle:
+            raise GrblError(8)
+        elif line == "$$":
+            for number, value in sorted(self._settings.items()):
+                self._send(f"${number}={value:.3f}" if number in _DECIMALS else f"${number}={value:.0f}")
+        elif line == "$I":
+            self._send(f"[VER:{self._version}.20190825:]")
+            self._send(f"[OPT:{self._options},{_PLANNER_BLOCKS},{_RECEIVE_BYTES + 1}]")
+        elif line == "$":
+            self._send("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]")
+        elif line == "$H":
+            yield from self._home()
+        else:
+            self._change_setting(line)
+
+    def _change_setting(self, line: str) -> None:
+        number, equals, value = line[1:].partition("=")
+        if not equals or not number.isdigit() or int(number) not in self._settings:
+            raise GrblError(3)
+        try:
+            wanted = float(value)
+        except ValueError:
+            raise GrblError(2) from None
+        if wanted < 0:
+            raise GrblError(4)
+        if number == "20" and wanted and not self._settings[22]:
+            raise GrblError(10)
+        self._settings[int(number)] = wanted
+        if number == "22" and not wanted:
+            self._settings[20] = 0
+        self.axis.acceleration = self._settings[120]
+
+    def _home(self) -> Generator[None, None, None]:
+        """Seek the switch, pull off, locate it slowly, pull off; then the position is known."""
+        if not self._settings[22]:
+            raise GrblError(5)
+        self._mode, low, travel = "Home", bool(int(self._settings[23]) & 1), self._settings[130]
+        self._modal["spindle"] = "M5" if self._settings[32] else self._modal["spindle"]
+        pull_off = self._settings[27]
+        switch = 0.0 if low else travel
+        clear = switch + (pull_off if low else -pull_off)
+        if abs(switch - self.shift_mm - self.axis.at(self._now())[0]) > 1.5 * travel:
+            self.raise_alarm(9)
+            return
+        for place_mm, feed in ((switch, 25), (clear, 25), (switch, 24), (clear, 25)):
+            self.axis.add(place_mm - self.shift_mm, speed=self._settings[feed] / 60, time_s=self._now())
+            yield from self._done()
+            yield from self._pause(self._settings[26] / 1000)
+        at_the_switch = pull_off - travel if low else -pull_off
+        counted = 0.0 if "Z" in self._options else at_the_switch
+        self.axis.place(counted)
+        self.shift_mm, self._mode = clear - counted, "Idle"
+
+    def _execute(self, block: Block) -> Generator[None, None, None]:
+        values, modal = block.values, {**self._modal, **block.commands}
+        moves = "X" in values and block.commands.get("once") != "G92"
+        if moves and modal["motion"] == "G80":
+            raise GrblError(31)
+        scale = 25.4 if modal["units"] == "G20" else 1.0
+        feed = values["F"] * scale if "F" in values else self._feed_mm_min
+        if feed == 0 and (modal["motion"] == "G1") and (moves or block.commands.get("motion") == "G1"):
+            raise GrblError(22)
+        self._feed_mm_min = feed
+        if "S" in values or "spindle" in block.commands:
+            yield from self._done()
+            self._s = values.get("S", self._s)
+        for command in ("M2", "M30"):
+            if block.commands.get("stop") == command:
+                modal |= {"motion": "G1", "distance": "G90", "spindle": "M5"}
+        if block.commands.get("motion", self._modal["motion"]) != self._modal["motion"]:
+            yield from self._done()
+        self._modal = {name: modal[name] for name in self._modal}
+        if block.commands.get("once") == "G4":
+            yield from self._done()
+            yield from self._pause(values["P"])
+        elif block.commands.get("once") in ("G92", "G92.1"):
+            yield from self._done()
+            machine = self.axis.at(self._now())[0]
+            self._offset_mm = machine - values["X"] * scale if block.commands["once"] == "G92" else 0.0
+            self._reports_to_offset = 0
+        elif moves:
+            yield from self._move(values["X"] * scale, block.machine_coordinates, feed)
+
+    def _move(self, x: float, machine_coordinates: bool, feed: float) -> Generator[None, None, None]:
+        while self.axis.pending >= _PLANNER_BLOCKS:
+            yield
+        if machine_coordinates:
+            target = x
+        elif self._modal["distance"] == "G91":
+            target = self.axis.planned_mm + x
+        else:
+            target = x + self._offset_mm
+        if self._settings[20] and not self._within_travel(target):
+            yield from self._done()
+            self.raise_alarm(2)
+            return
+        fastest = self._settings[110] if self._modal["motion"] == "G0" else min(feed, self._settings[110])
+        target = round(target * self._settings[100]) / self._settings[100]
+        if self.short_steps:
+            way = target - self.axis.planned_mm
+            target -= (1 if way > 0 else -1) * self.short_steps / self._settings[100]
+            self.short_steps = 0
+        self.axis.add(target, speed=fastest / 60, time_s=self._now())
+
+    def _within_travel(self, target: float) -> bool:
+        travel = self._settings[130]
+        if "Z" in self._options and int(self._settings[23]) & 1:
+            return 0 <= target <= travel
+        return -travel <= target <= 0

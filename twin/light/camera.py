@@ -1,0 +1,319 @@
+"""The camera's rays: lens and pupil, distortion, the window's glass faces, mirrors, and ray segments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.arrays import (
+    Bool,
+    Float,
+    Point2f,
+    Point3f,
+    SurfaceInteraction3f,
+    Vector3f,
+    scalar_transform,
+    to_jit,
+    to_numpy,
+)
+from twin.light.pose import SensorPose
+from twin.scene.objects import Objects
+from uwlts.model.errors import DesignError
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Camera, Medium, Sensor, Window
+
+STEP_MM = 1e-3
+"""How far along its direction a refracted ray starts; far above the spacing of 32-bit floats at 1 m (6e-5 mm)."""
+
+
+def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Right-handed rotation (3, 3) with columns x, y, z where z = ``axis`` and x is ``across`` made square to it."""
+    z = axis / np.linalg.norm(axis)
+    x = across - (across @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@dataclass(frozen=True)
+class LightPath:
+    """Rays in the medium behind a window: origin, unit direction, weight, and whether they got there."""
+
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
+    valid: Bool
+
+
+class WindowFaces:
+    """Both faces of a window. Rays meet them in a known order, so each is asked alone, without a scene around it.
+
+    Parameters
+    ----------
+    window
+        Description of the window; unmounted it lets rays pass unchanged.
+    origin_mm, rotation
+        Module frame in the camera frame: its origin (3,) and rotation (3, 3); the third column is the module's axis.
+    """
+
+    def __init__(
+        self, window: Window, medium: Medium, *, wavelength_nm: float, origin_mm: np.ndarray, rotation: np.ndarray
+    ):
+        index = medium.refractive_index(wavelength_nm)
+        self.mounted = window.mounted
+        if not window.mounted:
+            if medium.kind != "air":
+                raise DesignError("a window is left out although the sensor is in water: mount it or measure in air")
+            return
+        glass = window.index(wavelength_nm)
+        self._absorption = window.absorption_per_mm()
+        normal = rotation @ window.normal()
+        inner = origin_mm + window.distance_mm * rotation[:, 2]
+        outer = inner + window.thickness_mm * normal
+        self._faces = []
+        for centre, outside, inside in ((inner, 1.0, glass), (outer, glass, index)):
+            to_world = np.eye(4)
+            to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (
+                window.aperture_diameter_mm / 2,
+                window.aperture_diameter_mm / 2,
+                1,
+            )
+            to_world[:3, 3] = centre
+            bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
+            self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
+
+    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> LightPath:
+        """Send rays from the module's side through both faces.
+
+        ``mode`` is Radiance for rays traced backwards from the camera (weights carry 1 / n^2) and Importance for light
+        sent forwards from the laser.
+        """
+        width = dr.width(direction)
+        weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
+        if not self.mounted:
+            return LightPath(origin, direction, weight, valid)
+        context = mi.BSDFContext(mode)
+        context.component = 1
+        ray = mi.Ray3f(origin, direction)
+        for face in self._faces:
+            si = face.ray_intersect(ray, active=valid)
+            valid &= si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0)
+            sample, transmitted = face.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
+            weight *= dr.select(valid, transmitted[0], 0.0)
+            if face is self._faces[1] and self._absorption > 0:
+                weight *= dr.exp(-self._absorption * (si.t + STEP_MM))
+            onward = si.to_world(sample.wo)
+            ray = mi.Ray3f(si.p + onward * STEP_MM, onward)
+        return LightPath(ray.o, ray.d, weight, valid & (weight > 0))
+
+
+_NEWTON_STEPS = 6
+"""Lead to the rounding of 32 bits for the distortion of real lenses."""
+
+
+_FIELD = 0.96
+"""Blur is measured in the image's middle and at this share of the way to its edges and corners."""
+
+
+_RIM_POINTS = 8
+"""Rays through the pupil's rim; the blur's largest radius changes little from one to the next."""
+
+
+_DEPTHS = 200
+"""Depths of the blur's table, evenly spread on a logarithmic scale from 1 mm to 10 m behind the window."""
+
+
+_CLEAR_MM = 1e-2
+"""Reflected rays start this far from the mirror."""
+
+
+@dataclass(frozen=True)
+class LensRays:
+    """Ray generator of a camera; the entrance pupil is a disc about the origin of the camera frame, square to z."""
+
+    camera: Camera
+
+    def pupil_radius_mm(self) -> float:
+        """Radius of the entrance pupil, D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant)."""
+        return 0.5 * self.camera.focal_length_mm / self._working_f_number()
+
+    def through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
+        """Origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
+
+        ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens).
+        """
+        origin = self.pupil_radius_mm() * mi.Point3f(pupil.x, pupil.y, 0.0)
+        focused = chief * (self.camera.focus_distance_mm / chief.z)
+        return origin, dr.normalize(mi.Vector3f(focused - origin))
+
+    def directions(self, x: Float, y: Float) -> Vector3f:
+        """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
+        focal = self.camera.focal_length_px()
+        cx, cy = self.camera.principal_point()
+        seen = mi.Point2f((x - cx) / focal, (y - cy) / focal)
+        true = self._undistorted(seen)
+        return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
+
+    def _undistorted(self, seen: Point2f) -> Point2f:
+        """Invert x_d = x (1 + k1 r2 + k2 r4 + k3 r6) + 2 p1 x y + p2 (r2 + 2 x2) (Brown 1971) by Newton's method."""
+        d = self.camera.distortion
+        if not any((d.k1, d.k2, d.p1, d.p2, d.k3)):
+            return seen
+        point = mi.Point2f(seen)
+        for _ in range(_NEWTON_STEPS):
+            x, y = point.x, point.y
+            r2 = x * x + y * y
+            radial = 1 + r2 * (d.k1 + r2 * (d.k2 + r2 * d.k3))
+            slope = 2 * (d.k1 + r2 * (2 * d.k2 + r2 * 3 * d.k3))
+            off_x = x * radial + 2 * d.p1 * x * y + d.p2 * (r2 + 2 * x * x) - seen.x
+            off_y = y * radial + 2 * d.p2 * x * y + d.p1 * (r2 + 2 * y * y) - seen.y
+            xx = radial + slope * x * x + 2 * d.p1 * y + 6 * d.p2 * x
+            xy = slope * x * y + 2 * d.p1 * x + 2 * d.p2 * y
+            yy = radial + slope * y * y + 2 * d.p2 * x + 6 * d.p1 * y
+            determinant = xx * yy - xy * xy
+            point = mi.Point2f(x - (yy * off_x - xy * off_y) / determinant, y - (xx * off_y - xy * off_x) / determinant)
+        return point
+
+    def irradiance_on_axis(self) -> float:
+        """Irradiance on the image sensor per radiance at the pupil, in sr, on the axis; off it cos^4 comes on top.
+
+        E = L (pi / 4) / (N (1 + m))^2 with the magnification m at the focus distance (Smith, Modern Optical
+        Engineering, 4th ed., Eqs. 8.7 and 8.10).
+        """
+        return math.pi / 4 / self._working_f_number() ** 2
+
+    def _working_f_number(self) -> float:
+        focal = self.camera.focal_length_mm
+        return self.camera.f_number * (1 + focal / (self.camera.focus_distance_mm - focal))
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Camera rays in the medium, in the sensor's OCS: origins, unit directions, and sensor irradiance per radiance."""
+
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
+
+
+class View:
+    """Lens and window of a sensor in a medium."""
+
+    def __init__(self, sensor: Sensor, medium: Medium):
+        self.camera = sensor.camera
+        self.lens = LensRays(sensor.camera)
+        self._faces = WindowFaces(
+            sensor.camera.window,
+            medium,
+            wavelength_nm=sensor.laser.wavelength_nm,
+            origin_mm=np.zeros(3),
+            rotation=np.eye(3),
+        )
+        self._camera_from_object = camera_from_object(sensor)
+        self._to_object = np.linalg.inv(self._camera_from_object)
+        self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
+        self._blur: tuple[np.ndarray, np.ndarray] | None = None
+
+    def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Bundle:
+        """Rays behind the window of image points; pixel (0, 0) is the centre of the first pixel.
+
+        ``pupil`` holds points of the unit disc; without them chief rays through the pupil's centre are returned.
+        """
+        chief = self.lens.directions(x, y)
+        origin, direction = (mi.Point3f(0.0), chief) if pupil is None else self.lens.through_pupil(chief, pupil)
+        path = self._faces.through(origin, direction, mode=mi.TransportMode.Radiance)
+        transform = mi.Transform4f(mi.Matrix4f(self._to_object))
+        cosine = dr.square(dr.square(chief.z))
+        weight = dr.select(path.valid, path.weight * cosine * self.lens.irradiance_on_axis(), 0.0)
+        return Bundle(transform @ path.origin, transform @ path.direction, weight)
+
+    def grid(self, spacing: int) -> tuple[Bundle, tuple[int, int]]:
+        """Chief rays of nodes at pixel corners every ``spacing`` pixels, and the grid's shape (rows, columns)."""
+        if spacing not in self._grids:
+            columns, rows = -(-self.camera.width_px // spacing) + 1, -(-self.camera.height_px // spacing) + 1
+            x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
+            bundle = self.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+            dr.eval(bundle.origin, bundle.direction, bundle.weight)
+            self._grids[spacing] = bundle, (rows, columns)
+        return self._grids[spacing]
+
+    def depth_mm(self, p: Point3f) -> Float:
+        """Depth z in the camera frame of points of the OCS."""
+        row = self._camera_from_object[2]
+        return p.x * float(row[0]) + p.y * float(row[1]) + p.z * float(row[2]) + float(row[3])
+
+    def blur_radius_px(self, depth_mm: np.ndarray) -> np.ndarray:
+        """Largest distance in the image between a point's chief ray and its other rays, for depths of any shape.
+
+        Rays through the pupil's rim and chief rays of neighbouring pixels are followed through the window to every
+        depth; the largest blur anywhere in the image counts.
+        """
+        if self._blur is None:
+            self._blur = self._blur_table()
+        return np.interp(depth_mm, *self._blur)
+
+    def _blur_table(self) -> tuple[np.ndarray, np.ndarray]:
+        camera = self.camera
+        field = _FIELD * np.array([(i, j) for i in (-0.5, 0.0, 0.5) for j in (-0.5, 0.0, 0.5)])
+        middle = np.array([camera.width_px - 1, camera.height_px - 1]) / 2
+        image = field * (camera.width_px, camera.height_px) + middle
+        angle = 2 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
+        rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        # Per field point: the chief ray, its neighbours in x and y, then the rays through the rim.
+        shift = np.concatenate([[(0, 0), (1, 0), (0, 1)], np.zeros((_RIM_POINTS, 2))])
+        pupil = np.concatenate([np.zeros((3, 2)), rim])
+        at = (image[:, None] + shift).reshape(-1, 2)
+        through = np.tile(pupil, (len(image), 1))
+        x, y, pupil_x, pupil_y = (to_jit(mi.Float, values) for values in (*at.T, *through.T))
+        bundle = self.bundle(x, y, mi.Point2f(pupil_x, pupil_y))
+        dr.eval(bundle.origin, bundle.direction, bundle.weight)
+        transform = self._camera_from_object
+        o = to_numpy(bundle.origin).astype(float) @ transform[:3, :3].T + transform[:3, 3]
+        d = to_numpy(bundle.direction).astype(float) @ transform[:3, :3].T
+        o[bundle.weight.numpy() <= 0] = np.nan
+        near = np.nanmax(o[:, 2])
+        depths = near + np.geomspace(1.0, 1e4, _DEPTHS)
+        hits = o[:, None, :2] + d[:, None, :2] / d[:, None, 2:] * (depths[:, None] - o[:, None, 2:])
+        hits = hits.reshape(len(image), -1, _DEPTHS, 2)
+        jacobian = np.moveaxis(hits[:, 1:3] - hits[:, :1], 1, -1)
+        offset = np.linalg.solve(jacobian[:, None], (hits[:, 3:] - hits[:, :1])[..., None])[..., 0]
+        return depths, np.nanmax(np.linalg.norm(offset, axis=-1), axis=(0, 1))
+
+
+@dataclass(frozen=True)
+class RaySegment:
+    """A segment of camera rays in the OCS up to a surface, with the weight and length in mm of the path before it."""
+
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
+    length_before: Float
+    si: SurfaceInteraction3f
+    valid: Bool
+
+    def end(self) -> Point3f:
+        """Where the segment ends, in the OCS."""
+        return mi.Point3f(self.origin + self.direction * dr.select(self.valid, self.si.t, 1.0))
+
+
+def ray_segments(
+    objects: Objects, extinction: float, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, *, mirrors: int
+) -> Iterator[RaySegment]:
+    """The first segment of camera rays, then one for each of up to ``mirrors`` mirrors that they meet in turn."""
+    o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)
+    for met in range(mirrors + 1):
+        si = objects.scene.ray_intersect(pose.ray(o, d, travel_mm), weight > 0)
+        valid = si.is_valid() & (weight > 0)
+        yield RaySegment(o, d, weight, length_before, si, valid)
+        if met < mirrors:
+            front = valid & (si.wi.z > 0)
+            length = dr.select(valid, si.t, 0.0)
+            weight = weight * dr.select(front, objects.mirror_share(si), 0.0) * dr.exp(-extinction * length)
+            length_before = length_before + length
+            d_reflected = pose.object_direction(si.to_world(mi.reflect(si.wi)))
+            o = mi.Point3f(o + d * length + d_reflected * _CLEAR_MM)
+            d = dr.select(front, d_reflected, d)

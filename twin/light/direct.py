@@ -1,0 +1,164 @@
+"""A sheet as it lights points before the sensor: directly, from another laser, or after a mirror."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque_transform
+from twin.light.pose import SensorPose
+from twin.light.sheet import Sheet, SheetLight, SheetRays
+from twin.scene.objects import MirrorFace
+
+_CLEAR_MM = 1e-2
+"""Rays towards the laser start this far from the surface they leave."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A laser's sheet and where its own OCS stands in the sensor's: ``own_from_object`` (4, 4), None if they agree."""
+
+    sheet: Sheet
+    own_from_object: np.ndarray | None = None
+
+
+class Light:
+    """A source before a posed scene, directly or by way of one mirror face."""
+
+    def __init__(self, source: Source, pose: SensorPose, mirror: MirrorFace | None = None):
+        self.sheet, self._pose, self._mirror = source.sheet, pose, mirror
+        own = source.own_from_object
+        if mirror is not None:
+            object_from_face = np.linalg.inv(pose.scene_from_object) @ mirror.pose
+            reflection = object_from_face @ np.diag([1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(object_from_face)
+            self._reflection = opaque_transform(reflection)
+            self._to_face = opaque_transform(np.linalg.inv(object_from_face))
+            self._from_face = opaque_transform(object_from_face)
+            self._half = mi.Vector2f(*(dr.opaque(mi.Float, float(h)) for h in mirror.half_size_mm))
+            self._share = dr.opaque(mi.Float, mirror.share)
+        self._to_own = None if own is None else opaque_transform(own)
+        self._from_own = None if own is None else opaque_transform(np.linalg.inv(own))
+
+    def in_own_frame(self, origin: Point3f, direction: Vector3f) -> tuple[Point3f, Vector3f]:
+        """A ray of the sensor's OCS in the sheet's own, where the nominal sheet is X = 0."""
+        if self._mirror is not None:
+            origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ mi.Vector3f(direction)
+        if self._to_own is None:
+            return origin, direction
+        return self._to_own @ mi.Point3f(origin), self._to_own @ mi.Vector3f(direction)
+
+    def at(self, p: Point3f, travel_mm: Float | None = None) -> SheetLight:
+        """The sheet's light at points of the sensor's OCS, shadows aside; nothing where the mirror does not send it."""
+        if self._mirror is None:
+            return self._unfolded(p)
+        p = self._at_rest(p, travel_mm)
+        light = self._unfolded(self._reflection @ p, travel_mm)
+        light = replace(light, direction=self._reflection @ light.direction, normal=self._reflection @ light.normal)
+        _, meets = self._on_mirror(p, -light.direction)
+        return replace(light, irradiance=dr.select(meets, light.irradiance * self._share, 0.0))
+
+    def _unfolded(self, p: Point3f, travel_mm: Float | None = None) -> SheetLight:
+        """The sheet's light at points of the OCS, given where they stand while the sensor rests."""
+        if travel_mm is not None:
+            p = mi.Point3f(p - self._pose.object_travel(travel_mm))
+        if self._to_own is None:
+            return self.sheet.at(p)
+        light = self.sheet.at(self._to_own @ mi.Point3f(p))
+        return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
+
+    def _at_rest(self, p: Point3f, travel_mm: Float | None) -> Point3f:
+        """Where points of the travelling OCS, in which a mirror moves, lie in that of the resting sensor."""
+        return mi.Point3f(p if travel_mm is None else p + self._pose.object_travel(travel_mm))
+
+    def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
+        """Where the sheet may shine: everywhere, but by way of a mirror only where that sends it."""
+        if self._mirror is None:
+            return dr.full(mi.Bool, True, dr.width(p))
+        return self._on_mirror(p, -light.direction)[1]
+
+    def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, travel_mm: Float | None, active: Bool):
+        """Whether nothing stands between points of the sensor's OCS and the laser's window."""
+        towards = -light.direction
+        if self._mirror is None:
+            return active & ~self._blocked(objects, p, towards, light.exit_mm, travel_mm, active)
+        t, meets = self._on_mirror(self._at_rest(p, travel_mm), towards)
+        active = active & meets & ~self._blocked(objects, p, towards, t, travel_mm, active & meets)
+        folded = self._to_face @ towards
+        folded.z = -folded.z
+        onward = self._from_face @ folded
+        turn = mi.Point3f(p + towards * t)
+        return active & ~self._blocked(objects, turn, onward, light.exit_mm - t, travel_mm, active)
+
+    def _on_mirror(self, p: Point3f, direction: Vector3f) -> tuple[Float, Bool]:
+        """How far rays run to the mirror's face, and whether they meet its front."""
+        start, along = self._to_face @ mi.Point3f(p), self._to_face @ direction
+        t = -start.z / along.z
+        inside = (dr.abs(start.x + t * along.x) <= self._half.x) & (dr.abs(start.y + t * along.y) <= self._half.y)
+        return t, (start.z > 0) & (along.z < 0) & inside
+
+    def _blocked(
+        self, objects: mi.Scene, p: Point3f, towards: Vector3f, length: Float, travel_mm: Float | None, active: Bool
+    ) -> Bool:
+        ray = self._pose.ray(p + towards * _CLEAR_MM, towards, travel_mm)
+        ray.maxt = length - 2 * _CLEAR_MM
+        return objects.ray_test(ray, active & (length > 2 * _CLEAR_MM))
+
+    def rays(self, u: Point3f) -> SheetRays:
+        """Rays of a direct light in the sensor's OCS, drawn in proportion to its power."""
+        rays = self.sheet.sample(u)
+        if self._from_own is None:
+            return rays
+        return SheetRays(self._from_own @ mi.Point3f(rays.origin), self._from_own @ rays.direction)
+
+    def crossing(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
+        """Where rays of the sheet's own OCS cross its middle: how far along, and the light there in its own OCS."""
+        t = -origin.x / direction.x
+        light = self.sheet.at(mi.Point3f(origin + direction * t))
+        t -= light.distance_mm / dr.dot(direction, light.normal)
+        light = self.sheet.at(mi.Point3f(origin + direction * t))
+        if self._mirror is not None:
+            light = replace(light, irradiance=light.irradiance * self._share)
+        return t, light
+
+    def _middle_near(self, o: Point3f, d: Vector3f, t: Float) -> tuple[SheetLight, Float, Float]:
+        """The light at ``t`` on rays of the sheet's own OCS, the slope of its distance, and the middle found by it."""
+        light = self.sheet.at(mi.Point3f(o + d * t))
+        slope = _away_from_zero(dr.dot(d, light.normal))
+        return light, slope, t - light.distance_mm / slope
+
+    def pick_in_sheet(self, origin: Point3f, direction: Vector3f, length: Float, u: Float) -> tuple[Float, Float]:
+        """A place on rays of the sensor's OCS, drawn like the sheet's Gaussian across them, and its density in 1/mm.
+
+        The density is 0 where a ray up to ``length`` keeps clear of the sheet. It only steers samples: whoever uses it
+        evaluates the true light there.
+        """
+        o, d = self.in_own_frame(origin, direction)
+        back = (self.sheet.begins_at_z_mm - o.z) / d.z
+        length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
+        t = dr.clip(-o.x / _away_from_zero(d.x), 0.0, length)
+        _, _, middle = self._middle_near(o, d, t)
+        light, slope, middle = self._middle_near(o, d, dr.clip(middle, 0.0, length))
+        spread = 1.1 * math.sqrt(2) * light.sigma_mm / dr.abs(slope)
+        low, high = dr.erf(-middle / spread), dr.erf((length - middle) / spread)
+        x = dr.clip((middle + spread * dr.erfinv(dr.lerp(low, high, u))), 0.0, length)
+        share = 0.5 * (high - low)
+        density = dr.exp(-dr.square((x - middle) / spread)) / (math.sqrt(math.pi) * spread * share)
+        return x, dr.select((share > 1e-5) & dr.isfinite(density), density, 0.0)
+
+
+def lights(
+    sources: Iterable[Source], pose: SensorPose, mirrors: Iterable[MirrorFace] = ()
+) -> tuple[list[Light], list[Light]]:
+    """The sources directly, and by way of each mirror face."""
+    direct = [Light(source, pose) for source in sources]
+    return direct, [Light(source, pose, mirror) for source in sources for mirror in mirrors]
+
+
+def _away_from_zero(x: Float) -> Float:
+    """Slopes whose size is at least 1e-4, so that they can be divided by."""
+    return dr.select(dr.abs(x) < 1e-4, dr.mulsign(mi.Float(1e-4), x), x)

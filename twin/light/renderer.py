@@ -1,0 +1,408 @@
+"""Renders what reaches the image sensor: laser and lamp images as irradiance, only where there is light.
+
+A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
+the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure; random walks
+add the light that came on longer ways, which is smooth: cell by cell within the stripe's pixels, in large cells
+elsewhere. The windows stand still before the camera, so the nodes' rays behind the window are traced once; the objects
+stand still in the scene, so nothing is rebuilt or recompiled between frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.arrays import Float, UInt32, to_jit
+from twin.light.camera import Bundle, RaySegment, View, ray_segments
+from twin.light.direct import Light, Source, lights
+from twin.light.image_sampling import (
+    NODE_SPACING_PX,
+    any_corner,
+    corner_extremes,
+    corner_mean,
+    lattice,
+    near_sheet,
+    pupil_shifts,
+    widened,
+)
+from twin.light.pose import SensorPose, Travel
+from twin.light.sheet import Sheet
+from twin.light.walk import Walker
+from twin.light.water import Scattering, single_scattering
+from twin.options import ALL, Effects
+from twin.scene.description import Scene
+from twin.scene.objects import build_objects
+from uwlts.model.placement import camera_from_object, check_design
+from uwlts.model.sensor import Laser, Medium, Sensor
+
+WALK_CELL_PX = 8
+"""Side of the cells of multiply scattered light away from the stripe."""
+SAMPLES_AT_ONCE = 2**23
+"""More samples are rendered one part after the other; this many take some 100 MB."""
+WALKS_AT_ONCE = 2**21
+"""The same for random walks, which take some 200 MB."""
+CHANGE_SHARE = 2e-3
+"""Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
+_MIRRORS = 2
+"""How many mirrors the camera looks into one after the other."""
+_WALKS_PER_SAMPLE = 0.15
+"""Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
+_TRAVEL_STEP_MM = 0.2
+"""While the sensor travels, the lit pixels are looked for at places this far apart."""
+
+
+@dataclass(frozen=True)
+class LaserFrame:
+    """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
+
+    ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light that came straight from the lit
+    surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
+    """
+
+    scattered: np.ndarray
+    rows: np.ndarray
+    columns: np.ndarray
+    stripe: np.ndarray
+    polarisation: np.ndarray
+    roughness_um: np.ndarray
+
+    def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
+        """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
+        image = self.scattered.copy()
+        image[self.rows, self.columns] += self.stripe * factors
+        return image
+
+
+class Renderer:
+    """One sensor in one medium before one scene.
+
+    Raises
+    ------
+    DesignError, DescriptionError
+        The sensor cannot work in the medium, or an object cannot be built.
+    """
+
+    def __init__(self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL):
+        self.design = check_design(sensor, medium)
+        self.sensor, self.medium, self.effects = sensor, medium, effects
+        wavelength = sensor.laser.wavelength_nm
+        self.objects = build_objects(
+            scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
+        )
+        self.view = View(sensor, medium)
+        self.scattering = Scattering(medium, wavelength)
+        self.sheet = Sheet(sensor, medium)
+        self._sources = [Source(self.sheet), *(_further(sensor, laser, medium) for laser in sensor.more_lasers)]
+        self._mirrors = self.objects.mirrors if effects.secondary_light else ()
+        # Through the water to the stand-off and back, light is scattered so many times.
+        scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
+        self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 8 * scatterings)
+        self._reach_mm = 4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3]))
+
+    def irradiance(
+        self,
+        light: Literal["lamp", "laser"],
+        scene_from_object: np.ndarray,
+        *,
+        spp: int,
+        seed: int = 0,
+        travel: Travel | None = None,
+    ) -> np.ndarray:
+        """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
+
+        ``spp`` samples are taken per lit pixel, the same places in every pixel; ``seed`` chooses the random walks.
+        Equal arguments give equal images.
+        """
+        if light == "laser":
+            return self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
+        return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp)
+
+    def daylight(self, scene_from_object: np.ndarray, *, spp: int) -> np.ndarray:
+        """What falls on the image sensor with laser and lamp off, (H, W) in W/mm2, as `irradiance`."""
+        return self._lamp_frame(SensorPose(scene_from_object), spp=spp, ambient=True)
+
+    def laser_frame(
+        self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
+    ) -> LaserFrame:
+        """The light of the laser, and of the day if there is any, on the image sensor; see `irradiance`."""
+        pose = SensorPose(scene_from_object, travel)
+        direct, mirrored = lights(self._sources, pose, self._mirrors)
+        lit, image = self._laser_nodes(pose, direct, mirrored)
+        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
+        self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
+        if self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0:
+            image += self._lamp_frame(pose, spp=spp, ambient=True)
+        rows, columns = self._pixels_of(lit)
+        facts = [
+            self._fine(self._stripe_sums, pose, r, c, direct + mirrored, spp=spp)
+            for r, c in _parts(rows, columns, spp=spp)
+        ]
+        stripe, polarised, rough = np.concatenate([np.zeros((3, 0), np.float32), *facts], axis=1)
+        bright = np.maximum(stripe, np.finfo(np.float32).tiny)
+        return LaserFrame(image, rows, columns, stripe, np.clip(polarised / bright, 0, 1), rough / bright)
+
+    def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
+        bundle, shape = self.view.grid(NODE_SPACING_PX)
+        direct, _ = lights(self._sources[:1], pose)
+        near = [
+            near_sheet(self._sigmas(light, next(self._segments(moment, bundle, None))).numpy().reshape(shape))
+            for moment, (light, *_) in self._moments(pose, direct)
+        ]
+        return self._pixels_of(np.any(near, axis=0))
+
+    def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None = None) -> Float:
+        """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
+        direct, _ = lights(self._sources[:1], pose)
+        segment = next(self._segments(pose, bundle, travel_mm))
+        return segment.weight * self._radiance(pose, segment, direct, travel_mm)
+
+    # --- the lit surface ----------------------------------------------------------------------------------------------
+
+    def _segments(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None) -> Iterator[RaySegment]:
+        mirrors = _MIRRORS if self._mirrors else 0
+        return ray_segments(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
+
+    def _sigmas(self, light: Light, segment: RaySegment) -> Float:
+        """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
+        here = light.at(segment.end())
+        return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
+
+    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], travel_mm: Float | None) -> Float:
+        """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
+        radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
+        for light in sources:
+            here = light.at(end, travel_mm)
+            lit = light.reaches(self.objects.scene, end, here, travel_mm, segment.valid & (here.irradiance > 0))
+            towards = segment.si.to_local(pose.direction(-here.direction))
+            radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
+        return radiance * dr.exp(-self.scattering.extinction * dr.select(segment.valid, segment.si.t, 0.0))
+
+    # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
+
+    def _laser_nodes(
+        self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Cells (rows, columns) close to the lit stripe, and the haze (H, W) in W/mm2."""
+        bundle, shape = self.view.grid(NODE_SPACING_PX)
+        lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
+        reach = np.zeros_like(lit, np.float32)
+        image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        for moment, sources in self._moments(pose, direct + mirrored):
+            haze = mi.Float(0.0)
+            for index, segment in enumerate(self._segments(moment, bundle, None)):
+                across = [self._sigmas(light, segment) for light in sources]
+                straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
+                depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
+                if index == 0 and moment is pose and self.effects.haze and self.scattering.coefficient > 0:
+                    for light, sigmas in zip(sources, across, strict=True):
+                        haze += bundle.weight * self._haze(light, segment, sigmas)
+                reached = [light.may_reach(segment.end(), light.at(segment.end())) for light in sources]
+                dr.eval(depth, haze, *across, *reached)
+                near = np.zeros_like(lit)
+                for sigmas, there in zip(across, reached, strict=True):
+                    near |= near_sheet(sigmas.numpy().reshape(shape)) & any_corner(there.numpy().reshape(shape))
+                if self.effects.defocus and near.any():
+                    blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
+                    reach = np.maximum(reach, np.where(near, corner_extremes(blur)[1], 0))
+                lit |= near
+            if moment is pose:
+                image = self._spread(haze, shape)
+        return widened(lit, reach), image
+
+    def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
+        """The pose, and more of them over the exposure if the sensor travels, with the lights there."""
+        yield pose, sources
+        if pose.travel is not None:
+            first, last = pose.travel.ends(self.sensor.camera.height_px)
+            for travel_mm in np.linspace(first, last, 2 + int((last - first) / _TRAVEL_STEP_MM)):
+                moved = pose.moved(float(travel_mm))
+                direct, mirrored = lights(self._sources, moved, self._mirrors)
+                yield moved, direct + mirrored
+
+    def _haze(self, light: Light, segment: RaySegment, sigmas: Float) -> Float:
+        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
+
+        ``sigmas`` is the sheet's distance where the rays end on a surface, in standard deviations.
+        """
+        origin, direction = light.in_own_frame(segment.origin, segment.direction)
+        t, here = light.crossing(origin, direction)
+        end = dr.select(segment.valid, sigmas * dr.sign(dr.dot(direction, here.normal)), dr.inf)
+        scattered = single_scattering(self.scattering, here, direction=direction, surface_sigmas=end)
+        # A surface just before the sheet's middle cuts the sheet's light, but does not shadow what lies before it.
+        place = mi.Point3f(
+            segment.origin + segment.direction * dr.minimum(t, dr.select(segment.valid, segment.si.t, dr.inf))
+        )
+        reached = light.reaches(self.objects.scene, place, light.at(place), None, (t > 0) & (scattered > 0))
+        return dr.select(reached, scattered * dr.exp(-self.scattering.extinction * t), 0.0)
+
+    # --- light on longer ways -----------------------------------------------------------------------------------------
+
+    def _add_walks(self, image: np.ndarray, lit: np.ndarray, walker: Walker, *, seed: int, walks: int) -> None:
+        """Add multiply scattered and secondary light to an image (H, W), in large cells but for those in ``lit``."""
+        camera = self.sensor.camera
+        rows, columns = -(-camera.height_px // WALK_CELL_PX), -(-camera.width_px // WALK_CELL_PX)
+        row, column = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+        large = self._walked(walker, row, column, WALK_CELL_PX, seed=2 * seed, walks=walks).reshape(rows, columns)
+        size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
+        smooth = cv2.resize(large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
+        row, column = np.nonzero(lit)
+        if len(row):
+            small = np.zeros(lit.shape, np.float32)
+            small[row, column] = self._walked(walker, row, column, NODE_SPACING_PX, seed=2 * seed + 1, walks=4 * walks)
+            smooth = np.where(self._repeated(lit), self._repeated(small), smooth)
+        image += smooth
+
+    def _walked(
+        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, size_px: int, *, seed: int, walks: int
+    ) -> np.ndarray:
+        """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
+        x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
+        total = np.zeros(len(rows))
+        most = max(1, WALKS_AT_ONCE // len(rows))
+        for part, first in enumerate(range(0, walks, most)):
+            some = min(most, walks - first)
+            count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
+            cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
+            u, v = (_random(count, (place_seed + k) % 2**32) for k in (0, 1))
+            column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
+            bundle = self.view.bundle(column + u * size_px - 0.5, row + v * size_px - 0.5)
+            total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
+        return total / walks
+
+    # --- lamp ---------------------------------------------------------------------------------------------------------
+
+    def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
+        """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
+        bundle, shape = self.view.grid(1)
+        value = self._evenly_lit(pose, bundle, None, ambient=ambient)
+        segment = next(self._segments(pose, bundle, None))
+        depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
+        dr.eval(value, depth)
+        nodes = value.numpy().reshape(shape)
+        low, high = corner_extremes(nodes)
+        changes = high - low > CHANGE_SHARE * nodes.max()
+        if self.effects.defocus:
+            blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
+            changes = widened(changes, corner_extremes(blur)[1], cell_px=1)
+        if pose.travel is not None:
+            changes[:] = True  # what moves by may change any pixel
+        image = corner_mean(nodes)
+        for rows, columns in _parts(*np.nonzero(changes), spp=spp):
+            fine = self._fine(self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp, shifted=True)
+            image[rows, columns] = fine[0]
+        return image
+
+    def _evenly_lit_sums(
+        self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, ambient: bool
+    ) -> tuple[Float]:
+        return (self._evenly_lit(pose, bundle, travel_mm, ambient=ambient),)
+
+    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, *, ambient: bool) -> Float:
+        """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
+
+        A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
+        water scatters the same radiance E / pi into every ray; the lamp shines from the sensor's side, and only what
+        is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
+        extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
+        """
+        segment = next(self._segments(pose, bundle, travel_mm))
+        lamp = self.sensor.lamp
+        level = 1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2)
+        left = dr.exp(-self.scattering.extinction * dr.select(segment.valid, segment.si.t, dr.inf))
+        radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
+        if self.effects.haze and self.scattering.coefficient > 0:
+            scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
+            radiance += scattered / self.scattering.extinction * (1 - left)
+        return segment.weight * level * radiance
+
+    # --- pixels -------------------------------------------------------------------------------------------------------
+
+    def _stripe_sums(
+        self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, sources: list[Light]
+    ) -> tuple[Float, Float, Float]:
+        """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
+        total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
+        for segment in self._segments(pose, bundle, travel_mm):
+            value = segment.weight * self._radiance(pose, segment, sources, travel_mm)
+            total += value
+            polarised += value * self.objects.polarisation(segment.si)
+            rough += value * self.objects.roughness_um(segment.si)
+        return total, polarised, rough
+
+    def _fine(
+        self,
+        light: Callable[..., tuple[Float, ...]],
+        pose: SensorPose,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        *rest: object,
+        spp: int,
+        shifted: bool = False,
+    ) -> np.ndarray:
+        """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray.
+
+        ``shifted`` takes other places on the pupil in neighbouring pixels, so that a blurred edge shows no steps.
+        """
+        x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
+        index = dr.arange(mi.UInt32, len(rows) * spp)
+        pixel, sample = index // spp, index % spp
+        axes = 2 + 2 * self.effects.defocus + (pose.travel is not None)
+        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp, axes)]
+        row = dr.gather(mi.Float, y, pixel)
+        pupil = None
+        if self.effects.defocus:
+            u, v = places[2:4]
+            if shifted:
+                shift_u, shift_v = (to_jit(mi.Float, axis) for axis in pupil_shifts(rows, columns))
+                u, v = u + dr.gather(mi.Float, shift_u, pixel), v + dr.gather(mi.Float, shift_v, pixel)
+                u, v = u - dr.floor(u), v - dr.floor(v)
+            pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
+        travel_mm = None if pose.travel is None else pose.travel.at(row, places[-1])
+        bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
+        values = light(pose, bundle, travel_mm, *rest)
+        dr.eval(values)  # together: each sum on its own would trace the rays anew
+        return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
+
+    def _pixels_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of the pixels in the marked grid cells."""
+        rows, columns = np.nonzero(self._repeated(cells))
+        return rows, columns
+
+    def _spread(self, values: Float, shape: tuple[int, int]) -> np.ndarray:
+        """Values of nodes given to the pixels between them, (H, W); zero if they are one number."""
+        if dr.width(values) == 1:
+            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        return self._repeated(corner_mean(values.numpy().reshape(shape)))
+
+    def _repeated(self, cells: np.ndarray) -> np.ndarray:
+        """Values of grid cells given to their pixels, (H, W)."""
+        camera = self.sensor.camera
+        full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
+        return np.ascontiguousarray(full[: camera.height_px, : camera.width_px])
+
+
+def _further(sensor: Sensor, laser: Laser, medium: Medium) -> Source:
+    """Another laser of the sensor, whose sheet has an OCS of its own."""
+    other = sensor.model_copy(update={"laser": laser})
+    return Source(Sheet(other, medium), np.linalg.inv(camera_from_object(other)) @ camera_from_object(sensor))
+
+
+def _random(count: int, seed: int) -> Float:
+    """Numbers from 0 to 1 that depend on their index and the seed."""
+    index, key = cast(UInt32, dr.arange(mi.UInt32, count)), cast(UInt32, dr.opaque(mi.UInt32, seed))
+    return mi.sample_tea_float32(index, key)
+
+
+def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pixels in parts of at most `SAMPLES_AT_ONCE` samples; nothing if there are none."""
+    if len(rows):
+        count = -(-len(rows) * spp // SAMPLES_AT_ONCE)
+        yield from zip(np.array_split(rows, count), np.array_split(columns, count), strict=True)

@@ -1,0 +1,320 @@
+"""The laser sheet in the medium: fan rays traced through the real laser window, then a smooth ruled surface.
+
+Everything is in the sensor's object coordinate system (OCS), in which the nominal sheet is X = 0, Y runs along the
+stripe and Z along the laser's axis. A fan ray is the straight line Y = y0(m) + m Z, X = x0(m) + k(m) Z, with its slope
+m = dY/dZ as the parameter of the surface. A tilted window or a bow curve the surface; across it, along its normal, the
+light is a Gaussian.
+
+The fan's own frame has x along the sheet's normal, y along the fan and z along the laser's axis. A fan ray is named by
+the angle in rad that its projection along x makes with the axis.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import assert_never, cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.polynomial import Chebyshev
+
+from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, to_jit
+from twin.light.camera import WindowFaces, frame_about
+from uwlts.model.errors import DesignError
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Laser, Medium, Sensor
+
+_RAYS = 1025
+"""Fan rays traced through the window; many more than the series have terms."""
+_NODES = 4097
+"""Nodes of the power along the fan: finer than the traced rays."""
+_NEWTON_STEPS = 3
+"""Lead to the rounding of 32 bits, as the start is the ray of a fan without a window."""
+_LARGEST_DEGREE = 27
+"""Degree of the series before their ends are cut; enough for fans that fill their window."""
+_LARGEST_MISS_MM = 1e-3
+"""By how much the series may miss a traced ray 1 m behind the window."""
+_SERIES_MM = 5e-5
+_SERIES_SLOPE = 1e-7
+"""What the terms left out of a series may sum up to: about the roundings of the traced rays."""
+_SMALLEST_SPREAD_MM = 1e-3
+"""Rays closer to where the fan begins are taken as if so far from it."""
+
+
+@dataclass(frozen=True)
+class SheetLight:
+    """The sheet's light at points: signed distance across, width, irradiance in W/mm2 across the ray, its direction.
+
+    ``distance_mm`` and ``sigma_mm`` are measured along ``normal``, the unit normal of the lit surface on the side of X;
+    ``exit_mm`` is the way back to the laser's window.
+    """
+
+    distance_mm: Float
+    sigma_mm: Float
+    irradiance: Float
+    direction: Vector3f
+    normal: Vector3f
+    exit_mm: Float
+
+
+@dataclass(frozen=True)
+class SheetRays:
+    """Rays of the sheet's light in the OCS, each of equal power: where they leave the window, and unit directions."""
+
+    origin: Point3f
+    direction: Vector3f
+
+
+class Sheet:
+    """The lit surface of one sensor's laser in one medium.
+
+    Attributes
+    ----------
+    power_w
+        Power behind the window, before the medium takes any.
+    begins_at_z_mm
+        Smallest Z of the window's outer face in the OCS; there is no light before it.
+
+    Raises
+    ------
+    DesignError
+        A part of the fan does not pass the window, or is bent too much by it.
+    """
+
+    def __init__(self, sensor: Sensor, medium: Medium):
+        laser = sensor.laser
+        self._origin, fan = _traced(sensor, medium)
+        o, d = fan.origin, fan.direction
+        slope, tilt = d[1] / d[2], d[0] / d[2]
+        self._y0 = _series(slope, o[1] - slope * o[2], _SERIES_MM)
+        self._x0 = _series(slope, o[0] - tilt * o[2], _SERIES_MM)
+        self._tilt, self._exit_z = _series(slope, tilt, _SERIES_SLOPE), _series(slope, o[2], _SERIES_MM)
+        self.begins_at_z_mm = float(o[2].min())
+        far = o + 1e3 * d
+        miss = np.hypot(
+            self._y0(slope) + slope * far[2] - far[1], self._x0(slope) + self._tilt(slope) * far[2] - far[0]
+        ).max()
+        if miss > _LARGEST_MISS_MM:
+            raise DesignError(
+                f"the laser's window bends the {laser.fan_angle_deg:g} deg fan so unevenly that its rays are followed "
+                f"to {miss:.3f} mm only, not to {_LARGEST_MISS_MM:g} mm: make the fan narrower or tilt the window less"
+            )
+        self._dy0, self._dx0, self._dtilt = self._y0.deriv(), self._x0.deriv(), self._tilt.deriv()
+        self._power, self.power_w = _power_along(laser, slope, fan)
+        waist = laser.waist_radius_mm
+        index = medium.refractive_index(laser.wavelength_nm)
+        rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
+        self._waist, self._rayleigh, self._waist_at = waist, rayleigh, laser.waist_distance_mm
+        self._extinction = medium.extinction_per_mm(laser.wavelength_nm)
+
+    def at(self, p: Point3f) -> SheetLight:
+        """Light of the sheet at points in the OCS.
+
+        The slope of the fan ray through a point solves y0(m) + m Z = Y (Newton). Between two fan rays flows the power
+        P'(m) dm; across it spreads as a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
+        (Siegman, Lasers, Eqs. 17.5, and 17.6 for zR, with M2), s being the distance from the laser.
+        """
+        m = p.y / (p.z - float(self._origin[2]))
+        low, high = self._y0.domain
+        for _ in range(_NEWTON_STEPS):
+            t = self._normalised(m)
+            m -= (_value(self._y0, t) + m * p.z - p.y) / (_value(self._dy0, t) + p.z)
+            m = dr.clip(m, low - 0.05 * (high - low), high + 0.05 * (high - low))
+        t = self._normalised(m)
+        tilt, normal = _value(self._tilt, t), self._normal(m, t, p.z)
+        distance = (p.x - _value(self._x0, t) - tilt * p.z) * normal.x
+        stretch = dr.sqrt(1 + m * m + tilt * tilt)
+        exit_mm = (p.z - _value(self._exit_z, t)) * stretch
+        away = dr.norm(p - mi.Point3f(self._origin)) - self._waist_at
+        sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
+        gauss = dr.exp(-0.5 * dr.square(distance / sigma)) / (sigma * math.sqrt(2 * math.pi))
+        # A plane Z = const is crossed by P'(m) dm / dY per length along Y, spread along X as the Gaussian is cut there.
+        density = self._power.at(m) / (_value(self._dy0, t) + p.z) * normal.x
+        irradiance = density * gauss * stretch * dr.exp(-self._extinction * exit_mm)
+        direction = mi.Vector3f(tilt, m, 1.0) / stretch
+        return SheetLight(distance, sigma, dr.select(exit_mm > 0, irradiance, 0.0), direction, normal, exit_mm)
+
+    def sample(self, u: Point3f) -> SheetRays:
+        """Rays behind the window, drawn in proportion to power with three numbers from 0 to 1 each.
+
+        ``u.x`` chooses the fan ray, ``u.y`` and ``u.z`` how far beside and how much turned against it: with the
+        standard deviations w0 / 2 at the waist and w0 / (2 zR), independent of each other, straight rays spread by
+        w(s) / 2 at every s.
+        """
+        m = self._power.draw(u.x)
+        t = self._normalised(m)
+        tilt, z = _value(self._tilt, t), _value(self._exit_z, t)
+        stretch = dr.sqrt(1 + m * m + tilt * tilt)
+        along = cast(Vector3f, mi.Vector3f(tilt, m, 1.0))
+        leaves = mi.Point3f(_value(self._x0, t) + tilt * z, _value(self._y0, t) + m * z, z)
+        # Where the ray is as far from the laser as the waist.
+        from_laser = leaves - mi.Point3f(self._origin)
+        ahead = dr.dot(from_laser, along) / stretch
+        to_waist = dr.safe_sqrt(ahead * ahead - dr.squared_norm(from_laser) + self._waist_at**2) - ahead
+        waist_z = z + to_waist / stretch
+        sigma = 0.5 * self._waist / self._normal(m, t, waist_z).x
+        beside, turned = sigma * _standard_normal(u.y), sigma / self._rayleigh * _standard_normal(u.z)
+        leaves.x += beside - turned * to_waist
+        along.x += turned * stretch
+        return SheetRays(leaves, dr.normalize(along))
+
+    def _normalised(self, m: Float) -> Float:
+        offset, scale = self._y0.mapparms()
+        return dr.fma(m, scale, offset)
+
+    def _normal(self, m: Float, t: Float, z: Float) -> Vector3f:
+        """Unit normal of the surface X(Y, Z): its derivatives are X_Y = (x0' + k' Z) / (y0' + Z), X_Z = k - m X_Y."""
+        # At the fan's origin, where all rays meet, both derivatives vanish.
+        spread = dr.maximum(_value(self._dy0, t) + z, _SMALLEST_SPREAD_MM)
+        by_y = (_value(self._dx0, t) + _value(self._dtilt, t) * z) / spread
+        return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - _value(self._tilt, t)))
+
+
+@dataclass(frozen=True)
+class _FanBehindWindow:
+    """Fan rays where they leave the window: angles (N,), origins and unit directions (3, N), transmittances (N,)."""
+
+    angle: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+    transmitted: np.ndarray
+
+
+def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindow]:
+    """The laser's origin (3,) and its fan traced through the window's faces, all in the OCS."""
+    laser, pose = sensor.laser, laser_pose(sensor)
+    to_object = np.linalg.inv(camera_from_object(sensor))
+    rotation = frame_about(pose.axis, pose.normal)
+    faces = WindowFaces(
+        laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
+    )
+    # Denser towards the edges, where a series would otherwise swing.
+    angle = -_fan_half_angle(laser) * np.cos(np.linspace(0, math.pi, _RAYS))
+    fan = mi.Vector3f(rotation @ _fan_directions(laser, angle))
+    path = faces.through(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
+    if not bool(dr.all(path.valid)):
+        raise DesignError(
+            f"part of the laser's {laser.fan_angle_deg:g} deg fan does not pass its window of "
+            f"{laser.window.aperture_diameter_mm:g} mm: enlarge the window or bring it closer"
+        )
+    d = to_object[:3, :3] @ path.direction.numpy().astype(float)
+    o = np.broadcast_to(to_object[:3, :3] @ path.origin.numpy().astype(float) + to_object[:3, 3:], d.shape)
+    passed = np.broadcast_to(path.weight.numpy().astype(float), angle.shape)
+    return to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3], _FanBehindWindow(angle, o, d, passed)
+
+
+def _power_along(laser: Laser, slope: np.ndarray, fan: _FanBehindWindow) -> tuple[PowerTable, float]:
+    """Power behind the window per slope, and in total in W."""
+    lit = _fan_lit_angles(laser)
+    first, last = np.interp(lit[[0, -1]], fan.angle, slope)
+    nodes = np.linspace(first, last, _NODES)
+    angle_of, passes = _series(slope, fan.angle, _SERIES_SLOPE), _series(slope, fan.transmitted, 1e-6)
+    density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
+    between = np.union1d(lit, fan.angle[(fan.angle > lit[0]) & (fan.angle < lit[-1])])
+    total = np.trapezoid(_power_per_angle(laser, between) * np.interp(between, fan.angle, fan.transmitted), between)
+    return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=float(total)), float(total)
+
+
+def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
+    """Chebyshev series in the slope through values, without the terms at its end that sum up to less than allowed."""
+    fit = Chebyshev.fit(slope, values, _LARGEST_DEGREE, domain=(slope.min(), slope.max()))
+    left = np.cumsum(np.abs(fit.coef[::-1]))[::-1]
+    return fit.truncate(max(1, np.count_nonzero(left > tolerance)))
+
+
+def _value(series: Chebyshev, t: Float) -> Float:
+    """The series at its variable brought to -1 to 1, by Clenshaw's recurrence, which keeps 32 bits exact."""
+    ahead, beyond = mi.Float(0.0), mi.Float(0.0)
+    for coefficient in series.coef[:0:-1]:
+        ahead, beyond = dr.fma(2 * t, ahead, float(coefficient) - beyond), ahead
+    return dr.fma(t, ahead, float(series.coef[0]) - beyond)
+
+
+def _standard_normal(u: Float) -> Float:
+    return math.sqrt(2.0) * dr.erfinv(dr.clip(2 * u - 1, -1 + 1e-7, 1 - 1e-7))
+
+
+def _fan_half_angle(laser: Laser) -> float:
+    """Angle of the fan's edge in rad."""
+    return math.radians(laser.fan_angle_deg / 2)
+
+
+def _fan_lit_angles(laser: Laser) -> np.ndarray:
+    """Angles (K,) in rad between which the power per angle is smooth; outside the first and the last it is zero."""
+    if isinstance(laser.fan_profile, str):
+        return np.array([-_fan_half_angle(laser), _fan_half_angle(laser)])
+    return np.radians([angle for angle, _ in laser.fan_profile])
+
+
+def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
+    """Unit directions (3, N) of fan rays in the laser's frame.
+
+    A beam that enters line optics tilted by alpha leaves them as a cone, whose distance from a straight sheet is
+    z tan(alpha) (1 / cos(angle) - 1); the ray in the middle keeps the laser's axis.
+    """
+    bow = math.tan(math.radians(laser.bow_deg))
+    along = np.stack([bow * (1 / np.cos(angle) - 1), np.tan(angle), np.ones_like(angle)])
+    return along / np.linalg.norm(along, axis=0)
+
+
+def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
+    """Power in W/rad at lit angles (N,), before the window. Its integral over the fan is the laser's power."""
+    half = _fan_half_angle(laser)
+    match laser.fan_profile:
+        case "flat":
+            relative, total = np.ones_like(angle), 2 * half
+        case "gaussian":
+            relative, total = np.exp(-2 * (angle / half) ** 2), half * math.sqrt(math.pi / 2) * math.erf(math.sqrt(2))
+        case tuple() as profile:
+            nodes, powers = _fan_lit_angles(laser), [power for _, power in profile]
+            relative, total = np.interp(angle, nodes, powers), np.trapezoid(powers, nodes)
+        case _:
+            assert_never(laser.fan_profile)
+    return 1e-3 * laser.power_mw * relative / total
+
+
+class PowerTable:
+    """Power per unit of a coordinate along the fan: linear between even nodes, zero outside them.
+
+    The values lie in arrays, not in the kernel: every profile is looked up, and drawn from, by the same few steps.
+
+    Parameters
+    ----------
+    nodes
+        (N,), evenly spaced and increasing.
+    density
+        (N,), relative power per unit of the coordinate at the nodes, smooth or not.
+    power_w
+        What the density is scaled to in total.
+    """
+
+    def __init__(self, nodes: np.ndarray, density: np.ndarray, *, power_w: float):
+        self._low, self._step, self._cells = float(nodes[0]), float(nodes[1] - nodes[0]), len(nodes) - 1
+        share = density / np.trapezoid(density)
+        below = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]))])
+        self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
+        self._power_per_step = power_w / self._step
+
+    def at(self, x: Float) -> Float:
+        """Power in W per unit of the coordinate."""
+        place = (x - self._low) / self._step
+        # What is not a number becomes no index that clipping alone would keep within the table.
+        cell = dr.minimum(mi.UInt32(dr.clip(place, 0.0, self._cells - 1.0)), self._cells - 1)
+        share = dr.lerp(*self._ends(cell), place - mi.Float(cell))
+        return dr.select((place >= 0) & (place <= self._cells), self._power_per_step * share, 0.0)
+
+    def draw(self, u: Float) -> Float:
+        """The coordinate below which the share ``u`` of the power lies: even ``u`` give places as dense as the power.
+
+        Within a cell the share a t + (b - a) t^2 / 2 of its ends' densities a and b is solved for t, 0 to 1.
+        """
+        cell = dr.binary_search(0, self._cells - 1, lambda i: dr.gather(mi.Float, self._below, i + 1) <= u)
+        rest = u - dr.gather(mi.Float, self._below, cell)
+        a, b = self._ends(cell)
+        t = 2 * rest / dr.maximum(a + dr.safe_sqrt(a * a + 2 * (b - a) * rest), 1e-30)
+        return self._low + self._step * (mi.Float(cell) + dr.clip(t, 0.0, 1.0))
+
+    def _ends(self, cell: UInt32) -> tuple[Float, Float]:
+        return dr.gather(mi.Float, self._share, cell), dr.gather(mi.Float, self._share, cell + 1)

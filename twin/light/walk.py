@@ -1,0 +1,296 @@
+"""Light that reached the camera by way of more than one scattering or reflection, by random walks from the camera.
+
+A walk follows a camera ray through the water: it ends on a surface or is scattered on its way, and goes on from there.
+Every place that it comes to collects three parts of the laser's light:
+
+- what the sheet scatters into the walk's next stretch, at one place drawn like the sheet's profile across the stretch;
+- what a lit surface sends back along that stretch, where it ends on one;
+- the same lit surfaces once more, by connecting to a point that a ray of the fan lights up.
+
+The last two count the same light; each is weighted by how probable the other one was (the balance heuristic of Veach
+1997, Eq. 9.8), which leaves no rare bright samples: a stripe close by is found by the walk itself, a distant one by
+connecting. Directions are drawn from the surface's or the water's own scattering, and in scattering water also from
+forward scattering about the direction to the laser, from which most scattered light arrives.
+
+Left out: light that went by way of a mirror and was scattered or reflected by something else before or after.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any, cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInteraction3f, UInt32, Vector3f
+from twin.light.camera import Bundle
+from twin.light.direct import Light
+from twin.light.pose import SensorPose
+from twin.light.sheet import SheetLight
+from twin.light.water import Scattering
+from twin.options import Effects
+from twin.scene.objects import Objects
+
+_STEPS = 64
+"""No walk is longer; in the most turbid waters fewer than one in 10^4 would be."""
+_TOWARDS_LASER = 0.3
+"""Share of directions drawn about the direction to the laser."""
+_SURVIVES_FROM = 0.25
+"""Walks that carry less than this share of the light they began with are ended or strengthened at random."""
+_CLEAR_MM = 1e-2
+
+
+@dataclass
+class _Walks:
+    """Walks in the sensor's OCS: the ray, the light it stands for, and the pixel or cell it counts for.
+
+    ``density`` is that of the ray's direction in 1/sr where a lit surface at its end is to be counted, else 0.
+    ``away`` tells whether the walk has left the camera's own ray, ``reflected`` whether it has met a surface.
+    """
+
+    origin: Point3f
+    direction: Vector3f
+    strength: Float
+    weight: Float
+    cell: UInt32
+    number: UInt32
+    density: Float
+    away: Bool
+    reflected: Bool
+
+    def of(self, kept: UInt32) -> _Walks:
+        """The walks with the given indices."""
+        return _Walks(
+            **{f.name: dr.gather(type(getattr(self, f.name)), getattr(self, f.name), kept) for f in fields(self)}
+        )
+
+
+@dataclass(frozen=True)
+class Walker:
+    """Walks before one posed scene under its direct lights; rays that meet nothing are followed over ``reach_mm``."""
+
+    objects: Objects
+    scattering: Scattering
+    effects: Effects
+    pose: SensorPose
+    lights: list[Light]
+    reach_mm: float
+
+    @property
+    def _scatters(self) -> bool:
+        return self.effects.multiple_scattering and self.scattering.coefficient > 0
+
+    def radiance(self, bundle: Bundle, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
+        """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
+        width = dr.width(cell)
+        total = np.zeros(cells)
+        if not (self._scatters or self.effects.secondary_light):
+            return total
+        walks = _Walks(
+            bundle.origin,
+            bundle.direction,
+            dr.full(mi.Float, 1.0, width),
+            bundle.weight,
+            cell,
+            dr.arange(mi.UInt32, width),
+            dr.zeros(mi.Float, width),
+            dr.full(mi.Bool, False, width),
+            dr.full(mi.Bool, False, width),
+        )
+        for step in range(_STEPS):
+            walks, found, alive = self._step(walks, dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32))
+            dr.eval(found, alive, *(getattr(walks, f.name) for f in fields(walks)))
+            # Dr.Jit's threads would add in any order, which rounds differently every time.
+            total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
+            kept = cast(Any, dr.compress(alive))
+            if dr.width(kept) == 0:
+                break
+            if dr.width(kept) == 1:
+                # Arrays of one entry would take a kernel of their own: two halves do for the whole.
+                kept = mi.UInt32([kept[0], kept[0]])
+                walks.weight *= 0.5
+            walks = walks.of(kept)
+        return total
+
+    def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
+        """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
+        rng = _random_numbers(seed, walks.number)
+        o, d, c = walks.origin, walks.direction, self.scattering.extinction
+        si = self.objects.scene.ray_intersect(self.pose.ray(o, d))
+        hit = si.is_valid()
+        length = dr.select(hit, si.t, self.reach_mm)
+        end = mi.Point3f(o + d * length)
+        context = mi.BSDFContext()
+        bsdf = si.bsdf()
+        mirror = dr.select(hit, self.objects.mirror_share(si), 0.0)
+
+        found = mi.Float(0.0)
+        for light in self.lights:
+            if self._scatters:
+                found += self._scattered_by_sheet(light, o, d, length, walks.away, rng.next_float32())
+            found += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
+
+        # The walk is scattered on its way or ends on the surface, and goes on if it still promises enough.
+        in_water, distance, passed = self._free_path(length, hit, rng)
+        vertex = mi.Point3f(o + d * distance)
+        reflected = cast(Bool, walks.reflected | ~in_water)
+        towards_laser = [-light.at(vertex).direction for light in self.lights]
+        found *= walks.strength
+        strength = walks.strength * passed
+        promise = strength * self._promise(d, towards_laser, in_water) / _SURVIVES_FROM
+        survival = dr.minimum(promise, 1.0)
+        alive = (strength > 0) & (rng.next_float32() < survival)
+        strength = dr.select(alive, strength / survival, 0.0)
+
+        lobes = _TOWARDS_LASER / len(self.lights) if self._scatters else 0.0
+
+        def scattered(onward: Vector3f) -> tuple[Float, Float]:
+            """What the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
+            reflectance, density = bsdf.eval_pdf(context, si, si.to_local(self.pose.direction(onward)), hit & ~in_water)
+            value = dr.select(in_water, self.scattering.phase(_one_minus_cosine(d, onward)), reflectance[0])
+            density = dr.select(in_water, value, density * (1 - mirror))
+            if self._scatters:
+                density *= 1 - _TOWARDS_LASER
+                for towards in towards_laser:
+                    density += (
+                        lobes
+                        * dr.select(in_water, 1, 1 - mirror)
+                        * self.scattering.phase(_one_minus_cosine(towards, onward))
+                    )
+            return value, density
+
+        may_connect = alive if self.effects.secondary_light else alive & ~reflected
+        for light in self.lights:
+            u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
+            found += strength * self._connected(light, vertex, scattered, u, may_connect)
+        found *= walks.weight
+
+        # A new direction: the mirror's, one about the laser's direction, or the vertex's own.
+        choice, which = rng.next_float32(), rng.next_float32()
+        u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        specular = ~in_water & (choice < mirror)
+        sample, _ = bsdf.sample(context, si, u1, u2, hit & ~in_water)
+        own = dr.select(in_water, self.scattering.sample(d, u2)[0], self.pose.object_direction(si.to_world(sample.wo)))
+        onward = own
+        if self._scatters:
+            for k, towards in enumerate(towards_laser):
+                chosen = (which >= k * lobes) & (which < (k + 1) * lobes)
+                onward = dr.select(chosen, self.scattering.sample(towards, u2)[0], onward)
+        onward = dr.select(specular, self.pose.object_direction(si.to_world(mi.reflect(si.wi))), onward)
+        value, density = scattered(onward)
+        gain = dr.select(specular, 1.0, dr.select(density > 0, value / density, 0.0))
+        strength *= gain
+        alive &= (strength > 0) & dr.isfinite(strength)
+        away = walks.away | ~specular
+        following = _Walks(
+            mi.Point3f(vertex + onward * dr.select(in_water, 0.0, _CLEAR_MM)),
+            onward,
+            strength,
+            walks.weight,
+            walks.cell,
+            walks.number,
+            dr.select(specular | ~away, 0.0, density),
+            away,
+            reflected,
+        )
+        return following, found, alive
+
+    def _promise(self, d: Vector3f, towards_laser: list[Vector3f], in_water: Bool) -> Float:
+        """How much more light a walk may find than one in any direction: scattered on, it may run towards the laser."""
+        promise = mi.Float(1.0)
+        if self._scatters:
+            for towards in towards_laser:
+                ahead = 4 * math.pi * self.scattering.phase(_one_minus_cosine(towards, d))
+                promise = dr.maximum(promise, dr.select(in_water, ahead, 1.0))
+        return promise
+
+    def _scattered_by_sheet(
+        self, light: Light, o: Point3f, d: Vector3f, length: Float, active: Bool, u: Float
+    ) -> Float:
+        """Radiance that the sheet scatters once into rays, from one place on each."""
+        t, density = light.pick_in_sheet(o, d, length, u)
+        p = mi.Point3f(o + d * t)
+        here = light.at(p)
+        active = active & (density > 0) & (here.irradiance > 0)
+        lit = light.reaches(self.objects.scene, p, here, None, active)
+        source = here.irradiance * self.scattering.phase(_one_minus_cosine(-here.direction, d))
+        value = self.scattering.coefficient * source * dr.exp(-self.scattering.extinction * t) / density
+        return dr.select(lit, value, 0.0)
+
+    def _lit_end(
+        self, light: Light, walks: _Walks, si: SurfaceInteraction3f, bsdf: BSDFPtr, end: Point3f, hit: Bool
+    ) -> Float:
+        """Radiance of the lit surface at the stretch's end, weighted against connecting to it."""
+        here = light.at(end)
+        towards = si.to_local(self.pose.direction(-here.direction))
+        active = hit & (walks.density > 0) & (here.irradiance > 0)
+        if not self.effects.secondary_light:
+            active &= ~walks.reflected
+        active = light.reaches(self.objects.scene, end, here, None, active)
+        radiance = bsdf.eval(mi.BSDFContext(), si, towards, active)[0] * here.irradiance
+        # Both densities per sr: per mm2, that of a walk along its own surface has no bound.
+        by_walk = walks.density * dr.abs(mi.Frame3f.cos_theta(si.wi))
+        by_light = self._light_density(light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
+        return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
+
+    def _light_density(self, light: Light, here: SheetLight, cosine: Float) -> Float:
+        """Density per mm2 of the lit points that `_connected` draws: the share of the power that falls there."""
+        unweakened = here.irradiance * dr.exp(self.scattering.extinction * here.exit_mm)
+        return unweakened * dr.abs(cosine) / light.sheet.power_w
+
+    def _connected(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
+        """Light of a lit point, drawn in proportion to the power that falls there, that the vertex scatters on."""
+        rays = light.rays(u)
+        ray = self.pose.ray(rays.origin, rays.direction)
+        si = self.objects.scene.ray_intersect(ray, active)
+        lit = mi.Point3f(rays.origin + rays.direction * si.t)
+        active = active & si.is_valid()
+        apart = vertex - lit
+        distance = dr.norm(apart)
+        direction = apart / distance
+        local = si.to_local(self.pose.direction(direction))
+        sent = si.bsdf().eval(mi.BSDFContext(), si, local, active)[0]
+        value, density = scattered(-direction)
+        shadow = self.pose.ray(lit + direction * _CLEAR_MM, direction)
+        shadow.maxt = distance - 2 * _CLEAR_MM
+        active &= (sent * value > 0) & (distance > 2 * _CLEAR_MM)
+        active &= ~self.objects.scene.ray_test(shadow, active)
+        here = light.at(lit)
+        by_light = self._light_density(light, here, mi.Frame3f.cos_theta(si.wi))
+        by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
+        way = here.exit_mm + distance
+        light_there = light.sheet.power_w * sent * dr.exp(-self.scattering.extinction * way) / dr.square(distance)
+        return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
+
+    def _free_path(self, length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
+        """Whether walks are scattered before the surface, how far along they then are, and the share of light left.
+
+        Scattering is drawn as often as it promises light compared with the surface, whatever the water's clarity;
+        distances fall off by at least one reach, so that in clear water they are not drawn far behind the scene.
+        """
+        choice, u = rng.next_float32(), rng.next_float32()
+        c = self.scattering.extinction
+        through = dr.exp(-c * length)
+        if not self._scatters:
+            return dr.full(mi.Bool, False, dr.width(hit)), length, dr.select(hit, through, 0.0)
+        fall = max(c, 4 / self.reach_mm)
+        share = 1 - dr.exp(-fall * length)
+        promised = self.scattering.coefficient / fall * share
+        likely = dr.select(hit, dr.clip(promised / (promised + 0.5 * through), 0.3, 0.7), 1.0)
+        in_water = choice < likely
+        distance = -dr.log(1 - u * share) / fall
+        scattered = promised * dr.exp((fall - c) * distance) / likely
+        return in_water, dr.select(in_water, distance, length), dr.select(in_water, scattered, through / (1 - likely))
+
+
+def _one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
+    """1 - cos of the angle between unit vectors, exact for small angles too."""
+    return 0.5 * dr.squared_norm(a - b)
+
+
+def _random_numbers(seed: UInt32, number: UInt32) -> PCG32:
+    state, sequence = mi.sample_tea_32(seed, number)
+    return cast(Any, mi.PCG32)(size=dr.width(number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))

@@ -1,0 +1,117 @@
+"""Scattering in the water: its phase function, evaluated and sampled, and the sheet's light scattered once."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from twin.backend.arrays import Float, Point2f, UInt32, Vector3f, to_jit
+from twin.light.phase_functions import (
+    BACKWARD_END,
+    FIRST_PLACE,
+    FORWARD_END,
+    FORWARD_SR,
+    NODES,
+    STEP,
+    backward_share,
+    tabulated,
+)
+from twin.light.sheet import SheetLight
+from uwlts.model.sensor import Medium
+
+
+class Scattering:
+    """How a medium absorbs and scatters light of one wavelength: coefficients in 1/mm and the phase function.
+
+    ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``backward_share`` is the share of b that
+    scatters by more than 90 deg. The phase function of all that scatters lies in a table, read by the same kernels
+    whatever the medium.
+
+    Raises
+    ------
+    RangeError
+        The medium's tables do not reach the wavelength.
+    """
+
+    def __init__(self, medium: Medium, wavelength_nm: float):
+        self.absorption = medium.absorption_per_mm(wavelength_nm)
+        self.coefficient = medium.scattering_per_mm(wavelength_nm)
+        self.extinction = self.absorption + self.coefficient
+        table = tabulated(medium.scatterers(wavelength_nm))
+        self.backward_share = backward_share(table)
+        self._log_density = to_jit(mi.Float, table.log_density)
+        self._forward = dr.opaque(mi.Float, table.cumulative[0] / FORWARD_SR)
+        self._cumulative = to_jit(mi.Float, table.cumulative)
+
+    def phase(self, one_minus_cosine: Float) -> Float:
+        """Phase function in 1/sr at 1 - cos of the scattering angle.
+
+        Compute it as |w1 - w2|^2 / 2 from the unit directions before and after: 1 minus their product loses small
+        angles to the rounding of 32 bits.
+        """
+        before = dr.clip(one_minus_cosine, FORWARD_END, 2 - BACKWARD_END)
+        place = (dr.log(before / (2 - before)) - FIRST_PLACE) / STEP
+        cell = dr.minimum(mi.UInt32(dr.maximum(place, 0.0)), NODES - 2)
+        low, high = self._ends(cell)
+        density = dr.exp(dr.fma(high - low, place - mi.Float(cell), low)) / (math.pi * before * (2 - before))
+        return dr.select(one_minus_cosine < FORWARD_END, self._forward, density)
+
+    def sample(self, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
+        """A direction after scattering and its density in 1/sr, which is the phase function there.
+
+        The scattering angle grows with ``u.x``, the azimuth with ``u.y``.
+        """
+        before, after = self._heights(u.x)
+        sine = dr.sqrt(before * after)
+        sin_azimuth, cos_azimuth = dr.sincos(2 * math.pi * u.y)
+        turned = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - before)
+        return dr.normalize(mi.Frame3f(direction).to_world(turned)), self.phase(before)
+
+    def _heights(self, u: Float) -> tuple[Float, Float]:
+        """1 - cos and 1 + cos of the scattering angle below which the share ``u`` is scattered."""
+        node = mi.UInt32(0)
+        step = NODES // 2
+        while step:
+            node = dr.select(dr.gather(mi.Float, self._cumulative, node + step) <= u, node + step, node)
+            step //= 2
+        cell = dr.minimum(node, NODES - 2)
+        start, end = (dr.gather(mi.Float, self._cumulative, cell + side) for side in (0, 1))
+        share = dr.clip((u - start) / (end - start), 0.0, 1.0)
+        low, high = self._ends(cell)
+        # The density exp(k t) over 0 < t < 1 has the inverse log(1 + share (exp(k) - 1)) / k, 0 / 0 for k = 0; to
+        # three orders of k, which is below 0.05, it is this.
+        k = high - low
+        t = share + k * share * (1 - share) * (0.5 + k * (1 - 2 * share) / 6)
+        ratio = dr.exp(FIRST_PLACE + STEP * (mi.Float(cell) + t))
+        before, after = 2 * ratio / (1 + ratio), 2 / (1 + ratio)
+        # Beyond either end of the table directions are even over a cap.
+        first, last = (dr.gather(mi.Float, self._cumulative, mi.UInt32(end)) for end in (0, NODES - 1))
+        forward, backward = u < first, u >= last
+        before = dr.select(forward, FORWARD_END * u / first, before)
+        after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
+        return dr.select(backward, 2 - after, before), dr.select(forward, 2 - before, after)
+
+    def _ends(self, cell: UInt32) -> tuple[Float, Float]:
+        """Logarithm of the density at both ends of a cell of the table."""
+        return dr.gather(mi.Float, self._log_density, cell), dr.gather(mi.Float, self._log_density, cell + 1)
+
+
+def single_scattering(
+    scattering: Scattering, light: SheetLight, *, direction: Vector3f, surface_sigmas: Float
+) -> Float:
+    """Radiance that the sheet scatters once into a camera ray where the ray crosses it, in W/mm2/sr.
+
+    ``light`` is the sheet at the crossing, where the distance across is about zero; ``surface_sigmas`` the distance
+    across, in standard deviations and along the ray, of its end on a surface, which cuts the Gaussian off.
+    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos| times the share of the
+    Gaussian that the ray has passed.
+    """
+    b = dr.opaque(mi.Float, scattering.coefficient)
+    cosine = dr.maximum(dr.abs(dr.dot(direction, light.normal)), 1e-3)
+    peak = light.irradiance * light.sigma_mm * math.sqrt(2 * math.pi)
+    share = 0.5 * (1 + dr.erf(surface_sigmas / math.sqrt(2.0)))
+    # The light leaves against the camera ray, so that the difference of both directions is a sum here.
+    phase = scattering.phase(0.5 * dr.squared_norm(light.direction + direction))
+    return b * phase * peak / cosine * share

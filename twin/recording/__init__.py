@@ -1,0 +1,1 @@
+"""Captures with ground truth, campaigns, and the demonstration."""

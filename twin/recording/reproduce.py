@@ -1,0 +1,154 @@
+"""Records whole campaigns: every recording of each seed, several at a time, going on where an earlier run stopped."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from twin.options import CPU, Options, use_variant
+from twin.scene.campaign import Campaign, Take, takes
+from uwlts.model.errors import DescriptionError, Error, OutputError
+from uwlts.runtime.workers import work_through
+from uwlts.storage.capture import part_path
+from uwlts.storage.files import written_aside
+from uwlts.storage.truth import truth_path
+
+PLAN = "plan.json"
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A take to render into a file."""
+
+    take: Take
+    path: Path
+    options: Options
+    variant: str
+
+    def files(self) -> tuple[Path, Path, Path]:
+        """Capture, truth and unfinished capture."""
+        return self.path, truth_path(self.path), part_path(self.path)
+
+    def complete(self) -> bool:
+        """Whether the recording is there as a whole."""
+        capture, truth, part = self.files()
+        return capture.is_file() and truth.is_file() and not part.exists()
+
+    def images(self) -> int:
+        """How many images the recording has."""
+        motion = self.take.scene.motion
+        return motion.count * len(motion.lights)
+
+
+def record_campaigns(
+    campaign: Campaign,
+    folder: Path,
+    *,
+    seeds: range,
+    every: int = 1,
+    spp: int = 16,
+    variant: str = CPU,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; returns these folders.
+
+    Complete recordings stay as they are and interrupted ones are gone on with; ``overwrite`` removes those of the
+    seeds and renders all anew. ``progress(done, total)`` counts images.
+
+    Raises
+    ------
+    DescriptionError
+        The folder holds a campaign that was rendered differently, or the campaign's descriptions are wrong.
+    DesignError
+        The sensor cannot measure a scene.
+    OutputError
+        A file cannot be written.
+    SetupError
+        A process that renders was ended from outside.
+    """
+    folders = [folder / f"campaign-{seed}" for seed in seeds]
+    jobs = [
+        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed), variant)
+        for seed, place in zip(seeds, folders, strict=True)
+        for take in takes(campaign, seed=seed, every=every)
+    ]
+    plan = {"campaign": campaign.model_dump(mode="json"), "every": every, "spp": spp, "variant": variant}
+    _keep_to_plan(folder, json.loads(json.dumps(plan)), jobs, overwrite=overwrite)
+    for place in folders:
+        place.mkdir(exist_ok=True)
+    if overwrite:
+        # All at once and not one by one: what an interrupted run leaves must not be taken for its own.
+        for path in (path for job in jobs for path in job.files()):
+            path.unlink(missing_ok=True)
+    waiting = [job for job in jobs if not job.complete()]
+    total = sum(job.images() for job in jobs)
+    done = total - sum(job.images() for job in waiting)
+    progress(done, total)
+
+    def count(_: None) -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    # The longest first, so that no process is left alone with a long one at the end.
+    work_through(_record, sorted(waiting, key=_Job.images, reverse=True), workers=workers, heard=count)
+    return folders
+
+
+def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, overwrite: bool) -> None:
+    """Write down how a folder's campaigns are rendered, or make sure that it says the same."""
+    path = folder / PLAN
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        recorded = sorted(folder.glob("campaign-*/*.h5*"))
+        content = path.read_bytes() if path.is_file() else b"null"
+    except OSError as error:
+        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    try:
+        known = json.loads(content)
+    except ValueError:
+        known = None
+    if known == plan:
+        return
+    if recorded:
+        how = f"that {PLAN} does not tell of"
+        if isinstance(known, dict):
+            how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
+        if not overwrite:
+            raise DescriptionError(
+                f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start "
+                "afresh"
+            )
+        kept = set(recorded) - {file for job in jobs for file in job.files()}
+        if kept:
+            raise DescriptionError(
+                f"{folder} would keep recordings {how}, such as {min(kept)}: give another folder, or remove them first"
+            )
+    with written_aside(path, overwrite=True) as aside:
+        aside.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
+
+
+def _record(job: _Job, tell: Callable[[None], None]) -> None:
+    """Render a take; tells of every image."""
+    use_variant(job.variant)
+    import drjit as dr
+
+    from twin.recording.studio import record_scene
+
+    dr.set_thread_count(1)
+    try:
+        # What is there of an incomplete recording is a part to go on with, or lacks its truth.
+        record_scene(
+            job.take.scene,
+            job.take.sensor,
+            job.path,
+            as_built=job.take.built,
+            options=job.options,
+            overwrite=True,
+            resume=part_path(job.path).exists(),
+            progress=lambda images, total: tell(None),
+        )
+    except Error as error:
+        raise type(error)(f"{job.path}: {error}") from error

@@ -1,0 +1,296 @@
+"""A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import mitsuba as mi
+import numpy as np
+
+from twin.light.pose import Travel
+from twin.light.renderer import LaserFrame, Renderer
+from twin.options import Options
+from twin.recording.truth import FrameTruth, depth_map, no_stripe, true_stripe
+from twin.scene.description import CirclePlate, Scene, Shot
+from twin.scene.pattern import shift_circles
+from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
+from twin.sensor.speckle import Speckle, coherence
+from uwlts.model.errors import DesignError, OutputError
+from uwlts.model.library import validated
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
+
+Progress = Callable[[int, int], None]
+PROBE_SPP = 16
+"""Samples per lit pixel of the images from which the exposure follows."""
+BRIGHT_SHARE = 0.98
+"""Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
+
+
+def medium_of(sensor: Sensor, scene: Scene) -> Medium:
+    """The medium that a scene names, from the sensor's list, with the scene's water if it has one of its own."""
+    medium = sensor.medium(scene.medium)
+    if scene.water is None:
+        return medium
+    kind = {"water": scene.water} if isinstance(scene.water, str) else {"turbidity": scene.water}
+    kept = medium.model_dump(include={"kind", "temperature_c", "salinity_g_kg", "index"})
+    return validated(Medium, kept | kind, f"{scene.title}, water = {scene.water!r}")
+
+
+def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
+    """The sensor with its camera's window in place or taken off."""
+    window = sensor.camera.window.model_copy(update={"mounted": mounted})
+    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
+
+
+def check_scene(renderer: Renderer, scene: Scene) -> None:
+    """Refuse a scene whose objects the sensor cannot measure, with numbers.
+
+    Raises
+    ------
+    DesignError
+        All objects lie outside the depth of the measuring volume, or the scan never brings the sheet to them.
+    """
+    volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
+    # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
+    nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
+    box = renderer.objects.scene.bbox()
+    offsets = np.array([shot.travelled_mm * scene.motion.unit_direction() for shot in scene.motion.shots()])
+    low, high = (np.array(corner) - offsets for corner in (box.min, box.max))
+    if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
+        raise DesignError(
+            f"the objects lie from Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm about the stand-off, "
+            f"outside the measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
+        )
+    if not ((low[:, 0] <= 0) & (high[:, 0] >= 0)).any():
+        raise DesignError(
+            f"the sheet never meets the objects: seen from the sensor they stay between X = {low[:, 0].min():.1f} and "
+            f"{high[:, 0].max():.1f} mm, the sheet is at X = 0: change the motion or the objects' position"
+        )
+
+
+class Studio:
+    """A sensor before a scene, ready to take shots; exposures are settled once, before the first."""
+
+    def __init__(self, sensor: Sensor, scene: Scene, options: Options):
+        self.sensor = with_window(sensor, mounted=sensor.camera.window.mounted and scene.window_mounted)
+        self.scene, self.options = scene, options
+        self.medium = medium_of(sensor, scene)
+        self.renderer = Renderer(self.sensor, self.medium, scene, effects=options.effects)
+        check_scene(self.renderer, scene)
+        camera, laser = self.sensor.camera, self.sensor.laser
+        self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
+        self._pattern = (
+            fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
+            if options.effects.fixed_pattern
+            else None
+        )
+        self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
+        self._check_motion()
+
+    @property
+    def period_s(self) -> float:
+        """Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out."""
+        motion = self.scene.motion
+        if motion.speed_mm_per_s > 0:
+            return abs(motion.step_mm) / motion.speed_mm_per_s
+        return self.sensor.stage.settling_s + self._shortest_period_s()
+
+    def _shortest_period_s(self) -> float:
+        return max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
+
+    def _check_motion(self) -> None:
+        """Refuse a travel that is too fast for the camera."""
+        motion = self.scene.motion
+        if motion.speed_mm_per_s > 0 and motion.count > 1 and self.period_s < self._shortest_period_s() * (1 - 1e-9):
+            raise DesignError(
+                f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached after "
+                f"{1e3 * self.period_s:.3g} ms, but the camera needs {1e3 * self._shortest_period_s():.3g} ms from "
+                "frame to frame: travel more slowly, in longer steps, or with shorter exposures"
+            )
+
+    def pose(self, shot: Shot) -> np.ndarray:
+        """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
+        transform = np.eye(4)
+        transform[:3, 3] = shot.travelled_mm * self.scene.motion.unit_direction()
+        return transform
+
+    def travel(self, light: Literal["lamp", "laser"]) -> Travel | None:
+        """How the sensor travels during an exposure; None where it stands still."""
+        motion, detector = self.scene.motion, self.sensor.detector
+        if motion.speed_mm_per_s == 0 or not self.options.effects.motion:
+            return None
+        speed = motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
+        row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
+        return Travel(
+            direction=motion.unit_direction(),
+            exposure_mm=speed * 1e-3 * self.exposure_ms.get(light, 0.0),
+            row_mm=speed * row_s,
+            middle_row=(self.sensor.camera.height_px - 1) / 2,
+        )
+
+    def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W) of a shot."""
+        if shot.light == "lamp":
+            irradiance = self.renderer.irradiance("lamp", self.pose(shot), spp=spp, travel=travel)
+        else:
+            frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
+            irradiance = frame.irradiance(self._grain(frame, shot) if self.options.effects.speckle else 1.0)
+        return electrons_per_ms(
+            irradiance, self.sensor.camera, self.sensor.detector, wavelength_nm=self.sensor.laser.wavelength_nm
+        )
+
+    def _grain(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
+        """Speckle factors (P,) of the stripe's pixels."""
+        laser = self.sensor.laser
+        contrast = coherence(
+            frame.roughness_um,
+            linewidth_nm=laser.linewidth_nm,
+            wavelength_nm=laser.wavelength_nm,
+            index=self.medium.refractive_index(laser.wavelength_nm),
+        )
+        return self._speckle.factors(
+            frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
+        )
+
+    def frame(self, shot: Shot, index: int) -> Frame:
+        """Image number ``index`` of the scan with what a capture records of it."""
+        return Frame(
+            image=self.image(shot, index),
+            stage_mm=shot.stage_mm,
+            laser_on=shot.light == "laser",
+            exposure_ms=self.exposure_ms[shot.light],
+            time_s=index * self.period_s,
+        )
+
+    def image(self, shot: Shot, index: int) -> np.ndarray:
+        """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
+        self._shift_circles(shot, index)
+        rng = np.random.default_rng([self.options.seed, index]) if self.options.effects.noise else None
+        exposure = self.exposure_ms[shot.light]
+        light = exposure * self.electrons_per_ms(
+            shot, spp=self.options.spp, seed=self._seed(index), travel=self.travel(shot.light)
+        )
+        return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng, pattern=self._pattern)
+
+    def truth(self, shot: Shot) -> FrameTruth:
+        """What every profile line of a shot truly shows."""
+        if shot.light == "lamp":
+            return no_stripe(self.sensor.camera.lines())
+        return true_stripe(self.renderer, self.pose(shot), travel=self.travel("laser"))
+
+    def _shift_circles(self, shot: Shot, index: int) -> None:
+        """Move the circles of plates with errors of detection to where this image shows them."""
+        for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
+            if isinstance(plate, CirclePlate) and plate.detection_std_px > 0:
+                seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
+                mm_per_px = self._apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
+                shift_circles(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
+
+    def _apparent_depth_mm(self, depth_mm: float) -> float:
+        """Depth at which a point on the axis seems to be: a layer of index n looks n times thinner."""
+        window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
+        if not window.mounted:
+            return depth_mm
+        outside = depth_mm - window.distance_mm - window.thickness_mm
+        in_medium = outside / self.medium.refractive_index(wavelength)
+        return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
+
+    def _seed(self, index: int) -> int:
+        """Seed of a frame's random walks."""
+        return int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
+
+    def _exposure(self, light: Literal["lamp", "laser"]) -> float:
+        """Exposure in ms as described, or so that the first, middle or last shot just reaches the wanted level."""
+        wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
+        if wanted != "auto":
+            return wanted
+        shots = [shot for shot in self.scene.motion.shots() if shot.light == light]
+        axis = 0 if self.sensor.camera.stripe_along == "width" else 1
+        brightest = 0.0
+        for shot in dict.fromkeys((shots[0], shots[len(shots) // 2], shots[-1])):
+            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP, seed=0).max(axis=axis)
+            if (peaks > 0).any():
+                brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
+        longest = self.sensor.exposure.longest_ms
+        level = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
+        return min(longest, level / brightest) if brightest > 0 else longest
+
+
+def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], *, first: Shot) -> Truth:
+    """The truths of a recording's frames as one, with the depth map of its ``first`` shot."""
+    stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
+    return Truth(**stacked, depth_mm=depth_map(studio.renderer, studio.pose(first)))
+
+
+def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> CaptureHeader:
+    """What an operator would note in the capture: nominal values only."""
+    window_mounted = studio.sensor.camera.window.mounted
+    return CaptureHeader(
+        name=name,
+        sensor=with_window(nominal, mounted=window_mounted),
+        medium_name=scene.medium,
+        medium=medium_of(nominal, scene),
+        stage_direction=scene.motion.recorded_direction(),
+        saturation_dn=nominal.detector.full_scale_dn(),
+        target=scene.target,
+        artefact=scene.artefact,
+        provenance={
+            "source": "twin",
+            "seed": studio.options.seed,
+            "spp": studio.options.spp,
+            "effects": studio.options.effects.names(),
+            "variant": mi.variant(),
+            "mitsuba": version("mitsuba"),
+            "drjit": version("drjit"),
+            "uwlts": version("uwlts"),
+        },
+    )
+
+
+def record_scene(
+    scene: Scene,
+    sensor: Sensor,
+    path: str | Path,
+    *,
+    as_built: Sensor | None = None,
+    options: Options = Options(),
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> None:
+    """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
+
+    Images show ``as_built`` (the sensor itself unless given), the capture states ``sensor``. An interrupted run leaves
+    ``path.part`` with all complete frames; ``resume`` goes on from there and gives the same capture as an undisturbed
+    run. ``progress(done, total)`` is called after every frame.
+
+    Raises
+    ------
+    DesignError, DescriptionError
+        The sensor or the scene cannot work.
+    OutputError
+        A file exists already, or cannot be written.
+    """
+    path = Path(path)
+    if truth_path(path).exists() and not (overwrite or resume):
+        raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
+    studio = Studio(as_built or sensor, scene, options)
+    header = _header(path.stem, sensor, studio, scene)
+    shots = list(scene.motion.shots())
+    truths: list[FrameTruth] = []
+    dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
+    with CaptureWriter(path, header, dtype=dtype, overwrite=overwrite, resume=resume) as writer:
+        done = len(writer)
+        for index, shot in enumerate(shots):
+            truths.append(studio.truth(shot))
+            if index >= done:
+                writer.append(studio.frame(shot, index))
+            progress(index + 1, len(shots))
+        truth_header = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
+        truth = truth_of_recording(studio, truths, first=shots[0])
+        write_truth(truth_path(path), truth_header, truth, overwrite=overwrite or resume)

@@ -1,0 +1,435 @@
+"""Description of a virtual scene: objects, their poses, and the motion of the stage that scans them.
+
+Scene coordinates are the sensor's object coordinate system (OCS) at stage position 0: X normal to the sheet, the
+direction of a scan; Y along the stripe; Z along the laser's axis away from the sensor; the origin is the stand-off.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
+from scipy.spatial.transform import Rotation
+
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import find, names, read_table, validated
+from uwlts.model.sensor import Description, NotNegative, Positive, Vector
+from uwlts.targets import Target, parse_target
+
+Reflectance = Annotated[float, Field(ge=0, le=1)]
+Finish = Literal["diffuse", "painted", "pvc", "metal"]
+
+TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
+"""GGX roughness: a satin paint, an extruded pipe, ground steel."""
+TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
+"""Rms heights in um. Light out of a diffuse body has run through some um of it, whatever its surface."""
+
+
+class Pose(Description):
+    """Where something stands: rotated about the scene's X, then Y, then Z axis, then moved."""
+
+    position_mm: Vector = (0.0, 0.0, 0.0)
+    rotation_deg: Vector = (0.0, 0.0, 0.0)
+
+    def matrix(self) -> np.ndarray:
+        """Rigid transform (4, 4) from the object's own frame to the parent's."""
+        transform = np.eye(4)
+        transform[:3, :3] = Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix()
+        transform[:3, 3] = self.position_mm
+        return transform
+
+
+class Placed(Pose):
+    """Base of all objects: a pose and a finish.
+
+    ``finish`` says how the surface reflects: "diffuse" as Lambert's law says; "painted" and "pvc" as a diffuse body
+    under a clear, slightly rough coat; "metal" as rough steel. ``reflectance`` is the diffuse reflectance, that of the
+    body under a coat, and scales the reflection of a metal. The grey values (0 to 1) of picture ``texture`` multiply
+    it, laid out by the shape's own uv coordinates with the picture's last row at v = 0; a relative path starts at the
+    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um`` the surface's
+    rms height.
+    """
+
+    reflectance: Reflectance = 0.8
+    finish: Finish = "diffuse"
+    alpha: Annotated[float, Field(ge=0.02, le=1)] | None = None
+    roughness_um: NotNegative | None = None
+    texture: str | None = None
+
+    @model_validator(mode="after")
+    def _alpha_has_a_gloss(self) -> "Placed":
+        if self.finish == "diffuse" and self.alpha is not None:
+            raise ValueError(f"alpha {self.alpha:g} roughens a gloss, but finish 'diffuse' has none: leave alpha out")
+        return self
+
+    def gloss_alpha(self) -> float:
+        """GGX roughness, the finish's usual one unless given."""
+        return TYPICAL_ALPHA[self.finish] if self.alpha is None else self.alpha
+
+    def rms_height_um(self) -> float:
+        """Rms height of the surface in um, the finish's usual one unless given."""
+        return TYPICAL_ROUGHNESS_UM[self.finish] if self.roughness_um is None else self.roughness_um
+
+    def mirror_share(self) -> float:
+        """Share of light that is reflected as by a plane mirror."""
+        return 0.0
+
+    def polarisation(self) -> float:
+        """Degree of polarisation of scattered laser light: 1 from a metal or mirror, 0 out of a diffuse body."""
+        return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
+
+
+class Flat(Placed):
+    """Base of objects with flat faces, which may be mirrors.
+
+    ``mirror`` is the share of light that the faces reflect as plane mirrors do, beside what they scatter: the weak
+    stripe on a mirror comes from a small ``reflectance``.
+    """
+
+    mirror: Reflectance = 0.0
+
+    @model_validator(mode="after")
+    def _reflects_at_most_all(self) -> "Flat":
+        if self.reflectance + self.mirror > 1:
+            raise ValueError(
+                f"reflectance {self.reflectance:g} and mirror {self.mirror:g} add up to more than all light: "
+                f"lower one of them"
+            )
+        if self.mirror > 0 and self.finish in ("painted", "pvc"):
+            raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
+        return self
+
+    def mirror_share(self) -> float:
+        """Share of light that is reflected as by a plane mirror."""
+        return self.mirror
+
+
+class Sphere(Placed):
+    """A sphere about its own origin."""
+
+    kind: Literal["sphere"]
+    diameter_mm: Positive
+
+
+class Plate(Flat):
+    """A flat rectangle in its own x-y plane, facing -z (towards the sensor)."""
+
+    kind: Literal["plate"]
+    width_mm: Positive
+    height_mm: Positive
+
+
+class Block(Flat):
+    """A box about its own origin."""
+
+    kind: Literal["block"]
+    size_mm: tuple[Positive, Positive, Positive]
+
+
+class Pipe(Placed):
+    """The outside of a pipe; its axis is its own x axis, its middle its origin."""
+
+    kind: Literal["pipe"]
+    diameter_mm: Positive
+    length_mm: Positive
+
+
+class Mesh(Placed):
+    """Any surface from a file that trimesh reads, in mm; a relative path starts at the scene's folder."""
+
+    kind: Literal["mesh"]
+    path: str
+    scale: Positive = 1.0
+
+
+class FreeForm(Placed):
+    """Base of free-form surfaces of a shape of their own. They have no uv coordinates for a texture."""
+
+    @model_validator(mode="after")
+    def _has_no_texture(self) -> "FreeForm":
+        if self.texture is not None:
+            raise ValueError(f"texture {self.texture} on a surface without uv coordinates: leave it out, or use a mesh")
+        return self
+
+
+class Head(FreeForm):
+    """A dummy head with the stub of its neck, about its own origin; its face looks along -z, its crown lies at +y.
+
+    ``height_mm`` runs from the neck's cut to the crown.
+    """
+
+    kind: Literal["head"]
+    height_mm: Positive = 160.0
+
+
+class Weld(FreeForm):
+    """Rippled weld beads on the front of a plate in its own x-y plane, facing -z (towards the sensor).
+
+    The beads run along the plate's x or y axis (``along``), side by side, ``spacing_mm`` from middle to middle;
+    ``length_mm``, ``width_mm`` and ``height_mm`` are those of one bead, ``ripple_height_mm`` is that from trough to
+    crest. ``irregularity`` is how much width and height change on the way, as a share of them, and how far the path
+    and the ripples' places wander, in widths and pitches; ``seed`` chooses how.
+    """
+
+    kind: Literal["weld"]
+    plate_mm: tuple[Positive, Positive] = (80.0, 120.0)
+    beads: Annotated[int, Field(ge=1, le=100)] = 3
+    spacing_mm: Positive = 18.0
+    along: Literal["x", "y"] = "x"
+    length_mm: Positive = 56.0
+    width_mm: Positive = 10.0
+    height_mm: Positive = 2.0
+    ripple_pitch_mm: Positive = 3.0
+    ripple_height_mm: NotNegative = 0.25
+    irregularity: Annotated[float, Field(ge=0, le=0.3)] = 0.06
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def bead_reach_mm(self) -> float:
+        """How far a bead reaches sideways from its straight middle line, however irregular."""
+        return self.width_mm * (0.5 + 1.5 * self.irregularity)
+
+    @model_validator(mode="after")
+    def _beads_have_room(self) -> "Weld":
+        plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
+        wide = (self.beads - 1) * self.spacing_mm + 2 * self.bead_reach_mm()
+        if self.length_mm < self.width_mm:
+            raise ValueError(f"a bead of length_mm {self.length_mm:g} is shorter than its width_mm {self.width_mm:g}")
+        if self.beads > 1 and self.spacing_mm < 2 * self.bead_reach_mm():
+            raise ValueError(
+                f"spacing_mm {self.spacing_mm:g} lets beads touch that may be {2 * self.bead_reach_mm():g} mm wide"
+            )
+        if self.length_mm > plate[0] or wide > plate[1]:
+            raise ValueError(
+                f"beads of {self.length_mm:g} mm along {self.along} and {wide:g} mm together across it do not fit on "
+                f"plate_mm {self.plate_mm[0]:g} x {self.plate_mm[1]:g}"
+            )
+        if self.ripple_height_mm > 2 * (1 - self.irregularity) * self.height_mm:
+            raise ValueError(
+                f"ripple_height_mm {self.ripple_height_mm:g} lets troughs dip into the plate under a bead of height_mm "
+                f"{self.height_mm:g}"
+            )
+        return self
+
+
+class Printed(Placed):
+    """Base of flat plates, facing -z, with a printed pattern, which takes the place of a ``texture``."""
+
+    @model_validator(mode="after")
+    def _has_one_pattern(self) -> Self:
+        if self.texture is not None:
+            raise ValueError(
+                f"texture {self.texture} on a plate with a printed pattern: put it on an object of kind 'plate'"
+            )
+        return self
+
+    def dimmed(self, scale: float) -> Self:
+        """The same plate with every reflectance multiplied by ``scale``."""
+        names = [name for name in type(self).model_fields if name.endswith("reflectance")]
+        return self.model_copy(update={name: scale * getattr(self, name) for name in names})
+
+
+class CirclePlate(Printed):
+    """Flat plate, facing -z, with a lattice of circles; three of them carry a dot and mark origin, X and Y.
+
+    The lattice has ``columns`` along x and ``rows`` along y; ``origin`` is the marked origin's column and row, and
+    ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two. The origin circle lies at the
+    plate's own origin. ``reflectance`` is the ground's; the lattice takes the place of a ``texture``.
+
+    A real plate differs from its description: every circle is off by ``centre_std_mm`` along x and y, and the middle
+    of the plate stands ``bow_mm`` before its corners. ``detection_std_px`` shifts every circle in every image anew, as
+    errors of detection beyond those that the image itself leads to. ``errors_seed`` chooses these errors.
+    """
+
+    kind: Literal["circle_plate"]
+    width_mm: Positive
+    height_mm: Positive
+    columns: Annotated[int, Field(ge=3)]
+    rows: Annotated[int, Field(ge=3)]
+    spacing_x_mm: Positive
+    spacing_y_mm: Positive
+    diameter_mm: Positive
+    marker_diameter_mm: Positive
+    origin: tuple[NotNegative, NotNegative]
+    marker_x: tuple[int, int] = (2, 0)
+    marker_y: tuple[int, int] = (0, 2)
+    circle_reflectance: Reflectance = 0.85
+    marker_reflectance: Reflectance = 0.05
+    centre_std_mm: NotNegative = 0.0
+    bow_mm: Annotated[float, Field(gt=-10, lt=10)] = 0.0
+    detection_std_px: NotNegative = 0.0
+    errors_seed: Annotated[int, Field(ge=0)] = 0
+
+
+def _described_target(value: Any) -> Target:
+    return value if isinstance(value, Target) else parse_target(value)
+
+
+class TargetPlate(Printed):
+    """A calibration target of any kind, exactly as described; its own frame is the target's, so it faces -z.
+
+    ``target`` is a description as in a scene's ``[target]``, which is used if it is left out. ``reflectance`` is the
+    ground's, ``ink_reflectance`` that of what is printed on it: dark squares, or circles, which may be brighter than
+    the ground. The plate reaches ``rim_mm`` beyond the print on all sides.
+    """
+
+    kind: Literal["target_plate"]
+    target: Annotated[SerializeAsAny[Target], BeforeValidator(_described_target)]
+    ink_reflectance: Reflectance = 0.05
+    rim_mm: NotNegative = 10.0
+
+    def bounds_mm(self) -> np.ndarray:
+        """Corners (2, 2) of the plate in its own x-y plane: the one with the smallest x and y, and the opposite one."""
+        boxes = np.array([(p.x_min_mm, p.y_min_mm, p.x_max_mm, p.y_max_mm) for p in self.target.patches()])
+        return np.array([boxes[:, :2].min(axis=0) - self.rim_mm, boxes[:, 2:].max(axis=0) + self.rim_mm])
+
+
+AnyObject = Annotated[
+    Sphere | Plate | Block | Pipe | Mesh | Head | Weld | CirclePlate | TargetPlate, Field(discriminator="kind")
+]
+
+
+class Motion(Description):
+    """Stage positions of a scan: ``count`` of them from ``start_mm`` in steps of ``step_mm`` along ``direction``.
+
+    ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
+    position the images in ``lights`` are taken in turn. ``position_errors_mm`` is how much farther than recorded the
+    stage truly stands at each position, 0 unless given. ``speed_mm_per_s`` is how fast the stage moves along
+    ``direction`` while an image is exposed; at 0 it stands still.
+    """
+
+    start_mm: float = 0.0
+    step_mm: float = 1.0
+    count: Annotated[int, Field(ge=1, le=100000)] = 1
+    direction: Vector = (1.0, 0.0, 0.0)
+    nominal_direction: Vector | None = None
+    position_errors_mm: tuple[float, ...] = ()
+    lights: tuple[Literal["lamp", "laser"], ...] = ("laser",)
+    speed_mm_per_s: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> "Motion":
+        for vector in (self.direction, self.nominal_direction):
+            if vector is not None and np.linalg.norm(vector) < 1e-9:
+                raise ValueError(f"direction {vector} has no length")
+        if self.position_errors_mm and len(self.position_errors_mm) != self.count:
+            raise ValueError(f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions")
+        if not self.lights:
+            raise ValueError("lights is empty: name 'lamp', 'laser' or both")
+        if self.speed_mm_per_s > 0 and len(self.lights) > 1:
+            raise ValueError("a moving stage takes one image at each position: name one light, or stop with speed 0")
+        return self
+
+    def unit_direction(self) -> np.ndarray:
+        """True unit direction (3,) of the sensor's travel in the scene."""
+        return np.array(self.direction) / np.linalg.norm(self.direction)
+
+    def recorded_direction(self) -> tuple[float, float, float]:
+        """Unit direction that the capture states."""
+        vector = np.array(self.nominal_direction or self.direction)
+        x, y, z = (vector / np.linalg.norm(vector)).tolist()
+        return x, y, z
+
+    def shots(self) -> Iterator["Shot"]:
+        """Every image of the scan in its order."""
+        for index in range(self.count):
+            stage_mm = self.start_mm + index * self.step_mm
+            error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
+            for light in self.lights:
+                yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image to take: recorded and true position of the stage in mm, and the light that is on."""
+
+    stage_mm: float
+    travelled_mm: float
+    light: Literal["lamp", "laser"]
+
+
+class Scene(Description):
+    """A scene as read from TOML.
+
+    ``placements`` are named poses of the whole set of objects (near, standoff, far); ``placement`` is the one in use.
+    ``medium`` is one of the sensor's; ``water`` replaces what is dissolved and floats in it, by the name of a water or
+    a turbidity from 0 (pure) to 3 (harbour).
+    ``artefact`` and ``target`` are what an operator would note about the things before the sensor: calibrated values,
+    the target's description; they travel in the capture.
+    """
+
+    title: str
+    medium: str = "water"
+    water: str | Annotated[float, Field(ge=0, le=3)] | None = None
+    motion: Motion = Motion()
+    objects: Annotated[tuple[AnyObject, ...], Field(min_length=1)]
+    placements: dict[str, Pose] = {"standoff": Pose()}
+    placement: str = "standoff"
+    window_mounted: bool = True
+    artefact: dict[str, Any] | None = None
+    target: dict[str, Any] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _targets_described(cls, table: Any) -> Any:
+        """A target_plate without a description of its own shows the scene's target."""
+        if not isinstance(table, dict) or table.get("target") is None or not isinstance(table.get("objects"), list):
+            return table
+        objects = [
+            {"target": table["target"]} | thing
+            if isinstance(thing, dict) and thing.get("kind") == "target_plate"
+            else thing
+            for thing in table["objects"]
+        ]
+        return table | {"objects": objects}
+
+    @model_validator(mode="after")
+    def _placement_known(self) -> "Scene":
+        if self.placement not in self.placements:
+            raise ValueError(f"placement '{self.placement}' is not one of {', '.join(self.placements)}")
+        return self
+
+    @model_validator(mode="after")
+    def _one_circle_plate(self) -> "Scene":
+        plates = [thing for thing in self.objects if isinstance(thing, CirclePlate)]
+        if len(plates) > 1 and any(plate.detection_std_px > 0 for plate in plates):
+            raise ValueError("detection_std_px is for scenes with one circle_plate: leave it out, or the other plates")
+        return self
+
+    def object_poses(self) -> list[np.ndarray]:
+        """Transforms (4, 4) from each object's own frame to the scene's."""
+        whole = self.placements[self.placement].matrix()
+        return [whole @ thing.matrix() for thing in self.objects]
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that ship with the package."""
+    return names()
+
+
+def load_scene(
+    name_or_path: str | Path,
+    *,
+    placement: str | None = None,
+    medium: str | None = None,
+    water: str | float | None = None,
+    motion: Motion | Mapping[str, object] | None = None,
+) -> Scene:
+    """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
+    path = find(name_or_path)
+    table = read_table(path)
+    if isinstance(motion, Motion):
+        motion = motion.model_dump()
+    given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
+    table |= {key: value for key, value in given.items() if value is not None}
+    objects = table.get("objects", [])
+    if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
+        raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
+    table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
+    return validated(Scene, table, path)
+
+
+def _with_paths_from(folder: Path, thing: dict[str, Any]) -> dict[str, Any]:
+    """An object's table with relative paths of mesh and texture starting at a folder."""
+    return thing | {key: str(folder / thing[key]) for key in ("path", "texture") if isinstance(thing.get(key), str)}

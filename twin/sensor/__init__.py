@@ -1,0 +1,1 @@
+"""From irradiance to grey values: speckle and detector."""

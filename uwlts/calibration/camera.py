@@ -1,0 +1,346 @@
+"""Camera parameters and target poses from images of a flat target, by the stage's displacements or by free poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
+from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
+from uwlts.calibration.target_images import Placement, TargetImage, observe, placements, single_images
+from uwlts.model.calibration import CameraModel
+from uwlts.model.errors import CalibrationError
+
+# Coordinates of size one: a direction in which points extend less than this share of the widest one, or a null vector
+# of the equations that is not alone by this share, cannot be told from rounding and lens distortion.
+_FLAT = 1e-4
+
+
+_AMBIGUOUS = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class LinearCamera:
+    """Camera matrix K (3, 3), rotation (3, 3) and translation (3,) in mm from the points' frame to the camera's."""
+
+    matrix: np.ndarray
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+
+
+def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> LinearCamera:
+    """Pinhole camera from at least six points in space, by the normalised linear method without lens distortion.
+
+    Hartley and Zisserman, Multiple View Geometry, 2nd ed., algorithm 7.1 (linear part) and section 6.2.4 (RQ).
+
+    Parameters
+    ----------
+    points_mm : (N, 3), mm, any frame
+    pixels : (N, 2), px
+
+    Raises
+    ------
+    CalibrationError
+        The points lie in one plane or are too few, or the image is mirrored against them.
+    """
+    if len(points_mm) < 6:
+        raise CalibrationError(f"the linear start needs at least 6 target points; there are {len(points_mm)}")
+    to_unit, unit = _normalised(points_mm)
+    pixel_to_unit, unit_pixels = _normalised(pixels)
+    extents = np.linalg.svd(unit[:, :3], compute_uv=False)
+    if extents[2] < _FLAT * extents[0]:
+        raise CalibrationError(
+            "all target points lie in one plane: move the stage between the target images, or use poses='free' with a "
+            "tilted target"
+        )
+    nothing = np.zeros_like(unit)
+    u, v = unit_pixels[:, :1], unit_pixels[:, 1:2]
+    equations = np.vstack([np.hstack([unit, nothing, -u * unit]), np.hstack([nothing, unit, -v * unit])])
+    # The triangular factor has the equations' singular values and is only 12 x 12.
+    _, singular, rows = np.linalg.svd(np.linalg.qr(equations, mode="r"))
+    if singular[10] < _AMBIGUOUS * singular[0]:
+        raise CalibrationError("the target points do not determine the camera: use more points, spread over the image")
+    projection = np.linalg.solve(pixel_to_unit, rows[11].reshape(3, 4)) @ to_unit
+    return _taken_apart(projection, points_mm)
+
+
+def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Similarity (D + 1, D + 1) to centroid zero and rms distance sqrt(D), and the homogeneous result (N, D + 1)."""
+    dimension = coordinates.shape[1]
+    centroid = coordinates.mean(axis=0)
+    spread = np.sqrt(np.mean(np.sum((coordinates - centroid) ** 2, axis=1)))
+    if not spread > 0:
+        raise CalibrationError("all target points fall on one place: is the target detected at all?")
+    similarity = np.eye(dimension + 1) * np.sqrt(dimension) / spread
+    similarity[:-1, -1] = -centroid * np.sqrt(dimension) / spread
+    similarity[-1, -1] = 1.0
+    return similarity, np.column_stack([coordinates, np.ones(len(coordinates))]) @ similarity.T
+
+
+def _taken_apart(projection: np.ndarray, points_mm: np.ndarray) -> LinearCamera:
+    depths = points_mm @ projection[2, :3] + projection[2, 3]
+    if np.median(depths) < 0:
+        projection = -projection
+    if np.linalg.det(projection[:, :3]) < 0:
+        raise CalibrationError(
+            "the target images are mirrored against the stage positions: the stage moved the other way than "
+            "stage_direction says, or the target's columns or rows are numbered the wrong way round"
+        )
+    # RQ from QR of the rows in reverse order; the signs make the camera matrix's diagonal positive.
+    orthogonal, triangular = np.linalg.qr(projection[::-1, :3].T)
+    matrix, rotation = triangular.T[::-1, ::-1], orthogonal.T[::-1]
+    signs = np.sign(np.diag(matrix))
+    matrix, rotation = matrix * signs, signs[:, None] * rotation
+    translation = np.linalg.solve(matrix, projection[:, 3])
+    return LinearCamera(matrix / matrix[2, 2], rotation, translation)
+
+
+def linear_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Camera parameters (P,) and poses (6,) of a target that the stage displaces along its normal.
+
+    The placement that reaches farthest gives both by the linear method, the others then have their poses found.
+    """
+    farthest = int(np.argmax([np.ptp(placement.shifts_mm) for placement in placements]))
+    points = placements[farthest].displaced(placements[farthest].direction(np.empty(0)))
+    start = direct_linear(points, placements[farthest].pixels)
+    global_values = intrinsics.from_matrix(start.matrix)
+    poses = [placement_pose(placement, intrinsics.matrix(global_values)) for placement in placements]
+    poses[farthest] = np.r_[cv2.Rodrigues(start.rotation)[0].ravel(), start.translation_mm]
+    return global_values, poses
+
+
+def planar_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Camera parameters (P,) and poses (6,) of single images: f from homographies, the principal point in the middle.
+
+    `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera calibration, PAMI 2000.
+    """
+    size = (intrinsics.width_px, intrinsics.height_px)
+    points = [placement.points_mm.astype(np.float32) for placement in placements]
+    pixels = [placement.pixels.astype(np.float32) for placement in placements]
+    matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
+    if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
+        raise CalibrationError(
+            "the target images do not show the focal length: tilt the target against the camera's axis, differently "
+            "from image to image"
+        )
+    global_values = intrinsics.from_matrix(matrix)
+    return global_values, [placement_pose(placement, intrinsics.matrix(global_values)) for placement in placements]
+
+
+def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
+    """Rotation vector and shift (6,) of a placement seen by a camera without distortion."""
+    points = placement.displaced(placement.direction(np.empty(0)))
+    found, rotation, translation = cv2.solvePnP(points, placement.pixels, matrix, None)
+    if not found:
+        raise CalibrationError("no pose of the target explains one of its images: is it the right target?")
+    return np.r_[rotation.ravel(), translation.ravel()]
+
+
+Poses = Literal["stage-normal", "stage", "free"]
+
+
+# Beyond these shares of f and of the image's side a camera counts as not determined: lengths would be wrong as much.
+_LARGEST_FOCAL_STD = 0.02
+
+
+_LARGEST_CENTRE_STD = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSolution:
+    """A calibrated camera and how well it was determined.
+
+    Attributes
+    ----------
+    model : CameraModel
+    target_poses : (F, 4, 4)
+        ``T_camera_target`` of every image.
+    residuals_px : list of (N, 2)
+        Found minus calculated pixel, for every image.
+    parameters : tuple of str
+        Names of the camera parameters that were estimated.
+    covariance : (P, P)
+        Of these parameters.
+    sigma_px : float
+        Standard deviation of one coordinate, with the degrees of freedom counted.
+    stage_direction : (3,) or None
+        Unit direction in which the stage moves the sensor, camera frame; None where free poses do not follow a stage.
+    stage_tilt_rad, stage_tilt_std_rad : float or None
+        Angle between that direction and the target's normal and its standard deviation, for poses "stage"; the largest
+        of all placements.
+    rounds : int
+    stopped : str
+        Why the iteration ended.
+    """
+
+    model: CameraModel
+    target_poses: np.ndarray
+    residuals_px: list[np.ndarray]
+    parameters: tuple[str, ...]
+    covariance: np.ndarray
+    sigma_px: float
+    stage_direction: np.ndarray | None
+    stage_tilt_rad: float | None
+    stage_tilt_std_rad: float | None
+    rounds: int
+    stopped: str
+
+    def std(self) -> dict[str, float]:
+        """Standard deviation of every estimated parameter."""
+        return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def image_rms_px(self) -> np.ndarray:
+        """Root mean square distance (F,) between found and calculated pixels of every image."""
+        return np.array([np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in self.residuals_px])
+
+    def rms_px(self) -> float:
+        """Root mean square distance between found and calculated pixels over all images."""
+        return float(np.sqrt(np.mean(np.sum(np.vstack(self.residuals_px) ** 2, axis=1))))
+
+
+def solve_camera(
+    images: Sequence[TargetImage],
+    *,
+    width_px: int,
+    height_px: int,
+    poses: Poses = "stage-normal",
+    approaching: bool = True,
+    options: CameraOptions | None = None,
+    start: CameraSolution | None = None,
+) -> CameraSolution:
+    """Calibrate the camera by least squares of the pixel distances.
+
+    The stage moves the sensor by s along d, so that the target moves by -s d as the sensor sees it: a point x of the
+    target is at R (x - (s - s0) d) + t in the camera frame, with d in the target's frame.
+
+    Parameters
+    ----------
+    images : sequence of TargetImage
+    width_px, height_px : int
+        Size of the images.
+    poses : {"stage-normal", "stage", "free"}
+        "stage-normal" (the thesis): one pose per placement of the target, d is the target's normal. "stage": d is
+        estimated too, for each placement; needs square pixels. "free": one pose per image, stage positions unused.
+    approaching : bool
+        Whether growing stage positions bring the sensor nearer to the target; unused by "free".
+    options : CameraOptions
+    start : CameraSolution, optional
+        A solution for nearly the same pixels, with the same options and poses.
+
+    Raises
+    ------
+    CalibrationError
+        Too few images, a stage that did not move, a target mirrored against the stage, parameters not determined.
+    """
+    options = CameraOptions() if options is None else options
+    intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
+    views = _accepted(images, poses, approaching, options)
+    if start is None:
+        global_values, local = planar_start(views, intrinsics) if poses == "free" else linear_start(views, intrinsics)
+        local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
+    else:
+        global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
+
+    def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
+        return observe(views[group], intrinsics, global_values, local)
+
+    fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
+    _refuse_undetermined(fit, intrinsics)
+    return _solution(images, views, fit, intrinsics, poses)
+
+
+def _accepted(
+    images: Sequence[TargetImage], poses: Poses, approaching: bool, options: CameraOptions
+) -> list[Placement]:
+    if poses == "free":
+        if len(images) < 3:
+            raise CalibrationError(f"free poses need at least 3 target images; there are {len(images)}")
+        return single_images(images)
+    if poses == "stage" and not options.square_pixels:
+        raise CalibrationError(
+            "a free stage direction and pixels that are not square cannot be told apart: give square pixels, or "
+            "poses='stage-normal' or 'free'"
+        )
+    views = placements(images, approaching=approaching)
+    if not any(np.any(view.shifts_mm) for view in views):
+        raise CalibrationError(
+            f"{len(images)} target images, but the stage did not move: move it between them, or use poses='free' with "
+            f"a tilted target"
+        )
+    return views
+
+
+def _restart(view: Placement, start: CameraSolution, poses: Poses) -> np.ndarray:
+    pose = start.target_poses[view.image[0]]
+    local = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
+    if poses != "stage":
+        return local
+    direction = pose[:3, :3].T @ start.stage_direction
+    return np.r_[local, direction[:2] / abs(direction[2])]
+
+
+def _refuse_undetermined(fit: SchurFit, intrinsics: Intrinsics) -> None:
+    values = dict(zip(intrinsics.names, fit.global_values, strict=True))
+    limits = {name: _LARGEST_FOCAL_STD * values[name] for name in ("f", "fx", "fy") if name in values}
+    limits |= {"cx": _LARGEST_CENTRE_STD * intrinsics.width_px, "cy": _LARGEST_CENTRE_STD * intrinsics.height_px}
+    for name, std in zip(intrinsics.names, np.sqrt(np.diag(fit.covariance)), strict=True):
+        if name in limits and not std <= limits[name]:
+            raise CalibrationError(
+                f"the target images determine {name} with a standard deviation of {std:.3g} px; more than "
+                f"{limits[name]:.3g} px is of no use: take more images, tilted differently, or fix some parameters"
+            )
+
+
+def _solution(
+    images: Sequence[TargetImage], views: list[Placement], fit: SchurFit, intrinsics: Intrinsics, poses: Poses
+) -> CameraSolution:
+    target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
+    residuals = [np.empty((0, 2))] * len(images)
+    for view, local, covariance, misses in zip(views, fit.local, fit.local_covariances, fit.residuals, strict=True):
+        rotation = cv2.Rodrigues(local[:3])[0]
+        directions.append(rotation @ view.direction(local[6:]))
+        for index in np.unique(view.image):
+            here = view.image == index
+            target_poses[index, :3, :3] = rotation
+            target_poses[index, :3, 3] = local[3:6] - view.shifts_mm[here][0] * directions[-1]
+            residuals[index] = misses[here]
+        if poses == "stage":
+            tilts.append(_tilt(local[6:], covariance[6:, 6:]))
+    mean = np.mean(directions, axis=0)
+    stage = stage_direction(target_poses, np.array([i.stage_mm for i in images])) if poses == "free" else None
+    return CameraSolution(
+        model=intrinsics.model(fit.global_values),
+        target_poses=target_poses,
+        residuals_px=residuals,
+        parameters=intrinsics.names,
+        covariance=fit.covariance,
+        sigma_px=fit.sigma,
+        stage_direction=stage if poses == "free" else mean / np.linalg.norm(mean),
+        stage_tilt_rad=max(tilts)[0] if tilts else None,
+        stage_tilt_std_rad=max(tilts)[1] if tilts else None,
+        rounds=fit.rounds,
+        stopped=fit.stopped,
+    )
+
+
+def _tilt(tilt: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Angle in rad between the stage's direction and the normal, and its standard deviation."""
+    size = float(np.hypot(*tilt))
+    outward = tilt / size if size > 0 else np.array([1.0, 0.0])
+    return float(np.arctan(size)), float(np.sqrt(outward @ covariance @ outward)) / (1 + size**2)
+
+
+def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarray | None:
+    """Unit direction (3,) in the camera frame in which the stage moves the sensor, from poses of a fixed target.
+
+    ``target_poses`` (F, 4, 4) are ``T_camera_target``; the target's origin moves against the sensor. None where the
+    stage stood still, or the poses do not move as far as it did: then the target was moved by other means.
+    """
+    moved = stage_mm - stage_mm.mean()
+    if not np.any(moved):
+        return None
+    velocity = -(moved @ target_poses[:, :3, 3]) / (moved @ moved)
+    speed = float(np.linalg.norm(velocity))
+    return velocity / speed if abs(speed - 1) < 0.05 else None

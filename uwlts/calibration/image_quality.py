@@ -1,0 +1,235 @@
+"""Whether an image of the target, or of the laser line on it, is good enough to be recorded, and if not why."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uwlts.model.errors import ImageError
+from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+from uwlts.targets import Target, TargetView
+
+# The edge of Gaussian blur s has the slope 0.4 / s over its contrast.
+_SLOPE_TIMES_BLUR = 0.4
+# So many points tell how sharp an image is.
+_JUDGED_POINTS = 80
+# Points with fewer neighbours on the plate than this are too far apart to compare two images by them.
+_FEWEST_COMMON = 4
+_STRIPE = StripeOptions()
+
+
+@dataclass(frozen=True)
+class QualityLimits:
+    """What an image must keep to.
+
+    Attributes
+    ----------
+    fewest_points : int
+        Points of the target in an image, where it has so many.
+    smallest_share : float
+        Share of the target's points; a target larger than the image is seen in part.
+    largest_blur_px : float
+        Gaussian blur (standard deviation) of the edges, median over the points.
+    smallest_contrast : float
+        Grey levels between bright and dark, median over the points, as a share of the full scale.
+    largest_saturated : float
+        Share of the pixels of the target, or of the stripe's lines, that reach the full scale.
+    largest_motion_px : float
+        Way of the points between two images of one pose, see `way_px`.
+    smallest_change_px : float
+        Way of the points from the nearest pose recorded before.
+    fewest_lines : int
+        Profile lines with the stripe on the target.
+    """
+
+    fewest_points: int = 12
+    smallest_share: float = 0.1
+    largest_blur_px: float = 2.5
+    smallest_contrast: float = 0.08
+    largest_saturated: float = 0.02
+    largest_motion_px: float = 0.5
+    smallest_change_px: float = 5.0
+    fewest_lines: int = 20
+
+
+@dataclass(frozen=True)
+class TargetQuality:
+    """How good an image of the target is; ``reasons`` are why it is refused, empty if it is not.
+
+    ``points`` is how many were found, ``share`` of how many the target has, ``blur_px`` the edges' Gaussian blur,
+    ``contrast`` and ``saturated`` are shares of the full scale and of the target's pixels.
+    """
+
+    points: int
+    share: float
+    blur_px: float
+    contrast: float
+    saturated: float
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class StripeQuality:
+    """How good a laser image is: stripe pixels (N, 2) on the target, the share of them saturated, and the reasons."""
+
+    pixels: np.ndarray
+    saturated: float
+    reasons: tuple[str, ...]
+
+    @property
+    def lines(self) -> int:
+        """Profile lines with the stripe on the target."""
+        return len(self.pixels)
+
+
+def judge_target(
+    image: np.ndarray, view: TargetView, target: Target, *, full_dn: int, limits: QualityLimits = QualityLimits()
+) -> TargetQuality:
+    """How good an image (H, W) is in which the target was found.
+
+    Parameters
+    ----------
+    full_dn : int
+        Grey value at which pixels clip.
+    """
+    count, of_all = len(view.pixels), len(target.indices)
+    share = count / of_all
+    blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
+    contrast = float(np.median(view.quality["contrast"])) / full_dn
+    saturated = _saturated(image, view.pixels, full_dn)
+    reasons = []
+    if count < min(limits.fewest_points, of_all) or share < limits.smallest_share:
+        reasons.append(f"partial: {count} of {of_all} points found; bring more of the target into the image")
+    if blur > limits.largest_blur_px:
+        reasons.append(
+            f"blurred: edges are {blur:.1f} px wide, at most {limits.largest_blur_px:g} are good; focus, or change "
+            "the distance"
+        )
+    if contrast < limits.smallest_contrast:
+        reasons.append(
+            f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
+            f"{100 * limits.smallest_contrast:.0f} % are good; more light or a longer lamp_ms"
+        )
+    if saturated > limits.largest_saturated:
+        reasons.append(
+            f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
+            f"{100 * limits.largest_saturated:.0f} % are good; less light or a shorter lamp_ms"
+        )
+    return TargetQuality(count, share, blur, contrast, saturated, tuple(reasons))
+
+
+def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> float:
+    """Gaussian blur of the edges around the points (N, 2), median: from the steepest slope and the whole contrast.
+
+    Each point is judged in a square of ``half_px`` to all sides, which holds bright and dark far from the edge: levels
+    read close to a blurred edge would make it look sharp.
+    """
+    grey = image.astype(np.float32)
+    slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
+    half = max(3, round(half_px))
+    blurs = []
+    for u, v in np.rint(pixels[:: max(1, len(pixels) // _JUDGED_POINTS)]).astype(int).tolist():
+        around = np.s_[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1]
+        dark, bright = np.quantile(grey[around], (0.05, 0.95))
+        blurs.append(_SLOPE_TIMES_BLUR * (bright - dark) / max(float(np.quantile(slope[around], 0.99)), 1e-6))
+    return float(np.median(blurs))
+
+
+def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
+    """Why no target was found: the light if that is it, else what the search for it said."""
+    brightest = float(np.quantile(image, 0.995)) / full_dn
+    clipped = float(np.mean(image >= full_dn))
+    if brightest < 0.1:
+        return f"too dark: the image reaches {100 * brightest:.0f} % of the full scale; more light or a longer lamp_ms"
+    if clipped > 0.3:
+        return f"saturated: {100 * clipped:.0f} % of the image is at the full scale; less light or a shorter lamp_ms"
+    return error
+
+
+def way_px(one: TargetView, other: TargetView) -> float:
+    """Distance in px that nine tenths of the points keep to which both views show; infinite where these are few.
+
+    A target that is turned about its middle moves its outer points only, so the median would not tell.
+    """
+    places = {tuple(place): k for k, place in enumerate(one.indices.tolist())}
+    pairs = [(places[tuple(p)], k) for k, p in enumerate(other.indices.tolist()) if tuple(p) in places]
+    if len(pairs) < _FEWEST_COMMON:
+        return float("inf")
+    first, second = np.array(pairs).T
+    return float(np.quantile(np.linalg.norm(one.pixels[first] - other.pixels[second], axis=1), 0.9))
+
+
+def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = QualityLimits()) -> tuple[str, ...]:
+    """Why two images of one pose do not belong together; empty if they do."""
+    way = way_px(before, after)
+    if way <= limits.largest_motion_px:
+        return ()
+    return (f"moved: the target went {way:.1f} px between its images, at most {limits.largest_motion_px:g} are good",)
+
+
+def judge_novelty(
+    view: TargetView, recorded: Sequence[TargetView], limits: QualityLimits = QualityLimits()
+) -> tuple[str, ...]:
+    """Why a pose adds nothing to those recorded; empty if it does."""
+    ways = [way_px(view, old) for old in recorded]
+    if not ways or min(ways) >= limits.smallest_change_px:
+        return ()
+    return (f"too similar to image {int(np.argmin(ways)) + 1}: {min(ways):.1f} px apart; move or tilt the target",)
+
+
+def judge_stripe(
+    image: np.ndarray,
+    view: TargetView,
+    target: Target,
+    *,
+    stripe_along: str,
+    full_dn: int,
+    options: StripeOptions = _STRIPE,
+    limits: QualityLimits = QualityLimits(),
+) -> StripeQuality:
+    """How good a laser image (H, W) is, taken at the pose in which the lamp showed the target in ``view``.
+
+    A stripe that misses the target is no fault of the image: then there are no lines, and no reasons.
+    """
+    try:
+        stripe = extract_stripe(image, stripe_along=stripe_along, options=options, saturation=full_dn)
+    except ImageError as error:
+        return StripeQuality(np.empty((0, 2)), 0.0, (str(error),))
+    brightest = image.max(axis=0 if stripe_along == "width" else 1)
+    found = stripe.status == StripeStatus.OK
+    pixels = stripe.pixels()
+    on_target = _within(pixels, _hull(view.pixels, margin_px=_spacing_px(view, target)))
+    clipped = (brightest >= full_dn) & (found | (stripe.status == StripeStatus.SATURATED))
+    lit = max(int(found.sum()), int(clipped.sum()), 1)
+    saturated = float(clipped.sum()) / lit
+    reasons = ()
+    if lit >= limits.fewest_lines and saturated > 0.05:
+        reasons = (f"stripe saturated on {100 * saturated:.0f} % of its lines, at most 5 % are good; shorten laser_ms",)
+    return StripeQuality(pixels[on_target], saturated, reasons)
+
+
+def _saturated(image: np.ndarray, pixels: np.ndarray, full_dn: int) -> float:
+    """Share of the pixels within the points' hull that are at the full scale."""
+    mask = np.zeros(image.shape, np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(_hull(pixels)).astype(np.int32), 1)
+    return float(np.mean(image[mask > 0] >= full_dn))
+
+
+def _hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
+    """Corners (K, 2) of the points' convex hull, moved out from its middle by a margin."""
+    hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
+    outward = hull - hull.mean(axis=0)
+    return hull + margin_px * outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+
+
+def _within(pixels: np.ndarray, hull: np.ndarray) -> np.ndarray:
+    """Which (N,) of the pixels (N, 2) lie in a convex polygon (K, 2)."""
+    outline = hull.astype(np.float32)
+    return np.array([cv2.pointPolygonTest(outline, (float(u), float(v)), False) >= 0 for u, v in pixels], dtype=bool)
+
+
+def _spacing_px(view: TargetView, target: Target) -> float:
+    """Roughly how far apart neighbouring points are in the image."""
+    size_px, size_mm = np.ptp(view.pixels, axis=0).max(), np.ptp(view.points_mm[:, :2], axis=0).max()
+    return float(target.spacing_mm * size_px / max(size_mm, 1e-9))

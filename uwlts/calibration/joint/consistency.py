@@ -1,0 +1,339 @@
+"""Checks whether evidence, prior knowledge and noise of a joint estimate agree, and which images and values do not."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import assert_never
+
+import numpy as np
+
+from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
+from uwlts.calibration.joint.evidence import TARGET, Residuals, TargetEvidence
+from uwlts.calibration.joint.noise import outliers
+from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.parameter_keys import (
+    LensParameter,
+    MediumIndex,
+    ParameterKey,
+    SheetParameter,
+    SingleParameter,
+    StageParameter,
+    StepHeight,
+    TargetParameter,
+    WindowParameter,
+)
+from uwlts.model.sensor import Sensor, Uncertainty
+
+_ALIGNMENT = "stage_direction in the captures, or uncertainty.stage_alignment_deg"
+
+
+_CHECK: dict[SingleParameter, str] = {
+    WindowParameter.DISTANCE: "camera.window.distance_mm or uncertainty.window_distance_mm",
+    WindowParameter.SLOPE_X: "the window's tilts or uncertainty.window_tilt_deg",
+    WindowParameter.SLOPE_Y: "the window's tilts or uncertainty.window_tilt_deg",
+    WindowParameter.THICKNESS: "camera.window: thickness_mm and mounted",
+    WindowParameter.GLASS_INDEX: "camera.window.glass",
+    SheetParameter.BOW: "the target's flatness, the laser, or uncertainty.bow_deg",
+    SheetParameter.WINDOW_TURN: "the medium, or uncertainty.laser_window_tilt_deg",
+    StageParameter.SLOPE_1: _ALIGNMENT,
+    StageParameter.SLOPE_2: _ALIGNMENT,
+    TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
+}
+"""What to check of the parameters of which something is known before."""
+
+
+def format_deviation(key: ParameterKey, value: float, known: float, std: float, *, sigmas: float) -> str:
+    """That the images alone say a value, so many standard uncertainties of both off what was known before."""
+    match key:
+        case StageParameter.SCALE:
+            return (
+                f"the stage moves {1 + value:.5g} mm per mm of its positions, stated 1 +- {std:g} ({sigmas:.1f} "
+                "standard uncertainties off): check the target's spacing and the stage's scale"
+            )
+        case MediumIndex():
+            check = "the medium and the step's height in the captures, or --index"
+        case StepHeight():
+            check = "which standard it is"
+        case LensParameter() | WindowParameter() | SheetParameter() | StageParameter() | TargetParameter():
+            check = _CHECK[key]
+        case _:
+            assert_never(key)
+    quantity = key.quantity
+    return (
+        f"{quantity.words} found {quantity.format_value(value, std)}, described as "
+        f"{quantity.format_with_std(known, std)} ({sigmas:.1f} standard uncertainties off): check {check}"
+    )
+
+
+_LARGEST_TARGET_PX, _LARGEST_STRIPE_PX = 0.5, 1.0
+"""Scatter beyond which target points or stripes were misdetected or contradict each other, whatever the image."""
+
+
+_FEWEST_VALUES = 20
+
+
+_OVER_OTHERS, _OVER_OTHERS_PX = 3.0, 0.15
+
+
+_OVER_NOISE = 2.5
+
+
+_WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
+"""Lines that err together; the filter that finds the stripe, and speckle, join two to four."""
+
+
+_OUTLIER_SHARE = 0.2
+
+
+_DOUBTFUL, _WRONG = 4.0, 6.0
+"""Standard uncertainties from what was known before. Those of drawings are guesses, so few are but doubtful."""
+
+
+_FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
+"""Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
+
+
+_POSITIONS_WRONG = 3.0
+
+
+_FEWEST_POSITIONS = 4
+
+
+_MOST_NAMED, _MOST_SAID = 4, 6
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What speaks against an estimate, in words: contradictions, which make it useless, and doubts."""
+
+    contradictions: list[str]
+    doubts: list[str]
+
+    def refusal(self) -> str:
+        """The gravest contradictions as a message."""
+        more = len(self.contradictions) - _MOST_SAID
+        said = "; ".join(self.contradictions[:_MOST_SAID])
+        return f"the evidence contradicts itself: {said}" + (f"; and {more} more contradictions" if more > 0 else "")
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Robust scatter of one kind of residual in one image, and that of its fine structure, which no parameter moves."""
+
+    source: str
+    kind: str
+    peers: tuple[str, object]
+    scatter_px: float
+    noise_px: float
+
+    def largest_px(self) -> float:
+        """Scatter that is too large for its kind, whatever the noise."""
+        return _LARGEST_TARGET_PX if self.kind == TARGET else _LARGEST_STRIPE_PX
+
+
+def findings(
+    result: Estimate, evidence: Sequence[Evidence], sources: Sequence[Mapping[int, str]], *, sensor: Sensor
+) -> Findings:
+    """What speaks against an estimate.
+
+    Parameters
+    ----------
+    result : Estimate
+    evidence : sequence
+        What it was made from.
+    sources : sequence of mapping
+        For every piece of evidence the names of its images by their numbers: capture and frame.
+    sensor : Sensor
+        As described.
+    """
+    images = [
+        _image(residuals, piece, names[residuals.image])
+        for piece, parts, names in zip(evidence, result.residuals, sources, strict=True)
+        for residuals in parts
+        if len(residuals.values) >= _FEWEST_VALUES
+    ]
+    contradictions, doubts = _of_priors(result)
+    contradictions += _of_stage(result, evidence, sources, sensor.uncertainty)
+    unlike, unusual = _of_lens(result, sensor)
+    contradictions += unlike
+    if not contradictions:
+        contradictions, of_earlier = _of_earlier(result)
+        doubts += of_earlier
+    worse, doubtful = _of_images(images)
+    contradictions += worse
+    contradictions += _of_kinds(images)
+    waves, slight_waves = _of_shapes(result)
+    contradictions += waves
+    doubts += unusual + doubtful + slight_waves
+    doubts += [
+        f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
+        for kind, share in much_left_out(result).items()
+    ]
+    if result.stopped == UNSETTLED:
+        doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
+    return Findings(contradictions, doubts)
+
+
+def _image(residuals: Residuals, evidence: Evidence, source: str) -> _Image:
+    values = residuals.values
+    scatter = MAD_TO_STD * float(np.median(np.abs(values)))
+    # Residuals of neighbouring points or lines share what a wrong model does to them.
+    steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
+    noise = MAD_TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
+    return _Image(source, residuals.kind, (residuals.kind, evidence.view), scatter, noise)
+
+
+def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
+    """Parameters far from what was known before."""
+    parameters = result.parameters
+    mean, before = parameters.prior_mean(), parameters.prior_std()
+    wrong, doubtful = [], []
+    for key, value, known, std, after in zip(
+        parameters.keys, result.values, mean, before, np.sqrt(np.diag(result.covariance)), strict=True
+    ):
+        if not np.isfinite(std):
+            continue
+        # The estimate contains the prior: this is the variance of their difference where both are right.
+        share = float(np.sqrt(max(std**2 - after**2, (0.1 * std) ** 2)))
+        sigmas = abs(value - known) / share
+        if sigmas > _DOUBTFUL:
+            alone = known + (value - known) * (std / share) ** 2
+            words = format_deviation(key, alone, known, std, sigmas=sigmas)
+            (wrong if sigmas > _WRONG else doubtful).append((sigmas, words))
+    return [words for _, words in sorted(wrong, reverse=True)], [words for _, words in sorted(doubtful, reverse=True)]
+
+
+def _of_earlier(result: Estimate) -> tuple[list[str], list[str]]:
+    """The parameter that new evidence moves farthest from an earlier calibration; one is named, as many go with it."""
+    earlier = result.parameters.earlier
+    if earlier is None:
+        return [], []
+    before, count = earlier.std(), len(earlier.values)
+    gained = before**2 - np.diag(result.covariance)[:count]
+    sigmas = np.abs(result.values[:count] - earlier.values) / np.sqrt(np.maximum(gained, (0.1 * before) ** 2))
+    worst = int(np.argmax(sigmas))
+    if sigmas[worst] <= _DOUBTFUL:
+        return [], []
+    quantity = result.parameters.keys[worst].quantity
+    value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
+    words = (
+        f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in the "
+        f"{quantity.words}: {quantity.format_value(value, std)} against {quantity.format_with_std(known, std)}: check "
+        "heights and media in the captures; if they are right, the sensor has changed, calibrate again"
+    )
+    return ([words], []) if sigmas[worst] > _WRONG else ([], [words])
+
+
+def _of_lens(result: Estimate, sensor: Sensor) -> tuple[list[str], list[str]]:
+    """A focal length far from the lens's: spacing, medium and stage can be wrong together and fit nevertheless."""
+    camera, described = result.parameters.camera(result.values), sensor.camera.focal_length_px()
+    off = abs(camera.fx_px / described - 1)
+    if off <= _FOCAL_DOUBTFUL:
+        return [], []
+    words = (
+        f"the focal length is {camera.fx_px:.1f} px, by the description {described:.1f} px: check the target's "
+        "spacing, the medium in the captures, and the lens"
+    )
+    return ([words], []) if off > _FOCAL_WRONG else ([], [words])
+
+
+def _of_stage(
+    result: Estimate, evidence: Sequence[Evidence], sources: Sequence[Mapping[int, str]], uncertainty: Uncertainty
+) -> list[str]:
+    """Directions and positions of the stage far from what its description says."""
+    found = []
+    std = uncertainty.stage_position_mm
+    for piece, local, names in zip(evidence, result.local, sources, strict=True):
+        if not (isinstance(piece, TargetEvidence) and piece.staged):
+            continue
+        tilt = float(np.degrees(np.arctan(np.hypot(*local[6:8]))))
+        if tilt > _WRONG * uncertainty.stage_alignment_deg:
+            found.append(
+                f"{_capture(names)}: the stage moves {tilt:.2g} deg off the target's normal, described as within "
+                f"{uncertainty.stage_alignment_deg:g} deg (uncertainty.stage_alignment_deg)"
+            )
+        errors, images = local[8:], piece.images()
+        # The first position has no error of its own, so all others share its.
+        errors = errors - np.median(np.append(errors, 0.0))
+        # One that is far off bends the camera and so moves the others too.
+        usual = max(std, MAD_TO_STD * float(np.median(np.abs(errors)))) if len(errors) else std
+        wrong = np.abs(errors) > _WRONG * usual
+        rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+        if 0 < wrong.sum() <= max(1, len(errors) // 4):
+            found += _some(
+                [
+                    f"{names[image]}: the stage stood {error:+.3f} mm from where it said, stated uncertainty {std:g} mm"
+                    for image, error in zip(images[wrong], errors[wrong], strict=True)
+                ]
+            )
+        elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
+            found.append(
+                f"{_capture(names)}: the stage's positions scatter by {rms:.3f} mm, stated uncertainty {std:g} mm "
+                "(uncertainty.stage_position_mm)"
+            )
+    return found
+
+
+def _of_images(images: Sequence[_Image]) -> tuple[list[str], list[str]]:
+    """Images that fit far worse than their like: contradictions where not by their own noise, else doubts."""
+    wrong, doubtful = [], []
+    for image in images:
+        others = [other.scatter_px for other in images if other.peers == image.peers and other is not image]
+        usual = float(np.median(others)) if others else image.noise_px
+        if image.scatter_px <= max(_OVER_OTHERS * usual, usual + _OVER_OTHERS_PX):
+            continue
+        shaped = image.scatter_px > _OVER_NOISE * image.noise_px
+        (wrong if shaped or image.scatter_px > image.largest_px() else doubtful).append(
+            f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), "
+            + (f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px")
+        )
+    return _some(wrong), _some(doubtful)
+
+
+def _of_kinds(images: Sequence[_Image]) -> list[str]:
+    """Kinds of residuals that scatter more than images are noisy."""
+    found = []
+    for kind in dict.fromkeys(image.kind for image in images):
+        of_kind = [image for image in images if image.kind == kind]
+        scatter = float(np.median([image.scatter_px for image in of_kind]))
+        noise = float(np.median([image.noise_px for image in of_kind]))
+        if scatter > of_kind[0].largest_px() or scatter > max(_OVER_NOISE * noise, noise + _OVER_OTHERS_PX):
+            worst = max(of_kind, key=lambda image: image.scatter_px)
+            found.append(
+                f"the {kind} is {scatter:.2f} px off (rms) in most images, noise accounts for {noise:.2f} px; worst is "
+                f"{worst.source} with {worst.scatter_px:.2f} px"
+            )
+    return found
+
+
+def _of_shapes(result: Estimate) -> tuple[list[str], list[str]]:
+    """Stripes whose residuals run together over many lines, as those of a wrong height or window do."""
+    wrong, doubtful = [], []
+    for kind, noise in result.noise.items():
+        if kind == TARGET or noise.together <= _WAVES_DOUBTFUL:
+            continue
+        (wrong if noise.together > _WAVES_WRONG else doubtful).append(
+            f"the {kind} is off in waves along itself rather than by noise ({noise.sigma_px:.2f} px rms, as good as "
+            f"one independent value in {noise.together:.0f} lines): check heights, media and what else was described"
+        )
+    return wrong, doubtful
+
+
+def much_left_out(result: Estimate) -> dict[str, float]:
+    """The share that was left out as outliers, of the kinds of residuals of which that is much."""
+    found = {}
+    for kind, noise in result.noise.items():
+        parts = [part for parts in result.residuals for part in parts if part.kind == kind]
+        share = float(np.concatenate([outliers(part, noise) for part in parts]).mean())
+        if share > _OUTLIER_SHARE:
+            found[kind] = share
+    return found
+
+
+def _capture(names: Mapping[int, str]) -> str:
+    return next(iter(names.values())).split(", frame ")[0]
+
+
+def _some(lines: list[str]) -> list[str]:
+    if len(lines) <= _MOST_NAMED:
+        return lines
+    return [*lines[:_MOST_NAMED], f"and {len(lines) - _MOST_NAMED} more images"]

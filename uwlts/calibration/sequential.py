@@ -1,0 +1,445 @@
+"""Sequential calibration: camera and sheet from captures in air, then the window's distance from a step."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+import numpy as np
+
+import uwlts
+from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
+from uwlts.calibration.circle_bias import UnbiasedSolution, solve_without_bias
+from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
+from uwlts.calibration.target_images import TargetImage
+from uwlts.calibration.window import StepImage, WindowSolution, label_step, solve_window
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.errors import CalibrationError, EvaluationError
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Sensor, Window
+from uwlts.storage.capture import Capture
+from uwlts.storage.capture_sources import source_of
+from uwlts.stripe import StripeOptions
+
+
+def camera_figures(solution: CameraSolution, unbiased: UnbiasedSolution | None) -> dict[str, Any]:
+    """Residuals, standard deviations and covariance of the camera; the stage's direction in the camera frame."""
+    direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
+    return {
+        "images": len(solution.residuals_px),
+        "points": sum(map(len, solution.residuals_px)),
+        "rms_px": solution.rms_px(),
+        "sigma_px": solution.sigma_px,
+        "image_rms_px": solution.image_rms_px().tolist(),
+        "std": solution.std(),
+        "parameters": list(solution.parameters),
+        "covariance": solution.covariance.tolist(),
+        "stage_direction": None if direction is None else direction.tolist(),
+        "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
+        "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
+        "largest_circle_bias_px": None if unbiased is None else unbiased.largest_bias_px(),
+        "rounds": solution.rounds,
+        "stopped": solution.stopped,
+    }
+
+
+def sheet_figures(solution: SheetSolution, points: StripePoints) -> dict[str, Any]:
+    """Distances of the stripe points from the sheet."""
+    return {
+        "images": len(np.unique(points.image)),
+        "points": len(points.points_mm),
+        "rms_mm": solution.rms_mm,
+        "max_mm": solution.max_mm,
+        "rejected_share": solution.rejected_share,
+        "normal_std_deg": float(np.degrees(solution.normal_std_rad)),
+        "turn_from_nominal_deg": float(np.degrees(solution.turn_rad)),
+    }
+
+
+def window_figures(solution: WindowSolution, sources: list[str]) -> dict[str, Any]:
+    """Step heights and their errors, the distance's standard deviations, the curve; what is missing is None."""
+    return {
+        "images": sources,
+        "distance_mm": solution.model.distance_mm,
+        "std_mm": solution.std_mm,
+        "scatter_std_mm": solution.scatter_std_mm,
+        "per_height": solution.per_height,
+        "heights_mm": solution.heights_mm.tolist(),
+        "errors_mm": solution.errors_mm.tolist(),
+        "height_std_mm": solution.height_std_mm.tolist(),
+        "image_distances_mm": _none_for_nan(solution.image_distances_mm),
+        "curve_mm": [_none_for_nan(row) for row in solution.curve_mm],
+        "bounds_mm": list(solution.bounds_mm),
+    }
+
+
+def _none_for_nan(values: np.ndarray) -> list[float | None]:
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+_LARGEST_USUAL_TURN = np.radians(5)
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """How the calibration is made.
+
+    Attributes
+    ----------
+    refractions : {1, 2}
+        2: a glass plate of known thickness and index; the images in air are taken without the window. 1: a single
+        interface; the images in air are taken with the window in place, whose effect goes into the distortion.
+    poses : {"stage-normal", "stage", "free"}
+        As for `solve_camera`.
+    camera : CameraOptions
+    stripe : StripeOptions
+    correct_circles : bool
+        Take out the offset between a circle's image and the image of its centre.
+    margin_mm : float, optional
+        How far the plate reaches beyond its outermost points; half their spacing unless given.
+    medium_index : float, optional
+        Replaces the index of the medium of the step images.
+    same_water : bool
+        Jointly: whether scans were taken in the same water as the target, not only in one described alike.
+    sizes_known : bool
+        Jointly: whether diameters and spacings of what was scanned count as calibrated where their uncertainty is
+        stated; they are estimated otherwise.
+    bounds_mm : (low, high), optional
+        Window distances to search.
+    """
+
+    refractions: Literal[1, 2] = 2
+    poses: Poses = "stage-normal"
+    camera: CameraOptions = CameraOptions()
+    stripe: StripeOptions = StripeOptions()
+    correct_circles: bool = True
+    margin_mm: float | None = None
+    medium_index: float | None = None
+    same_water: bool = True
+    sizes_known: bool = True
+    bounds_mm: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A calibration with everything a report shows of its making.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    air : AirEvidence
+    camera : CameraSolution
+    bias_px : list of (N, 2) or None
+        Offsets taken out of the circles' centres.
+    stripe_points : StripePoints
+    sheet : SheetSolution
+    steps : list of StepEvidence
+        Those used for the window, in the order of its figures.
+    window : WindowSolution or None
+    warnings : list of str
+    """
+
+    calibration: Calibration
+    air: AirEvidence
+    camera: CameraSolution
+    bias_px: list[np.ndarray] | None
+    stripe_points: StripePoints
+    sheet: SheetSolution
+    steps: list[StepEvidence]
+    window: WindowSolution | None
+    warnings: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All that the captures of a calibration show.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        As the captures of the target describe it.
+    medium_kind : str
+        Kind of the medium in which the target was seen.
+    stage_direction : (3,)
+        Nominal direction of the stage before the target, in the OCS.
+    approaching : bool or None
+        Whether the stage moves the sensor towards the target; None where that does not matter.
+    air : AirEvidence
+    plate : Window or None
+        Description of the camera's window before the step standard; None without step captures.
+    steps : list of StepEvidence
+    sources : dict
+        What the captures say of themselves, for the calibration's provenance.
+    warnings : list of str
+    """
+
+    sensor: Sensor
+    medium_kind: Literal["air", "fresh", "sea", "custom"]
+    stage_direction: np.ndarray
+    approaching: bool | None
+    air: AirEvidence
+    plate: Window | None
+    steps: list[StepEvidence]
+    sources: dict[str, Any]
+    warnings: list[str]
+
+
+def calibrate_sequentially(
+    air: Sequence[Capture],
+    steps: Sequence[Capture] = (),
+    *,
+    options: CalibrationOptions | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
+
+    Parameters
+    ----------
+    air : sequence of Capture
+        A target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
+        the target, those with the laser on, at the same stage positions, the stripe on it. Seen through the window in
+        another medium, and without step captures, they give the calibration of a single viewpoint: refraction goes
+        into focal length and distortion.
+    steps : sequence of Capture
+        A step standard in the medium of use.
+    options : CalibrationOptions
+    progress : callable, optional
+
+    Raises
+    ------
+    CalibrationError
+        The evidence does not determine the calibration or contradicts it.
+    DescriptionError
+        A capture does not describe its target or its step standard.
+    """
+    options = CalibrationOptions() if options is None else options
+    return solve(gather(air, steps, options=options, progress=progress), options=options)
+
+
+def gather(
+    air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
+) -> Evidence:
+    """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`."""
+    sensor = common_sensor([*air, *steps])
+    media = {capture.header.medium.kind for capture in air}
+    if len(media) > 1 or (steps and media != {"air"}):
+        raise CalibrationError(
+            f"the target was seen in {' and '.join(sorted(media))}: take all images of it in air if a step standard "
+            "is to find the window, else all in the medium of use"
+        )
+    found = air_evidence(air, stripe=options.stripe, progress=progress)
+    warnings = [*found.warnings, *_window_warnings(air, steps, options)]
+    on_steps: list[StepEvidence] = []
+    if steps:
+        on_steps, left_out = step_evidence(
+            steps, medium_index=options.medium_index, stripe=options.stripe, progress=progress
+        )
+        warnings += left_out
+        if not on_steps:
+            raise CalibrationError(no_stripe_in(steps))
+    return Evidence(
+        sensor=sensor,
+        medium_kind=air[0].header.medium.kind,
+        stage_direction=np.array(air[0].header.stage_direction),
+        approaching=None if options.poses == "free" else _approaching(air),
+        air=found,
+        plate=steps[0].header.sensor.camera.window if steps else None,
+        steps=on_steps,
+        sources=sources_of(air, steps),
+        warnings=warnings,
+    )
+
+
+def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
+    """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
+    sensor, found = evidence.sensor, evidence.air
+    camera, unbiased = _camera(evidence, options, start)
+    if found.no_stripe:
+        raise CalibrationError(found.no_stripe)
+    margin = found.target.spacing_mm / 2 if options.margin_mm is None else options.margin_mm
+    stripe_points = points_on_target(
+        camera.model, found.stripes, camera.target_poses, extent_mm=found.target.extent_mm, margin_mm=margin
+    )
+    pose = laser_pose(sensor)
+    sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
+    warnings = [*evidence.warnings, *_turn_warnings(camera, sheet, evidence)]
+    calibration = Calibration(
+        sensor_name=sensor.name,
+        stripe_along=sensor.camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
+        medium_kind=evidence.medium_kind,
+        camera=camera.model,
+        window=None,
+        sheet=sheet.model,
+        camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
+    )
+    used, window = [], None
+    if evidence.plate is not None:
+        used, window, left_out = _window(calibration, evidence, evidence.plate, options)
+        warnings += left_out
+    figures: dict[str, Any] = {"camera": camera_figures(camera, unbiased), "sheet": sheet_figures(sheet, stripe_points)}
+    if window is not None:
+        figures["window"] = window_figures(window, [step.source for step in used])
+    how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
+    calibration = calibration.model_copy(
+        update={
+            "window": None if window is None else window.model,
+            "residuals": figures,
+            "provenance": evidence.sources | how | {"warnings": warnings},
+        }
+    )
+    bias = None if unbiased is None else unbiased.bias_px
+    return CalibrationResult(calibration, found, camera, bias, stripe_points, sheet, used, window, warnings)
+
+
+def common_sensor(captures: Sequence[Capture]) -> Sensor:
+    """The first capture's sensor; CalibrationError where another has other optics, or there is none."""
+    if not captures:
+        raise CalibrationError("no capture is given: a calibration starts with one of a target")
+    sensor = captures[0].header.sensor
+
+    def optics(capture: Capture) -> dict[str, object]:
+        camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
+        return {
+            "image size": f"{camera.width_px} x {camera.height_px} px",
+            "stripe_along": camera.stripe_along,
+            "wavelength": f"{laser.wavelength_nm:g} nm",
+        }
+
+    for capture in captures[1:]:
+        own, other = optics(capture), optics(captures[0])
+        differ = ", ".join(
+            f"its {name} is {own[name]} against {other[name]}" for name in own if own[name] != other[name]
+        )
+        if differ:
+            camera = capture.header.sensor.camera
+            turned = (camera.height_px, camera.width_px) == (sensor.camera.width_px, sensor.camera.height_px)
+            raise CalibrationError(
+                f"{capture.path.name} comes from another sensor than {captures[0].path.name}: {differ}"
+                + ("; the images of one are turned by a quarter turn" if turned and "size" in differ else "")
+            )
+    return sensor
+
+
+def _camera(
+    evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None
+) -> tuple[CameraSolution, UnbiasedSolution | None]:
+    image = evidence.sensor.camera
+
+    def solved(images: Sequence[TargetImage], better: CameraSolution | None) -> CameraSolution:
+        return solve_camera(
+            images,
+            width_px=image.width_px,
+            height_px=image.height_px,
+            poses=options.poses,
+            approaching=evidence.approaching is not False,
+            options=options.camera,
+            start=better or start,
+        )
+
+    diameter_mm = evidence.air.target.circle_diameter_mm
+    if not options.correct_circles or diameter_mm is None:
+        return solved(evidence.air.images, None), None
+    unbiased = solve_without_bias(evidence.air.images, solved, diameter_mm=diameter_mm)
+    return unbiased.solution, unbiased
+
+
+def _approaching(air: Sequence[Capture]) -> bool:
+    """Whether the stage moves the sensor towards the target, which stands square to the OCS's Z before the sensor."""
+    along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
+    if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:
+        raise CalibrationError(
+            "the stage must move the sensor along the laser's axis (OCS Z), the same way in all captures; "
+            f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in sorted(along))}: use "
+            "poses='free' with a tilted target"
+        )
+    return bool(min(along) > 0)
+
+
+def _window(
+    calibration: Calibration, evidence: Evidence, plate: Window, options: CalibrationOptions
+) -> tuple[list[StepEvidence], WindowSolution, list[str]]:
+    window = nominal_window(plate, evidence.sensor, refractions=options.refractions)
+    used, images, warnings = [], [], []
+    for step in evidence.steps:
+        try:
+            images.append(step_image(calibration, window, step))
+            used.append(step)
+        except EvaluationError as error:
+            warnings.append(f"{step.source}: left out, {error}")
+    if not images:
+        raise CalibrationError(
+            "no step image can be used for the window's distance; " + "; ".join([*evidence.warnings, *warnings][:3])
+        )
+    return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
+
+
+def step_image(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
+    """A stripe on the step standard with its treads told apart; EvaluationError where it does not show two."""
+    standard = step.standard
+    return label_step(
+        calibration,
+        window,
+        step.pixels,
+        height_mm=standard.height_mm,
+        medium_index=step.medium_index,
+        edge_mm=standard.edge_mm,
+        reference=standard.reference,
+    )
+
+
+def nominal_window(plate: Window, sensor: Sensor, *, refractions: Literal[1, 2]) -> WindowModel:
+    """A window as described, as the reconstruction sees it: a glass plate, or one interface."""
+    normal = tuple(plate.normal().tolist())
+    if refractions == 1:
+        return WindowModel(refractions=1, distance_mm=plate.distance_mm, normal=normal)
+    return WindowModel(
+        refractions=2,
+        distance_mm=plate.distance_mm,
+        normal=normal,
+        thickness_mm=plate.thickness_mm,
+        glass_index=plate.index(sensor.laser.wavelength_nm),
+    )
+
+
+def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
+    if not all(capture.header.sensor.camera.window.mounted for capture in steps):
+        raise CalibrationError("a step capture says its camera has no window: there is no distance to find")
+    if not steps:
+        return []
+    mounted = [capture.header.sensor.camera.window.mounted for capture in air]
+    if options.refractions == 2 and any(mounted):
+        return [
+            "the window stood before the camera in air, so its shift of the rays went into the camera's parameters: "
+            "with two refractions take the images in air without it, or use refractions=1"
+        ]
+    if options.refractions == 1 and not all(mounted):
+        return ["the window was removed in air and is one interface in the medium: its thickness appears nowhere"]
+    return []
+
+
+def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:
+    warnings = []
+    if sheet.turn_rad > _LARGEST_USUAL_TURN:
+        warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")
+    if camera.stage_direction is not None:
+        nominal = camera_from_object(evidence.sensor)[:3, :3] @ evidence.stage_direction
+        cosine = camera.stage_direction @ nominal / np.linalg.norm(nominal)
+        turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        if turn > np.degrees(_LARGEST_USUAL_TURN):
+            warnings.append(f"the stage's direction is {turn:.1f} deg away from the capture's stage_direction")
+    return warnings
+
+
+def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, Any]:
+    """What a calibration was made from, by what and when, for its provenance."""
+    return {
+        "source": "calibration from captures",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "software": f"uwlts {uwlts.__version__}",
+        "air_captures": [source_of(capture) for capture in air],
+        "step_captures": [source_of(capture) for capture in steps],
+        "scan_captures": [source_of(capture) for capture in scans],
+    }

@@ -1,0 +1,15 @@
+"""The ``uwlts`` command: the sensor's software, from captures to evaluated point clouds."""
+
+import sys
+
+# Importing them adds their commands.
+from uwlts.cli import calibration, files, measuring, quality, recording, thesis
+from uwlts.cli.options import app
+from uwlts.runtime.console import run
+
+__all__ = ["app", "calibration", "files", "main", "measuring", "quality", "recording", "thesis"]
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(app))

@@ -1,0 +1,1 @@
+"""Reconstruction, uncertainty of points and figures, evaluation and verification."""

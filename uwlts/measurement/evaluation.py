@@ -1,0 +1,189 @@
+"""Evaluation of point clouds against artefacts with calibrated sizes and against ground truth."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from uwlts.measurement.evaluation_file import EvaluationRecord, write_record
+from uwlts.measurement.figure_uncertainty import figure_uncertainties
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.metrology.evaluation import ArtefactEvaluation, Figure, Quantity
+from uwlts.metrology.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
+from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
+from uwlts.model.errors import EvaluationError
+from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.truth import Truth, read_truth
+
+# What points from perfect images by true parameters have to keep (tests/system/test_campaign.py).
+TOLERANCE_MM = 0.010
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Result of `evaluate`.
+
+    Attributes
+    ----------
+    source : str
+        Name of the cloud.
+    cloud : PointCloud
+        The evaluated cloud with the deviation of every point from the artefact's fit, or without an artefact from the
+        true surface after a best fit.
+    artefact : ArtefactEvaluation or None
+        The artefact and everything measured of it; None where there is no artefact.
+    figures : tuple of Figure
+        Of the artefact, with uncertainties where the cloud has them.
+    truth, truth_after_best_fit : TruthComparison or None
+        Of the points as measured, and after the rigid motion that fits them best to the truth; None without a truth.
+    """
+
+    source: str
+    cloud: PointCloud
+    artefact: ArtefactEvaluation | None
+    figures: tuple[Figure, ...]
+    truth: TruthComparison | None
+    truth_after_best_fit: TruthComparison | None
+
+    def all_of(self, quantity: Quantity) -> tuple[Figure, ...]:
+        """All figures of a quantity; EvaluationError where there is none."""
+        found = tuple(figure for figure in self.figures if figure.key.quantity is quantity)
+        if not found:
+            shown = "no artefact" if self.artefact is None else f"the artefact '{self.artefact.kind}'"
+            raise EvaluationError(f"the evaluation of {shown} has no figure '{quantity}'")
+        return found
+
+    @property
+    def sphere_spacings(self) -> tuple[Figure, ...]:
+        """Spacings of consecutive spheres."""
+        return self.all_of(Quantity.SPACING_ERROR)
+
+    @property
+    def sphere_spacing(self) -> Figure:
+        """Spacing of consecutive spheres with the largest error."""
+        return max(self.sphere_spacings, key=lambda figure: abs(figure.value_mm))
+
+    @property
+    def diameters(self) -> tuple[Figure, ...]:
+        """Diameters of the spheres, or of the pipe."""
+        return self.all_of(Quantity.DIAMETER_ERROR)
+
+    @property
+    def step_height(self) -> Figure:
+        """Height of the step."""
+        return self.all_of(Quantity.HEIGHT_ERROR)[0]
+
+    @property
+    def probing_error(self) -> Figure:
+        """Probing error of the worst sphere."""
+        return self.all_of(Quantity.PROBING_ERROR)[0]
+
+    @property
+    def range_error(self) -> Figure:
+        """Range of the deviations from the plane."""
+        return self.all_of(Quantity.RANGE_ERROR)[0]
+
+    @property
+    def std(self) -> Figure:
+        """Standard deviation about the fitted surface, of the worst one."""
+        return self.all_of(Quantity.STD)[0]
+
+    def record(self) -> EvaluationRecord:
+        """Content of the evaluation's file; EvaluationError where the cloud's metadata does not fit in."""
+        found = self.artefact
+        content: dict[str, Any] = {"cloud": self.source, **self.cloud.metadata}
+        content |= {"artefact": found and found.artefact, "evaluation": found and found.as_dict(), "truth": None}
+        if self.truth is not None and self.truth_after_best_fit is not None:
+            content["truth"] = self.truth.as_dict() | {"after_best_fit": self.truth_after_best_fit.as_dict()}
+        if found is not None:
+            known = [(figure.key.name, figure.uncertainty) for figure in self.figures if figure.uncertainty is not None]
+            content["uncertainty"] = {
+                name: {"random_mm": u.random_mm, "systematic_mm": u.systematic_mm, "expanded_mm": u.expanded_mm}
+                for name, u in known
+            }
+        try:
+            return EvaluationRecord.model_validate(content)
+        except ValidationError as error:
+            details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
+            raise EvaluationError(f"the metadata of the cloud {self.source} is not valid: {details}") from error
+
+
+def evaluate(
+    cloud: PointCloud | str | Path,
+    artefact: Artefact | dict[str, Any] | str | Path | None = None,
+    truth: Truth | str | Path | None = None,
+    *,
+    source: str | None = None,
+) -> Evaluation:
+    """Compare a cloud with its artefact's calibrated sizes and, point by point, with ground truth.
+
+    Parameters
+    ----------
+    cloud : PointCloud or path
+        Points in the object coordinate system (OCS), mm.
+    artefact : Artefact, dict or path of a TOML file, optional
+        Kind and calibrated values; the one that the cloud's capture names unless given.
+    truth : Truth or path, optional
+        Ground truth of the capture, if it was rendered.
+    source : str, optional
+        Name of the cloud in the evaluation's file; that of the cloud's file or capture unless given.
+
+    Raises
+    ------
+    EvaluationError
+        There is neither an artefact nor a truth, an artefact's description is not valid, or the cloud does not show
+        the artefact.
+    CaptureError, DescriptionError
+        A file cannot be read.
+    """
+    if not isinstance(cloud, PointCloud):
+        source = source or Path(cloud).name
+        cloud = read_cloud(cloud)
+    if artefact is None:
+        artefact = cloud.metadata.get("artefact")
+    if isinstance(artefact, str | Path):
+        artefact = read_artefact(artefact)
+    elif isinstance(artefact, dict):
+        artefact = parse_artefact(artefact)
+    if truth is not None and not isinstance(truth, Truth):
+        truth = read_truth(truth)[1]
+    if artefact is None and truth is None:
+        raise EvaluationError(
+            "nothing to judge by: the capture names no artefact (give --artefact) and there is no truth file (--truth)"
+        )
+    compared, fitted = (None, None) if truth is None else _against_truth(cloud, truth)
+    found = None if artefact is None else evaluate_cloud(cloud, artefact)
+    figures: tuple[Figure, ...] = ()
+    deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm
+    if found is not None:
+        known = figure_uncertainties(cloud, found)
+        figures = tuple(replace(figure, uncertainty=known.get(figure.key.name)) for figure in found.figures)
+        deviation = found.deviation_mm
+    name = source or str(cloud.metadata.get("capture", ""))
+    return Evaluation(name, replace(cloud, deviation_mm=deviation), found, figures, compared, fitted)
+
+
+def _against_truth(cloud: PointCloud, truth: Truth) -> tuple[TruthComparison, TruthComparison]:
+    """Comparison as measured, and after the rigid motion that takes out the difference of the coordinate systems."""
+
+    def compared(points: np.ndarray) -> TruthComparison:
+        return compare_with_truth(
+            points,
+            cloud.frame,
+            cloud.line,
+            point_mm=truth.point_mm,
+            normal=truth.normal,
+            status=truth.status,
+            tolerance_mm=TOLERANCE_MM,
+        )
+
+    plain = compared(cloud.points_mm)
+    motion = best_fit_motion(plain, cloud.points_mm)
+    return plain, compared(cloud.points_mm @ motion[:3, :3].T + motion[:3, 3])
+
+
+def write_evaluation(path: str | Path, evaluation: Evaluation, *, overwrite: bool = False) -> None:
+    """Write an evaluation as indented JSON, whole or not at all; OutputError where that fails."""
+    write_record(path, evaluation.record(), overwrite=overwrite)

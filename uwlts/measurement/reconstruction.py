@@ -1,0 +1,201 @@
+"""Reconstruction of captures: point clouds from the stripes of all laser images by a calibration of any kind."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.measurement.point_uncertainty import point_uncertainty
+from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightness
+from uwlts.optics.reconstruction import ObjectPoints, reconstruct_by_polynomials, reconstruct_profile
+from uwlts.optics.window import RayStatus, require_index
+from uwlts.storage.calibration_file import loaded_calibration
+from uwlts.storage.capture import Capture, opened_capture
+from uwlts.storage.cloud import PointCloud
+from uwlts.stripe import FoundStripes, StripeOptions, find_stripes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanCloud(PointCloud):
+    """The cloud of a capture, and what became of the profile lines of all its laser images.
+
+    Attributes
+    ----------
+    stripe : (N,) int
+        Number, in the capture's `FoundStripes`, of the stripe centre that each point comes from.
+    lines_by_status : dict
+        Number of profile lines by the name of their `StripeStatus`, and ``blurred`` by a joint calibration.
+    rays_by_status : dict
+        Number of stripe centres by the name of their `RayStatus`.
+    """
+
+    stripe: np.ndarray
+    lines_by_status: dict[str, int]
+    rays_by_status: dict[str, int]
+
+
+def reconstruct(
+    capture: Capture | str | Path,
+    calibration: AnyCalibration | str | Path,
+    *,
+    options: StripeOptions = StripeOptions(),
+    index: float | None = None,
+    with_uncertainty: bool | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ScanCloud:
+    """Point cloud of a capture: finds the stripes of all laser images and turns them into points.
+
+    Parameters
+    ----------
+    capture : Capture or path
+    calibration : Calibration, PolynomialCalibration or path
+    options : StripeOptions, optional
+        How stripes are found.
+    index : float, optional
+        Refractive index of the medium relative to air, in place of the one that follows from the capture.
+    with_uncertainty : bool, optional
+        Calculate the uncertainty of the points; by default with a joint calibration, which alone holds one.
+    progress : callable, optional
+        Called after each image with the number of images done and the number in all.
+
+    Returns
+    -------
+    ScanCloud
+        ``points_mm`` (N, 3) in the object coordinate system, ``covariance_mm2`` (N, 3, 3) or None.
+
+    Raises
+    ------
+    CaptureError, CalibrationError, RangeError
+        As `find_stripes` and `reconstruct_stripes`; or a file cannot be read.
+    """
+    calibration = loaded_calibration(calibration)
+    with opened_capture(capture) as scan:
+        check_fits(scan.header, calibration, source=scan.path.name)
+        stripes = find_stripes(scan, options=options, progress=progress)
+        known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
+        return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
+
+
+def reconstruct_stripes(
+    capture: Capture,
+    stripes: FoundStripes,
+    calibration: AnyCalibration,
+    *,
+    index: float | None = None,
+    with_uncertainty: bool = False,
+) -> ScanCloud:
+    """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
+
+    ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` adds the
+    uncertainty of the points by a joint calibration. Without a window in the light's way
+    the calibration's window is left out. Points that a calibration by polynomials does not reach are left out and
+    counted in ``rays_by_status``.
+
+    By a joint calibration points are taken where the light comes from, beside the sheet's middle where the surface
+    shines brighter there (`uwlts.optics.brightness`), and lines are left out, counted as ``blurred``, where blur may
+    move the stripe's centre more than noise does.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration does not fit the capture, or an index is given for a calibration by polynomials.
+    RangeError
+        The refractive index is none of a medium.
+    """
+    check_fits(capture.header, calibration, source=capture.path.name)
+    if index is not None and isinstance(calibration, PolynomialCalibration):
+        raise CalibrationError(
+            "polynomials hold the refraction of the medium they were made in: a refractive index cannot replace it"
+        )
+    index = calibration.index_of(capture.header.medium) if index is None else index
+    require_index(index)
+    lines = stripes.lines_by_status
+    sharp, blur = np.arange(len(stripes.line)), np.zeros(len(stripes.line))
+    exact = calibration if isinstance(calibration, Calibration) and calibration.joint is not None else None
+    if exact is not None:
+        sharp, blur = sharp_lines(stripes)
+        blurred = len(stripes.line) - len(sharp)
+        lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
+        stripes = stripes[sharp]
+    found = _points(capture, calibration, stripes, index)
+    beside = np.zeros((len(sharp), 3)) if exact is None else _beside(capture, exact, stripes, index)
+    points = _posed(found.points_mm + beside, capture, stripes.frame)
+    good = np.flatnonzero(found.status == RayStatus.OK)
+    kept = stripes[good]
+    known = None
+    if with_uncertainty:
+        if exact is None:
+            raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
+        known = point_uncertainty(
+            capture, exact, kept.frame, kept.line, kept.centre_px, blur_px=blur[good], beside_mm=beside[good]
+        )
+    rays = np.bincount(found.status, minlength=len(RayStatus))
+    return ScanCloud(
+        points_mm=points[good],
+        intensity=kept.amplitude,
+        frame=kept.frame,
+        line=kept.line,
+        uncertainty=known,
+        metadata={
+            "capture": capture.path.name,
+            "sensor": calibration.sensor_name,
+            "medium": capture.header.medium_name,
+            "medium_index": index,
+            "artefact": capture.header.artefact,
+            "calibration": calibration_digest(calibration),
+        },
+        stripe=sharp[good],
+        lines_by_status=lines,
+        rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
+    )
+
+
+def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes, index: float) -> ObjectPoints:
+    """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
+    stage, direction = capture.stage_mm[stripes.frame], np.array(capture.header.stage_direction)
+    line, centre = stripes.line, stripes.centre_px
+    if isinstance(calibration, PolynomialCalibration):
+        return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
+    direction = np.array(calibration.stage_direction_of(capture.header.stage_direction))
+    if not capture.header.sensor.camera.window.mounted:
+        calibration = calibration.model_copy(update={"window": None})
+    return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
+
+
+def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:
+    """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
+    if np.isfinite(capture.pose).any():
+        return np.zeros((len(stripes.line), 3))
+    slopes = slopes_of_brightness(
+        stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm[:], capture.exposure_ms[:]
+    )
+    header = capture.header
+    return beside_sheet(
+        calibration,
+        header.sensor,
+        stripes.line,
+        stripes.centre_px,
+        stripes.width_px,
+        slopes,
+        medium_index=index,
+        stage_direction=header.stage_direction,
+    )
+
+
+def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:
+    """Points of frames that carry a full pose ``T_scene_object`` are placed by it instead of by the stage."""
+    posed = np.isfinite(capture.pose).all(axis=(1, 2))
+    if not posed.any():
+        return points
+    points = points.copy()
+    for number in np.flatnonzero(posed):
+        own = frame == number
+        at_stage = capture.stage_mm[number] * np.array(capture.header.stage_direction)
+        pose = capture.pose[number]
+        points[own] = (points[own] - at_stage) @ pose[:3, :3].T + pose[:3, 3]
+    return points

@@ -1,0 +1,145 @@
+"""Verification in the field: a known object is measured, and the result must agree with its certificate."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.measurement.figure_uncertainty import figure_uncertainties
+from uwlts.measurement.reconstruction import reconstruct
+from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.artefacts import parse_artefact
+from uwlts.model.errors import EvaluationError, RangeError
+from uwlts.storage.calibration_file import loaded_calibration
+from uwlts.storage.capture import Capture, opened_capture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """One calibrated quantity, measured.
+
+    Attributes
+    ----------
+    quantity : str
+    calibrated_mm, measured_mm : float
+    calibrated_expanded_mm, measured_expanded_mm : float or None
+        Expanded uncertainties (k = 2) of the calibrated and of the measured value; None where not known.
+    limit_mm : float or None
+        Largest permissible error.
+    """
+
+    quantity: str
+    calibrated_mm: float
+    measured_mm: float
+    calibrated_expanded_mm: float | None
+    measured_expanded_mm: float | None
+    limit_mm: float | None
+
+    @property
+    def error_mm(self) -> float:
+        """Measured less calibrated value."""
+        return self.measured_mm - self.calibrated_mm
+
+    @property
+    def expanded_mm(self) -> float:
+        """Expanded uncertainty of the error, of what is known of it."""
+        return float(np.hypot(self.calibrated_expanded_mm or 0.0, self.measured_expanded_mm or 0.0))
+
+    @property
+    def normalised_error(self) -> float | None:
+        """E_n of ISO/IEC 17043: error over expanded uncertainty; None where the measured value's is not known."""
+        return None if self.measured_expanded_mm is None else abs(self.error_mm) / self.expanded_mm
+
+    @property
+    def passed(self) -> bool:
+        """Whether E_n is 1 at most and the error within its limit, as far as there are these.
+
+        The limit is kept if the error and its expanded uncertainty together do (ISO 14253-1, conformity proven).
+        """
+        agrees = self.normalised_error is None or self.normalised_error <= 1.0
+        return agrees and (self.limit_mm is None or abs(self.error_mm) + self.expanded_mm <= self.limit_mm)
+
+    @property
+    def text(self) -> str:
+        """The verdict in one line."""
+        text = f"{self.quantity}: {self.measured_mm:.4f} mm, calibrated {self.calibrated_mm:.4f} mm, "
+        text += f"error {self.error_mm:+.4f} ± {self.expanded_mm:.4f} mm"
+        if self.normalised_error is not None:
+            text += f", E_n {self.normalised_error:.2f}"
+        if self.limit_mm is not None:
+            text += f", limit {self.limit_mm:g} mm"
+        return f"{text}: {'pass' if self.passed else 'FAIL'}"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Verdicts on all calibrated quantities of an artefact."""
+
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all verdicts are passed."""
+        return all(verdict.passed for verdict in self.verdicts)
+
+    @property
+    def text(self) -> str:
+        """One line for each verdict."""
+        return "\n".join(verdict.text for verdict in self.verdicts)
+
+
+def verify(
+    capture: Capture | str | Path, calibration: AnyCalibration | str | Path, limit_mm: float | None = None
+) -> Verification:
+    """Measure the artefact that a capture shows and compare it with its calibrated values.
+
+    Parameters
+    ----------
+    capture : Capture or path
+    calibration : Calibration, PolynomialCalibration or path
+    limit_mm : float, optional
+        Largest permissible error, mm.
+
+    Raises
+    ------
+    EvaluationError
+        The capture names no artefact with a calibrated size, does not show it, or there is nothing to judge by: neither
+        a limit nor a joint calibration, which alone holds the measurement's uncertainty.
+    RangeError
+        The limit is not positive.
+    CalibrationError, CaptureError
+        The calibration does not fit the capture, there is no stripe, or a file cannot be read.
+    """
+    if limit_mm is not None and not limit_mm > 0:
+        raise RangeError(f"--limit is {limit_mm:g} mm; a permissible error is positive")
+    calibration = loaded_calibration(calibration)
+    with opened_capture(capture) as scan:
+        if calibration.joint is None and limit_mm is None:
+            raise EvaluationError(
+                "the calibration holds no uncertainty to judge by: give --limit, or calibrate jointly"
+            )
+        if scan.header.artefact is None:
+            raise EvaluationError(f"{scan.path.name} does not say what it shows: its header needs an artefact")
+        artefact = parse_artefact(scan.header.artefact)
+        cloud = reconstruct(scan, calibration)
+    evaluation = evaluate_cloud(cloud, artefact)
+    known = figure_uncertainties(cloud, evaluation)
+    verdicts = []
+    for figure in evaluation.figures:
+        calibrated = figure.key.calibrated
+        if calibrated is None or figure.key.is_detail:
+            continue
+        verdicts.append(
+            Verdict(
+                quantity=calibrated.name,
+                calibrated_mm=calibrated.value_mm,
+                measured_mm=figure.measured_mm,
+                calibrated_expanded_mm=calibrated.uncertainty_mm,
+                measured_expanded_mm=known[figure.key.name].expanded_mm if figure.key.name in known else None,
+                limit_mm=limit_mm,
+            )
+        )
+    if not verdicts:
+        raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size to verify by")
+    return Verification(tuple(verdicts))

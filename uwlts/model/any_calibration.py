@@ -1,0 +1,98 @@
+"""Calibrations of any kind: reading, digest, and whether one fits a recording."""
+
+import hashlib
+from typing import Protocol
+
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.sensor import Medium, Sensor
+
+AnyCalibration = Calibration | PolynomialCalibration
+
+
+# Polynomials hold the refraction they were made with: so much more, as from 20 to 30 degC, moves a point 300 mm away by
+# 0.2 mm.
+_LARGEST_INDEX_CHANGE = 1e-3
+
+
+class RecordingDescription(Protocol):
+    """What has to be known of a recording to choose its calibration; the header of a capture is one."""
+
+    @property
+    def sensor(self) -> Sensor: ...
+
+    @property
+    def medium(self) -> Medium: ...
+
+    @property
+    def medium_name(self) -> str: ...
+
+
+def calibration_digest(calibration: AnyCalibration) -> str:
+    """Short digest that identifies a calibration, as the clouds made with it name it."""
+    return hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
+
+
+def check_fits(header: RecordingDescription, calibration: AnyCalibration, *, source: str) -> None:
+    """Refuse a calibration that cannot belong to a recording, by the recording's description.
+
+    Parameters
+    ----------
+    header : RecordingDescription
+        As a capture's header.
+    calibration : Calibration or PolynomialCalibration
+    source : str
+        Name of the recording for messages.
+
+    Raises
+    ------
+    CalibrationError
+        Image size or stripe orientation differ; the recording was made in water and the calibration has no window; or
+        the calibration is one by polynomials and the recording was made in another medium, or with the window on in one
+        and off in the other.
+    """
+    camera = header.sensor.camera
+    model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera
+    if (camera.width_px, camera.height_px) != (model.width_px, model.height_px):
+        raise CalibrationError(
+            f"{source} has images of {camera.width_px} x {camera.height_px} pixels, the calibration is for "
+            f"{model.width_px} x {model.height_px}"
+            + (
+                ": the images are turned by a quarter turn, turn them back"
+                if (camera.height_px, camera.width_px) == (model.width_px, model.height_px)
+                else ": calibrate with images of this size, or use the calibration of the camera that took these"
+            )
+        )
+    if camera.stripe_along != calibration.stripe_along:
+        raise CalibrationError(
+            f"in {source} the stripe runs along the image's {camera.stripe_along}, in the calibration along "
+            f"its {calibration.stripe_along}"
+        )
+    if isinstance(calibration, PolynomialCalibration):
+        _check_same_refraction(header, calibration, source=source)
+    elif header.medium.kind not in ("air", calibration.medium_kind) and calibration.window is None:
+        raise CalibrationError(
+            f"{source} was made in {header.medium_name}, but the calibration is for "
+            f"{calibration.medium_kind} only: calibrate again with step images taken in the medium (--step)"
+        )
+    elif header.medium.kind == "air" and calibration.medium_kind != "air":
+        raise CalibrationError(
+            f"{source} was made in air, but the calibration is that of a single viewpoint in water "
+            f"({calibration.medium_kind}): its camera holds the refraction; calibrate in air"
+        )
+
+
+def _check_same_refraction(header: RecordingDescription, calibration: PolynomialCalibration, *, source: str) -> None:
+    own = calibration.medium
+    index, own_index = calibration.index_of(header.medium), calibration.index_of(own)
+    if header.medium.kind != own.kind or abs(index - own_index) > _LARGEST_INDEX_CHANGE:
+        raise CalibrationError(
+            f"{source} was made in {header.medium_name} ({header.medium.kind}, n {index:.4f}), the "
+            f"polynomials in {calibration.medium_name} ({own.kind}, n {own_index:.4f}): they hold in the medium they "
+            "were made in only; calibrate again in this one"
+        )
+    if header.sensor.camera.window.mounted != calibration.window_mounted:
+        with_window, without = "with the camera's window", "without the camera's window"
+        here, there = (with_window, without) if not calibration.window_mounted else (without, with_window)
+        raise CalibrationError(f"{source} was made {here}, the polynomials {there}: calibrate again")

@@ -1,0 +1,95 @@
+"""Descriptions of artefacts with their calibrated sizes, distinguished by `kind`."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+
+from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError
+from uwlts.model.sensor import Description, NotNegative, Positive
+
+_MOST_SPHERES = 6
+
+
+class SphereStandard(Description):
+    """Spheres in fixed positions; two make the dumbbell of VDI/VDE 2634, one gives the probing error alone.
+
+    Spheres whose calibrated sizes and spacings leave their order open (within 0.5 % of the smallest diameter) are
+    taken in the order of rising Y or X, whichever their centres spread along more. `cap_angle_deg` leaves out points
+    farther than that from the point of the sphere that faces the sensor (-Z).
+    """
+
+    kind: Literal["spheres"] = "spheres"
+    diameters_mm: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=_MOST_SPHERES)]
+    spacings_mm: tuple[Positive, ...] = ()
+    diameter_uncertainty_mm: NotNegative | None = None
+    spacing_uncertainty_mm: NotNegative | None = None
+    cap_angle_deg: Annotated[float, Field(gt=0, le=180)] | None = None
+
+    @model_validator(mode="after")
+    def _one_spacing_between_neighbours(self) -> "SphereStandard":
+        if len(self.spacings_mm) != len(self.diameters_mm) - 1:
+            raise ValueError(
+                f"{len(self.diameters_mm)} spheres have {len(self.diameters_mm) - 1} spacings between consecutive "
+                f"ones; {len(self.spacings_mm)} are given"
+            )
+        pairs = zip(self.spacings_mm, self.diameters_mm, self.diameters_mm[1:], strict=False)
+        for spacing, first, second in pairs:
+            if spacing < (first + second) / 2:
+                raise ValueError(f"spheres of {first} and {second} mm cannot stand {spacing} mm apart: they overlap")
+        return self
+
+
+class PlaneStandard(Description):
+    """A flat surface."""
+
+    kind: Literal["plane"] = "plane"
+    flatness_mm: NotNegative | None = None
+
+
+class StepStandard(Description):
+    """Parallel faces at two levels, one step or several of the same height (base - block - base)."""
+
+    kind: Literal["step"] = "step"
+    height_mm: Positive
+    height_uncertainty_mm: NotNegative | None = None
+    reference: Literal["lower", "upper"] = "lower"
+    edge_mm: NotNegative = 1.0
+
+
+class Pipe(Description):
+    """A cylinder seen from outside or inside."""
+
+    kind: Literal["pipe"] = "pipe"
+    diameter_mm: Positive
+    diameter_uncertainty_mm: NotNegative | None = None
+
+
+Artefact = Annotated[SphereStandard | PlaneStandard | StepStandard | Pipe, Field(discriminator="kind")]
+
+
+def parse_artefact(table: dict[str, Any]) -> Artefact:
+    """An artefact's description; EvaluationError naming what is wrong with it."""
+    try:
+        return TypeAdapter(Artefact).validate_python(table)
+    except ValidationError as error:
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
+        raise EvaluationError(f"the artefact's description is not valid: {details}") from error
+
+
+def read_artefact(path: str | Path) -> Artefact:
+    """An artefact's description from a TOML file.
+
+    Raises
+    ------
+    CaptureError, DescriptionError, EvaluationError
+        The file cannot be read, is no TOML, or does not describe an artefact.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
+    return parse_artefact(table)

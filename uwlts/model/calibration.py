@@ -1,0 +1,203 @@
+"""The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
+
+import json
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from uwlts.model.joint_estimate import JointEstimate, Origin, joint_estimate_in
+from uwlts.model.sensor import Description, Distortion, Medium, Positive, Vector
+
+Matrix4 = tuple[tuple[float, float, float, float], ...]
+
+
+class CameraModel(Description):
+    """Pinhole with Brown-Conrady distortion, as OpenCV has it; pixel (0, 0) is the centre of the first pixel."""
+
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: float
+    cy_px: float
+    distortion: Distortion = Distortion()
+
+    def matrix(self) -> np.ndarray:
+        """Camera matrix K (3, 3)."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    def coefficients(self) -> np.ndarray:
+        """Distortion coefficients (5,) in OpenCV's order k1 k2 p1 p2 k3."""
+        d = self.distortion
+        return np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+
+
+class WindowModel(Description):
+    """The camera's window as the reconstruction sees it, in the camera frame.
+
+    ``refractions`` is 2 for a glass plate (air, glass, medium) and 1 for a single interface between air and medium, as
+    in the thesis's first model; then thickness and glass index are not used. ``distance_mm`` runs along the camera's
+    axis from the entrance pupil to the inner face (or to the single interface).
+    """
+
+    refractions: Literal[1, 2]
+    distance_mm: Positive
+    normal: Vector = (0.0, 0.0, 1.0)
+    thickness_mm: Annotated[float, Field(ge=0)] = 0.0
+    glass_index: Annotated[float, Field(ge=1, lt=4)] = 1.0
+
+
+class FanModel(Description):
+    """How the laser sheet departs from a plane, and what the laser's window does to it, in the camera frame.
+
+    The fan begins at ``apex_mm`` and runs along the unit vector ``axis``. A beam that enters the line optics tilted by
+    the angle ``bow_rad`` gives a cone rather than a plane. The normal of the laser's window is turned by
+    ``window_turn_rad`` against the sheet, about axis x normal, so that a medium turns the sheet about ``pivot_mm``.
+    """
+
+    apex_mm: Vector
+    axis: Vector
+    pivot_mm: Vector
+    bow_rad: float = 0.0
+    window_turn_rad: float = 0.0
+
+
+class SheetModel(Description):
+    """The laser sheet in the camera frame: in air, without bow, the points x with ``normal . x = offset_mm``.
+
+    Without a ``fan`` it is that plane in every medium; `uwlts.optics.sheet` says what it is with one.
+    """
+
+    normal: Vector
+    offset_mm: float
+    fan: FanModel | None = None
+
+
+class KnownMedium(Description):
+    """A medium as captures describe it, and the refractive index that its calibration found."""
+
+    medium: Medium
+    index: Annotated[float, Field(ge=1, lt=2)]
+
+
+class KnownStage(Description):
+    """A stage by the direction in which captures say it moves the sensor, and the one found, both in the OCS."""
+
+    described: Vector
+    direction: Vector
+
+
+class Calibration(Description):
+    """A calibrated sensor.
+
+    ``window`` is None where none stands in the light's way, or where its effect was left to focal length and
+    distortion. Without a window the calibration holds in the kind of medium in which the target was seen,
+    ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix
+    ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
+    ``stripe_along`` is as in the sensor description. ``media`` are those of the evidence: in just these the index
+    found replaces the one that follows from the description. ``stages`` are those whose direction was found.
+    ``residuals`` are named figures of each step, ``provenance`` what the calibration was made from. ``joint`` is the
+    joint estimate where there is one; in the file it is among the residuals.
+    """
+
+    sensor_name: str
+    stripe_along: Literal["width", "height"]
+    wavelength_nm: Positive
+    medium_kind: Literal["air", "fresh", "sea", "custom"] = "air"
+    camera: CameraModel
+    window: WindowModel | None
+    sheet: SheetModel
+    camera_from_object: Matrix4
+    media: tuple[KnownMedium, ...] = ()
+    stages: tuple[KnownStage, ...] = ()
+    residuals: dict[str, Any] = {}
+    provenance: dict[str, Any] = {}
+    joint: JointEstimate | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_file(cls, content: Any) -> Any:
+        residuals = content.get("residuals") if isinstance(content, dict) else None
+        if not (isinstance(residuals, dict) and "joint" in residuals):
+            return content
+        joint = joint_estimate_in(residuals["joint"], content.get("provenance", {}))
+        return content | {"residuals": {key: each for key, each in residuals.items() if key != "joint"}, "joint": joint}
+
+    @model_serializer(mode="wrap")
+    def _into_file(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content = handler(self) | {"residuals": self.residuals_in_file()}
+        del content["joint"]
+        return content
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Calibration":
+        if not _is_rigid(self.camera_from_object):
+            raise ValueError("camera_from_object must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
+        _require_unit(self.sheet.normal, "the sheet's normal")
+        if self.sheet.fan is not None:
+            _require_unit(self.sheet.fan.axis, "the axis of the fan")
+        if self.window is not None:
+            _require_unit(self.window.normal, "the window's normal")
+        require_plain_json(self.residuals, self.provenance)
+        return self
+
+    def residuals_in_file(self) -> dict[str, Any]:
+        """The residuals as files have them, the joint estimate among them as plain JSON."""
+        if self.joint is None:
+            return self.residuals
+        # After the camera's figures, as files have always had it, so that digests stay.
+        figures = list(self.residuals.items())
+        place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
+        return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
+
+    def origin(self) -> Origin:
+        """What the calibration was made from, by its provenance."""
+        return Origin.model_validate(self.provenance)
+
+    def index_of(self, medium: Medium) -> float:
+        """Refractive index of a medium at the laser's wavelength, as last calibrated where it was; else RangeError."""
+        known = next((found.index for found in reversed(self.media) if found.medium == medium), None)
+        return medium.refractive_index(self.wavelength_nm) if known is None else known
+
+    def stage_direction_of(self, described: Vector) -> Vector:
+        """Unit direction in the OCS of a stage that is described so, or as going back, as calibrated where it was."""
+        found = self.stage_of(described)
+        if found is None:
+            return described
+        stage, forth = found
+        return stage.direction if forth else (-stage.direction[0], -stage.direction[1], -stage.direction[2])
+
+    def stage_of(self, described: Vector) -> tuple[KnownStage, bool] | None:
+        """The stage that was calibrated along a direction of the OCS, and whether it goes that way or back."""
+        for stage in self.stages:
+            for forth in (True, False):
+                if np.allclose(stage.described, np.array(described) * (1 if forth else -1)):
+                    return stage, forth
+        return None
+
+    def object_transform(self) -> np.ndarray:
+        """``T_camera_object`` as an array (4, 4)."""
+        return np.array(self.camera_from_object)
+
+
+def require_plain_json(residuals: dict[str, Any], provenance: dict[str, Any]) -> None:
+    """Refuse what a calibration's file cannot hold; ValueError."""
+    try:
+        json.dumps([residuals, provenance], allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
+
+
+def _is_rigid(matrix: Matrix4) -> bool:
+    """Whether a matrix (4, 4) is a rotation, not a reflection, and a shift; to 1e-6, as text may be rounded."""
+    if len(matrix) != 4:
+        return False
+    rotation = np.array(matrix)[:3, :3]
+    square = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+    return square and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
+
+
+def _require_unit(vector: Vector, name: str) -> None:
+    if not np.isclose(np.linalg.norm(vector), 1, atol=1e-6):
+        raise ValueError(f"{name} {vector} is not a unit vector")

@@ -1,0 +1,53 @@
+"""Everything a user can get wrong has an error of its own here; a program bug is any other exception.
+
+Messages say what was found, what was expected and what to do. The commands print them without a traceback and exit
+with code 2.
+"""
+
+
+class Error(Exception):
+    """Base of all errors caused by input, files or the machine rather than by a bug."""
+
+
+class DescriptionError(Error):
+    """A sensor, scene or target description cannot be read: unknown key, wrong type, unknown name."""
+
+
+class DesignError(Error):
+    """A description is readable but the sensor it describes cannot work."""
+
+
+class RangeError(Error):
+    """A value lies outside the range for which a formula or table holds."""
+
+
+class CaptureError(Error):
+    """A capture, cloud or calibration file is foreign, truncated, of a newer version, or inconsistent."""
+
+
+class OutputError(Error):
+    """An output cannot be written: it exists already, the folder is missing, the disk is full."""
+
+
+class ImageError(Error):
+    """An image has the wrong size, type or content for what is asked of it."""
+
+
+class TargetError(Error):
+    """A calibration target is not found, or not found completely enough, in an image."""
+
+
+class CalibrationError(Error):
+    """The evidence does not determine the calibration, or contradicts it."""
+
+
+class EvaluationError(Error):
+    """A cloud does not hold what the evaluation needs."""
+
+
+class SetupError(Error):
+    """The machine lacks something: libLLVM, a library, a permission."""
+
+
+class HardwareError(Error):
+    """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""

@@ -1,0 +1,154 @@
+"""The joint estimate that a calibration holds: parameters, values, covariance, and a summary of its evidence."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+
+from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
+from uwlts.model.sensor import Uncertainty, Vector
+
+_Count = Annotated[int, Field(ge=0)]
+_Std = Annotated[FiniteFloat, Field(ge=0)]
+_Pair = tuple[FiniteFloat, FiniteFloat]
+
+
+class _Stored(BaseModel):
+    """Base of what files hold of a joint estimate; keys that other versions add are kept."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True, allow_inf_nan=False)
+
+
+class CoveredRegion(_Stored):
+    """A region of the sheet that stripes cover, seen through the window or not in one medium.
+
+    ``medium`` is its number among the calibration's media, None for air; ``outline_mm`` is convex, Y and Z of the OCS;
+    ``camera_depth_mm`` are the nearest and farthest depths along the camera's axis from its entrance pupil.
+    """
+
+    medium: _Count | None
+    name: str
+    window: bool
+    point_count: Annotated[_Count, Field(alias="points")]
+    camera_depth_mm: _Pair
+    outline_mm: tuple[_Pair, ...]
+
+
+class ImageFit(_Stored):
+    """How well an image fits: the kind of its residuals, their rms without outliers, and their numbers."""
+
+    source: str
+    kind: str
+    rms_px: FiniteFloat | None
+    residual_count: Annotated[_Count, Field(alias="residuals")]
+    outlier_count: Annotated[_Count, Field(alias="strays")]
+
+
+class NominalSheet(_Stored):
+    """The sheet as described, for which sheet parameters of zero stand: camera frame, mm.
+
+    ``normal`` is the sheet's in air, ``axis`` the laser's axis, square to it; the sheet turns about ``middle_mm``,
+    the fan begins at ``apex_mm`` and leaves the laser's window at ``pivot_mm``.
+    """
+
+    normal: Vector
+    axis: Vector
+    middle_mm: Vector
+    apex_mm: Vector
+    pivot_mm: Vector
+
+
+class JointEstimate(_Stored):
+    """All parameters that were estimated together.
+
+    Attributes
+    ----------
+    parameters : (P,)
+    values, std, std_before : (P,)
+        In the parameters' units; ``std_before`` is None where nothing was known before.
+    covariance : (P, P)
+    nominal_sheet : NominalSheet
+    scatter_px : dict
+        Standard deviation of every kind of residual.
+    shared_variance : dict
+        Of every kind, variance of a mean of many residuals over that of as many independent ones.
+    residual_count, outlier_count : int
+    rounds : int or None
+        Of the least squares.
+    stopped : str or None
+        Why it ended.
+    images : tuple of ImageFit
+    covered : tuple of CoveredRegion
+    """
+
+    parameters: tuple[ParameterInFile, ...]
+    values: tuple[FiniteFloat, ...]
+    std: tuple[_Std, ...]
+    std_before: tuple[_Std | None, ...]
+    covariance: tuple[tuple[FiniteFloat, ...], ...]
+    nominal_sheet: Annotated[NominalSheet, Field(alias="described_sheet")]
+    scatter_px: dict[str, _Std]
+    shared_variance: dict[str, _Std] = {}
+    residual_count: Annotated[_Count, Field(alias="residuals")]
+    outlier_count: Annotated[_Count, Field(alias="strays")]
+    rounds: _Count | None = None
+    stopped: str | None = None
+    images: tuple[ImageFit, ...] = ()
+    covered: tuple[CoveredRegion, ...] = ()
+
+    @model_validator(mode="after")
+    def _sized(self) -> "JointEstimate":
+        count = len(self.parameters)
+        if any(len(each) != count for each in (self.values, self.std, self.std_before, self.covariance)) or any(
+            len(row) != count for row in self.covariance
+        ):
+            raise ValueError(f"not all of it is of its {count} parameters")
+        if any(row[place] < 0 for place, row in enumerate(self.covariance)):
+            raise ValueError("a variance is negative")
+        return self
+
+    def std_of(self, key: ParameterKey) -> float | None:
+        """Standard uncertainty of a parameter; None where it was not estimated."""
+        return self.std[self.parameters.index(key)] if key in self.parameters else None
+
+    def covariance_matrix(self) -> np.ndarray:
+        """The covariance as an array (P, P)."""
+        return np.array(self.covariance, dtype=np.float64).reshape(len(self.parameters), -1)
+
+    def in_file(self) -> dict[str, Any]:
+        """The estimate as plain JSON with the keys of files."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+
+class CaptureSource(BaseModel):
+    """A capture that a calibration was made from."""
+
+    file: str
+    sha256: str
+
+
+class Origin(BaseModel):
+    """What a calibration was made from: captures, target, how well the sensor was known before; warnings of it."""
+
+    known_before: Uncertainty = Uncertainty()
+    air_captures: tuple[CaptureSource, ...] = ()
+    step_captures: tuple[CaptureSource, ...] = ()
+    scan_captures: tuple[CaptureSource, ...] = ()
+    target: dict[str, Any] | None = None
+    warnings: tuple[str, ...] = ()
+
+    def captures(self) -> tuple[CaptureSource, ...]:
+        """Those of targets, of steps and of scans."""
+        return self.air_captures + self.step_captures + self.scan_captures
+
+
+def joint_estimate_in(figures: Any, provenance: Any) -> JointEstimate:
+    """The joint estimate of a file's figures; ValueError where it or its provenance is damaged."""
+    try:
+        joint = JointEstimate.model_validate(figures)
+        Origin.model_validate(provenance)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place, what = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        raise ValueError(f"the joint estimate is damaged: {place + ': ' if place else ''}{what}") from error
+    return joint

@@ -1,0 +1,128 @@
+"""Finds descriptions by name or path, reads their TOML, and turns validation failures into clear errors.
+
+Names are looked up in the library that ships with the package: ``scenes/sensors`` for sensors, ``scenes`` for scenes.
+A description may name a ``base`` of its own kind and give only what differs from it.
+"""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+
+from uwlts.model.errors import DescriptionError, Error
+from uwlts.model.sensor import Description, Sensor
+
+AnyDescription = TypeVar("AnyDescription", bound=Description)
+
+
+def library_folder() -> Path:
+    """Folder of the descriptions that ship with the package: inside the wheel, or beside it in a source checkout."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "scenes"
+    return inside if inside.is_dir() else package.parent / "scenes"
+
+
+def names(folder: str = "") -> list[str]:
+    """Names of the shipped descriptions in a folder of the library."""
+    return sorted(path.stem for path in (library_folder() / folder).glob("*.toml"))
+
+
+def find(name_or_path: str | Path, folder: str = "") -> Path:
+    """Path of a description given by file or by name; raises DescriptionError with the known names."""
+    path = Path(name_or_path)
+    if path.suffix == ".toml":
+        if not path.is_file():
+            raise DescriptionError(f"no description at {path}")
+        return path
+    shipped = library_folder() / folder / f"{name_or_path}.toml"
+    if not shipped.is_file():
+        known = ", ".join(names(folder))
+        raise DescriptionError(
+            f"nothing is called '{name_or_path}'; known are {known}, or give the path of a .toml file"
+        )
+    return shipped
+
+
+def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Table of a TOML file with its ``base`` filled in; nested tables are merged, everything else is replaced."""
+    if path.resolve() in seen:
+        raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
+    except OSError as error:
+        raise DescriptionError(f"cannot read {path}: {error.strerror}") from error
+    base = table.pop("base", None)
+    if base is None:
+        return table
+    if not isinstance(base, str):
+        raise DescriptionError(f"{path}: base is {base!r}; expected the name or path of another description")
+    beside = path.parent / f"{base.removesuffix('.toml')}.toml"
+    # A description may be called like the shipped one on which it is based.
+    base_path = beside if beside.is_file() and beside.resolve() != path.resolve() else find(base, folder)
+    return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
+
+
+def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """A new table: ``base`` with ``changes`` laid over it, tables merged key by key."""
+    result = dict(base)
+    for key, value in changes.items():
+        both = isinstance(value, dict) and isinstance(base.get(key), dict)
+        result[key] = merged(base[key], value) if both else value
+    return result
+
+
+def validated(model: type[AnyDescription], table: dict[str, Any], source: str | Path) -> AnyDescription:
+    """The table as a description; DescriptionError names each wrong key, what was found and what is expected."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        lines = [_explained(problem) for problem in error.errors()]
+        raise DescriptionError(f"{source} is not a valid {_words(model)}:\n" + "\n".join(lines)) from error
+    except Error as error:
+        raise type(error)(f"{source}: {error}") from error
+
+
+def _words(model: type[Description]) -> str:
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
+
+
+def _explained(problem: Any) -> str:
+    key = ".".join(str(part) for part in problem["loc"]) or "(whole description)"
+    if problem["type"] == "extra_forbidden":
+        return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"
+    if problem["type"] == "missing":
+        return f"  {key}: missing"
+    found = "" if isinstance(problem["input"], dict) else f" (found {problem['input']!r})"
+    return f"  {key}: {problem['msg'].removeprefix('Value error, ')}{found}"
+
+
+def load_sensor(name_or_path: str | Path) -> Sensor:
+    """Read a sensor description.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of a shipped sensor, such as "thesis", or path of a TOML file, which may name a ``base``.
+
+    Returns
+    -------
+    Sensor
+        The nominal data of camera, laser, windows, detector, stage, measuring volume and media; validated, frozen.
+
+    Raises
+    ------
+    DescriptionError
+        No sensor has this name, or the file is missing, not TOML, or has an unknown or wrong key; the message lists
+        what was found and what is expected.
+
+    Examples
+    --------
+    >>> sensor = uwlts.load_sensor("thesis")
+    >>> sensor.medium("water").refractive_index(sensor.laser.wavelength_nm)
+    """
+    path = find(name_or_path, "sensors")
+    return validated(Sensor, read_table(path, "sensors"), path)

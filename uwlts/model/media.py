@@ -1,0 +1,120 @@
+"""Refractive index, absorption and scattering of the media and windows; all indices are relative to air.
+
+Formulas refuse values outside the range in which their authors fitted them. The window materials were measured in
+air, so their formulas give indices relative to air as they stand.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from uwlts.model.errors import DescriptionError, RangeError
+
+
+def check_range(name: str, value: float, lowest: float, highest: float, source: str) -> None:
+    """Raise RangeError unless ``lowest <= value <= highest``."""
+    if not (math.isfinite(value) and lowest <= value <= highest):
+        raise RangeError(f"{name} is {value:g}, but {source} holds from {lowest:g} to {highest:g}")
+
+
+def water_index(*, wavelength_nm: float, temperature_c: float, salinity_g_kg: float = 0.0) -> float:
+    """Refractive index of fresh or sea water relative to air.
+
+    Quan and Fry 1995, Applied Optics 34:3477, Eq. 3, valid for 0-30 degC, 0-35 g/kg and 400-700 nm.
+
+    Raises
+    ------
+    RangeError
+        Outside the fitted range.
+    """
+    source = "the formula of Quan and Fry (1995)"
+    check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, source)
+    check_range("temperature_c", temperature_c, 0.0, 30.0, source)
+    check_range("salinity_g_kg", salinity_g_kg, 0.0, 35.0, source)
+    t, s, w = temperature_c, salinity_g_kg, wavelength_nm
+    return (
+        1.31405
+        + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t**2) * s
+        - 2.02e-6 * t**2
+        + (15.868 + 0.01155 * s - 0.00423 * t) / w
+        - 4382.0 / w**2
+        + 1.1455e6 / w**3
+    )
+
+
+@dataclass(frozen=True)
+class Glass:
+    """A window material: index relative to air against wavelength in um, its range, absorption at 635 nm, source."""
+
+    index: Callable[[float], float]
+    lowest_um: float
+    highest_um: float
+    absorption_per_m: float
+    source: str
+
+
+def _sellmeier(strengths: tuple[float, ...], poles_um2: tuple[float, ...]) -> Callable[[float], float]:
+    """Sellmeier's formula n^2 = 1 + sum B L^2 / (L^2 - C), with L in um and C in um^2."""
+    return lambda um: math.sqrt(1 + sum(b * um**2 / (um**2 - c) for b, c in zip(strengths, poles_um2, strict=True)))
+
+
+def _soda_lime(um: float) -> float:
+    """Rubin 1985, Solar Energy Materials 12:275: n = 1.5130 - 0.003169 L^2 + 0.003962 / L^2."""
+    return 1.5130 - 0.003169 * um**2 + 0.003962 / um**2
+
+
+_BK7 = _sellmeier((1.03961212, 0.231792344, 1.01046945), (0.00600069867, 0.0200179144, 103.560653))
+_SILICA = _sellmeier((0.6961663, 0.4079426, 0.8974794), (0.0684043**2, 0.1162414**2, 9.896161**2))
+
+GLASSES = {
+    "N-BK7": Glass(_BK7, 0.3, 2.5, 0.24, "Schott data sheet"),
+    "fused-silica": Glass(_SILICA, 0.21, 3.71, 0.0, "Malitson 1965, JOSA 55:1205"),
+    "soda-lime": Glass(_soda_lime, 0.31, 4.6, 14.5, "Rubin 1985, clear"),
+    "soda-lime-low-iron": Glass(_soda_lime, 0.31, 4.6, 3.25, "Rubin 1985, low iron"),
+    "PMMA": Glass(_sellmeier((1.1819,), (0.011313,)), 0.4368, 1.052, 0.0, "Sultanova 2009"),
+}
+
+
+def find_glass(name: str) -> Glass:
+    """The named window material; raises DescriptionError with the known names."""
+    if name not in GLASSES:
+        raise DescriptionError(f"unknown glass '{name}'; known are {', '.join(GLASSES)}, or give its index as a number")
+    return GLASSES[name]
+
+
+def glass_index(name: str, *, wavelength_nm: float) -> float:
+    """Refractive index of a named glass relative to air; raises RangeError outside the formula's range."""
+    glass = find_glass(name)
+    check_range(
+        "wavelength_nm", wavelength_nm, 1e3 * glass.lowest_um, 1e3 * glass.highest_um, f"{name} ({glass.source})"
+    )
+    return glass.index(1e-3 * wavelength_nm)
+
+
+@cache
+def read_table(name: str) -> np.ndarray:
+    """Columns (columns, rows) of a table in ``uwlts/tables``; its source stands in the file's first lines."""
+    text = files("uwlts.model").joinpath("tables", name).read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if not line.startswith("#")]
+    return np.loadtxt(rows, delimiter=",", skiprows=1).T
+
+
+def water_absorption_per_m(*, wavelength_nm: float) -> float:
+    """Absorption of pure water in 1/m (Pope and Fry 1997), linear between the table's 2.5 nm steps."""
+    wavelength, absorption = read_table("water_absorption.csv")
+    check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], "the table of Pope and Fry (1997)")
+    return float(np.interp(wavelength_nm, wavelength, absorption))
+
+
+def water_scattering_per_m(*, wavelength_nm: float, salinity_g_kg: float = 0.0) -> float:
+    """Molecular scattering of water in 1/m (Zhang, Hu and He 2009 at 20 degC), linear in wavelength and salinity."""
+    wavelength, fresh, sea = read_table("water_scattering.csv")
+    source = "the table after Zhang, Hu and He (2009)"
+    check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], source)
+    check_range("salinity_g_kg", salinity_g_kg, 0.0, 35.0, source)
+    ends = [np.interp(wavelength_nm, wavelength, column) for column in (fresh, sea)]
+    return float(np.interp(salinity_g_kg, (0.0, 35.0), ends))

@@ -1,0 +1,156 @@
+"""Where camera, laser and sheet nominally stand to each other, and whether such a sensor can work at all."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.model.errors import DesignError
+from uwlts.model.sensor import Camera, Medium, Sensor
+
+
+@dataclass(frozen=True)
+class LaserPose:
+    """Fan of the laser in the camera frame: origin (3,) in mm, unit axis, fan direction and sheet normal (3,)."""
+
+    origin_mm: np.ndarray
+    axis: np.ndarray
+    fan: np.ndarray
+    normal: np.ndarray
+
+
+def laser_pose(sensor: Sensor) -> LaserPose:
+    """Nominal pose of the laser's fan in the camera frame, with fan = axis x normal.
+
+    The sheet's normal is the baseline's direction (+x for a stripe along the height, -y along the width) made square
+    to the laser's axis, then turned by the roll about the axis.
+    """
+    laser = sensor.laser
+    towards = np.array([1.0, 0.0, 0.0]) if sensor.camera.stripe_along == "height" else np.array([0.0, -1.0, 0.0])
+    if laser.baseline_mm is not None and laser.triangulation_angle_deg is not None:
+        angle = math.radians(laser.triangulation_angle_deg)
+        origin = laser.baseline_mm * towards
+        axis = -math.sin(angle) * towards + np.array([0.0, 0.0, math.cos(angle)])
+    elif laser.origin_mm is not None and laser.axis is not None:
+        origin = np.array(laser.origin_mm)
+        axis = np.array(laser.axis) / np.linalg.norm(laser.axis)
+    else:
+        raise DesignError("the laser is not placed: give baseline and triangulation angle, or origin and axis")
+    normal = towards - (towards @ axis) * axis
+    if np.linalg.norm(normal) < 1e-6:
+        raise DesignError("the laser's axis runs along the baseline: the sheet has no direction across it")
+    normal /= np.linalg.norm(normal)
+    fan = np.cross(axis, normal)
+    roll = math.radians(laser.roll_deg)
+    normal = math.cos(roll) * normal + math.sin(roll) * fan
+    return LaserPose(origin_mm=origin, axis=axis, fan=np.cross(axis, normal), normal=normal)
+
+
+def camera_from_object(sensor: Sensor) -> np.ndarray:
+    """``T_camera_object`` (4, 4): maps the object coordinate system (OCS) to the camera frame.
+
+    The OCS follows the thesis: X normal to the sheet, Z along the laser's axis away from the sensor, Y = Z x X along
+    the stripe; its origin is where the camera's axis meets the sheet (the stand-off).
+
+    Raises
+    ------
+    DesignError
+        The sheet does not cross the camera's axis in front of the window.
+    """
+    pose = laser_pose(sensor)
+    crossing = pose.normal[2]
+    standoff = pose.normal @ pose.origin_mm / crossing if abs(crossing) > 1e-9 else math.inf
+    window = sensor.camera.window
+    if not window.distance_mm + window.thickness_mm < standoff < 1e5:
+        raise DesignError(
+            f"the sheet crosses the camera's axis {standoff:.1f} mm from the entrance pupil; it must cross in front of "
+            f"the window's outer face at {window.distance_mm + window.thickness_mm:.1f} mm: change baseline or angle"
+        )
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack([pose.normal, pose.fan, pose.axis], axis=1)
+    transform[:3, 3] = (0.0, 0.0, standoff)
+    return transform
+
+
+@dataclass(frozen=True)
+class View:
+    """What the camera sees of the sheet: line length at the stand-off and the depth range outside the window, mm."""
+
+    standoff_mm: float
+    line_length_mm: float
+    nearest_mm: float
+    farthest_mm: float
+
+
+def _half_width_mm(
+    camera: Camera, medium_index: float, wavelength_nm: float, side_px: int, depth_mm: np.ndarray
+) -> np.ndarray:
+    """Half the width of the view of an image side at depths outside an untilted window, by Snell's law."""
+    window = camera.window
+    sine = math.sin(math.atan(0.5 * side_px / camera.focal_length_px()))
+    slopes = [s / math.sqrt(1 - s * s) for s in (sine, sine / window.index(wavelength_nm), sine / medium_index)]
+    return slopes[0] * window.distance_mm + slopes[1] * window.thickness_mm + slopes[2] * depth_mm
+
+
+def view_of_sheet(sensor: Sensor, medium: Medium) -> View:
+    """Line length and depth range of the nominal sensor in a medium, with lens distortion and tilts left out.
+
+    Raises
+    ------
+    DesignError
+        The sheet nowhere crosses the view within ten stand-offs.
+    """
+    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
+    index = medium.refractive_index(wavelength)
+    window = camera.window
+    outer = window.distance_mm + window.thickness_mm
+    pose = laser_pose(sensor)
+    standoff = camera_from_object(sensor)[2, 3] - outer
+    if camera.stripe_along == "width":
+        across, along, axis = camera.height_px, camera.width_px, 1
+    else:
+        across, along, axis = camera.width_px, camera.height_px, 0
+    depth = np.linspace(0.0, 10 * standoff, 20001)
+    sheet = (pose.normal @ pose.origin_mm - pose.normal[2] * (depth + outer)) / pose.normal[axis]
+    seen = np.abs(sheet) <= _half_width_mm(camera, index, wavelength, across, depth)
+    if not seen.any():
+        raise DesignError("the sheet never crosses the camera's view: change baseline, angle or focal length")
+    length = 2 * _half_width_mm(camera, index, wavelength, along, np.array([standoff]))[0]
+    return View(float(standoff), float(length), float(depth[seen][0]), float(depth[seen][-1]))
+
+
+def check_design(sensor: Sensor, medium: Medium) -> View:
+    """Refuse a sensor that cannot work in the medium, with the reason and numbers; returns its view otherwise.
+
+    Raises
+    ------
+    DesignError
+        A window smaller than the cone that passes it, a laser origin inside or behind its window, or a sheet that
+        misses the measuring volume.
+    """
+    camera, laser = sensor.camera, sensor.laser
+    window = camera.window
+    if window.mounted:
+        corner = math.hypot(camera.width_px, camera.height_px) / 2 / camera.focal_length_px()
+        pupil = camera.focal_length_mm / camera.f_number
+        sine = math.sin(math.atan(corner)) / window.index(laser.wavelength_nm)
+        needed = 2 * (corner * window.distance_mm + window.thickness_mm * sine / math.sqrt(1 - sine**2)) + pupil
+        if needed > window.aperture_diameter_mm:
+            raise DesignError(
+                f"the camera's window opens {window.aperture_diameter_mm:.1f} mm, but the cone of view is "
+                f"{needed:.1f} mm wide at its outer face: enlarge the window or bring it closer to the lens"
+            )
+    if laser.window.mounted:
+        spread = 2 * math.tan(math.radians(laser.fan_angle_deg / 2)) * laser.window.distance_mm
+        if spread > laser.window.aperture_diameter_mm:
+            raise DesignError(
+                f"the laser's window opens {laser.window.aperture_diameter_mm:.1f} mm, but the fan is {spread:.1f} mm "
+                f"wide at its inner face: enlarge the window or bring it closer to the laser"
+            )
+    view = view_of_sheet(sensor, medium)
+    if view.nearest_mm > sensor.volume.far_mm or view.farthest_mm < sensor.volume.near_mm:
+        raise DesignError(
+            f"the camera sees the sheet from {view.nearest_mm:.0f} to {view.farthest_mm:.0f} mm outside the window, "
+            f"but the measuring volume reaches from {sensor.volume.near_mm:g} to {sensor.volume.far_mm:g} mm"
+        )
+    return view

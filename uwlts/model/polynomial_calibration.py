@@ -1,0 +1,85 @@
+"""The polynomial reference method's calibration: two polynomials for each profile line, stored as JSON."""
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from uwlts.model.calibration import require_plain_json
+from uwlts.model.sensor import Description, Medium, Positive
+
+Pair = tuple[float, float]
+
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+class PolynomialCalibration(Description):
+    """A sensor calibrated by polynomials (thesis, section 4.7): stripe position to Z, and Z to Y, for each line.
+
+    It holds in the medium and with the window it was made with, and only where its evidence reached.
+
+    Attributes
+    ----------
+    medium_name, medium : of the captures it was made from
+    window_mounted : whether the camera's window stood in the light's way
+    degree : of both polynomials of a line
+    first_line : number of the profile line of the first row
+    position_range_px, depth_range_mm : ranges of the stripe position and of Z in the OCS on which the arguments of the
+        Legendre polynomials run from -1 to 1, for all lines
+    domains_px : for each line the range of stripe positions that was calibrated, None for a line without any
+    depth_coefficients, along_coefficients : Legendre coefficients in mm of Z(position) and of Y(Z), a row for each line
+    residuals, provenance : named figures, and what the calibration was made from
+    """
+
+    sensor_name: str
+    stripe_along: Literal["width", "height"]
+    wavelength_nm: Positive
+    medium_name: str
+    medium: Medium
+    window_mounted: bool
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    degree: Annotated[int, Field(ge=1)]
+    first_line: Annotated[int, Field(ge=0)]
+    position_range_px: Pair
+    depth_range_mm: Pair
+    domains_px: tuple[Pair | None, ...]
+    depth_coefficients: Rows
+    along_coefficients: Rows
+    residuals: dict[str, Any] = {}
+    provenance: dict[str, Any] = {}
+
+    @property
+    def joint(self) -> None:
+        """Polynomials hold no joint estimate."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "PolynomialCalibration":
+        count, lines = len(self.domains_px), self.width_px if self.stripe_along == "width" else self.height_px
+        if not 0 < count <= lines - self.first_line:
+            raise ValueError(f"{count} lines from line {self.first_line} on do not lie in an image of {lines} lines")
+        for name in ("depth_coefficients", "along_coefficients"):
+            rows = getattr(self, name)
+            if len(rows) != count or {len(row) for row in rows} != {self.degree + 1}:
+                raise ValueError(
+                    f"{name} must have {count} rows of {self.degree + 1} numbers, as domains_px and degree"
+                )
+        for name in ("position_range_px", "depth_range_mm"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} must grow, not go from {low:g} to {high:g}")
+        low, high = self.position_range_px
+        known = [domain for domain in self.domains_px if domain is not None]
+        if not known or not all(low <= a <= b <= high for a, b in known):
+            raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
+        require_plain_json(self.residuals, self.provenance)
+        return self
+
+    def index_of(self, medium: Medium) -> float:
+        """Refractive index of a medium at the laser's wavelength, relative to air; RangeError where it has none."""
+        return medium.refractive_index(self.wavelength_nm)
+
+    def domains(self) -> np.ndarray:
+        """``domains_px`` as an array (L, 2), NaN for None."""
+        return np.array([(np.nan, np.nan) if domain is None else domain for domain in self.domains_px])

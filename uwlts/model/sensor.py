@@ -1,0 +1,478 @@
+"""Description of a sensor: what drawings and data sheets say, read from TOML, validated when made.
+
+Everything here is nominal. Lengths are mm, the camera frame is x right, y down, z along the optical axis with its
+origin at the entrance pupil; all refractive indices are relative to air.
+"""
+
+import math
+from itertools import pairwise
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from uwlts.model import media, phase_functions, waters
+from uwlts.model.errors import DescriptionError
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Vector = tuple[float, float, float]
+
+_INDEX_FORMULA = 1.5e-5
+"""Error that Quan and Fry (1995) give for their formula of the index of water."""
+
+
+class Description(BaseModel):
+    """Base of all descriptions: frozen, unknown keys and non-finite numbers refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Window(Description):
+    """A flat window before a module. ``distance_mm`` runs along the module's axis from its origin to the inner face.
+
+    The normal is the module's axis turned by ``tilt_x_deg`` about the module's x axis, then ``tilt_y_deg`` about its y
+    axis. ``glass`` is a name known to `uwlts.model.media` or a refractive index relative to air. An unmounted window is
+    left out of the light's way: the module looks straight into the medium, which is then air.
+    """
+
+    distance_mm: Positive
+    thickness_mm: Positive
+    glass: str | Annotated[float, Field(gt=1, lt=4)]
+    aperture_diameter_mm: Positive
+    tilt_x_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.0
+    tilt_y_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.0
+    absorption_per_m: NotNegative | None = None
+    mounted: bool = True
+
+    @field_validator("glass")
+    @classmethod
+    def _known_glass(cls, value: str | float) -> str | float:
+        if isinstance(value, str):
+            media.find_glass(value)
+        return value
+
+    def index(self, wavelength_nm: float) -> float:
+        """Refractive index of the glass relative to air."""
+        if isinstance(self.glass, str):
+            return media.glass_index(self.glass, wavelength_nm=wavelength_nm)
+        return self.glass
+
+    def absorption_per_mm(self) -> float:
+        """Absorption of the glass in 1/mm: the given value, else the named glass's at 635 nm, else none."""
+        if self.absorption_per_m is not None:
+            return 1e-3 * self.absorption_per_m
+        return 1e-3 * media.find_glass(self.glass).absorption_per_m if isinstance(self.glass, str) else 0.0
+
+    def normal(self) -> np.ndarray:
+        """Unit normal (3,) in the module's frame, pointing along the light of a camera ray (away from the module)."""
+        x, y = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
+        return np.array([math.cos(x) * math.sin(y), -math.sin(x), math.cos(x) * math.cos(y)])
+
+
+class Distortion(Description):
+    """Brown-Conrady coefficients in OpenCV's order and sense."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+
+class Camera(Description):
+    """Image sensor and lens. ``focal_length_mm`` is the pinhole's image distance (camera constant).
+
+    ``stripe_along`` is the side of the image along which the laser stripe runs: "width" (1280 in the thesis's camera,
+    one peak per column) or "height" (1024, one peak per row). It also places the laser: above the camera (-y) for
+    "width", to its right (+x) for "height".
+    """
+
+    width_px: Annotated[int, Field(ge=16, le=20000)]
+    height_px: Annotated[int, Field(ge=16, le=20000)]
+    pixel_size_um: Positive
+    focal_length_mm: Positive
+    principal_point_px: tuple[float, float] | None = None
+    distortion: Distortion = Distortion()
+    f_number: Positive
+    focus_distance_mm: Positive
+    stripe_along: Literal["width", "height"]
+    window: Window
+
+    def principal_point(self) -> tuple[float, float]:
+        """Principal point in px; the image centre unless given. Pixel (0, 0) is the centre of the first pixel."""
+        return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
+
+    def focal_length_px(self) -> float:
+        """Focal length in pixels."""
+        return 1e3 * self.focal_length_mm / self.pixel_size_um
+
+    def lines(self) -> int:
+        """Number of profile lines in an image: its columns if the stripe runs along the width, else its rows."""
+        return self.width_px if self.stripe_along == "width" else self.height_px
+
+
+class Laser(Description):
+    """Sheet source. Place it by ``baseline_mm`` and ``triangulation_angle_deg``, or by ``origin_mm`` and ``axis``.
+
+    The baseline runs in the camera's x-y plane from the entrance pupil to the fan's origin, the angle lies between the
+    camera's and the laser's axis. ``waist_radius_mm`` is the 1/e2 radius across the sheet at ``waist_distance_mm`` from
+    the origin, in the medium of use. ``roll_deg`` turns the fan about the laser's axis.
+
+    ``power_mw`` leaves the line optics, spread over the fan as ``fan_profile`` says: "flat", the same power in every
+    angle; "gaussian", exp(-2 (angle / half the fan)^2) up to the fan's edges; or pairs of an angle in deg and a
+    relative power per angle, linear between them and zero outside. A beam that enters the line optics tilted by
+    ``bow_deg`` gives a line that curves towards the sheet's normal (positive) or away from it.
+    ``linewidth_nm`` is the full width at half maximum of the spectrum.
+    """
+
+    wavelength_nm: Annotated[float, Field(ge=400, le=700)]
+    linewidth_nm: NotNegative = 0.0
+    power_mw: Positive
+    fan_angle_deg: Annotated[float, Field(gt=0, lt=120)]
+    fan_profile: Literal["flat", "gaussian"] | tuple[tuple[float, float], ...] = "flat"
+    bow_deg: Annotated[float, Field(gt=-10, lt=10)] = 0.0
+    roll_deg: Annotated[float, Field(gt=-180, le=180)] = 0.0
+    waist_radius_mm: Positive
+    waist_distance_mm: Positive
+    beam_quality_m2: Annotated[float, Field(ge=1)] = 1.0
+    baseline_mm: Positive | None = None
+    triangulation_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
+    origin_mm: Vector | None = None
+    axis: Vector | None = None
+    window: Window
+
+    @model_validator(mode="after")
+    def _placed_once(self) -> "Laser":
+        by_angle = (self.baseline_mm is not None, self.triangulation_angle_deg is not None)
+        by_axis = (self.origin_mm is not None, self.axis is not None)
+        if (all(by_angle), any(by_axis)) != (True, False) and (any(by_angle), all(by_axis)) != (False, True):
+            raise ValueError("place the laser by baseline_mm and triangulation_angle_deg, or by origin_mm and axis")
+        if self.axis is not None and np.linalg.norm(self.axis) < 1e-9:
+            raise ValueError(f"axis {self.axis} has no direction")
+        return self
+
+    @model_validator(mode="after")
+    def _profile_within_the_fan(self) -> "Laser":
+        if isinstance(self.fan_profile, str):
+            return self
+        if len(self.fan_profile) < 2:
+            raise ValueError(
+                f"fan_profile has {len(self.fan_profile)} pairs of angle in deg and relative power: give at least two"
+            )
+        angles, powers = zip(*self.fan_profile, strict=True)
+        if any(b <= a for a, b in pairwise(angles)):
+            raise ValueError(f"the angles of fan_profile must increase, found {angles} deg")
+        if min(powers) < 0 or max(powers) == 0:
+            raise ValueError(f"the powers of fan_profile must not be negative nor all zero, found {powers}")
+        if max(-angles[0], angles[-1]) > self.fan_angle_deg / 2:
+            raise ValueError(
+                f"fan_profile reaches from {angles[0]:g} to {angles[-1]:g} deg, but the fan only from "
+                f"{-self.fan_angle_deg / 2:g} to {self.fan_angle_deg / 2:g} deg: widen fan_angle_deg or cut the profile"
+            )
+        return self
+
+
+class Medium(Description):
+    """Air, fresh or sea water by temperature and salinity, or any medium with its index given.
+
+    Water is pure unless ``water`` names one known to `uwlts.model.waters`, or ``turbidity`` sweeps it from pure (0)
+    over clear (1) and coastal (2) to harbour (3). ``absorption_per_m`` and ``scattering_per_m`` replace what follows
+    from these.
+
+    ``phase`` is the phase function of the particles, while the molecules of water scatter as molecules do; of
+    everything if ``scattering_per_m`` is given. It is a name of `uwlts.model.phase_functions.KINDS`, of which
+    "henyey-greenstein" takes ``asymmetry``, and "fournier-forand" ``particle_index`` (relative to water) and
+    ``particle_slope`` (of the size distribution), which ``backscatter_share`` replaces if given; or a table of a
+    ``kind`` with parameters of its own. Unless given it is that of the named ``water``, "petzold" where ``turbidity``
+    is given, else "molecular".
+    """
+
+    kind: Literal["air", "fresh", "sea", "custom"]
+    temperature_c: float = 20.0
+    salinity_g_kg: NotNegative = 0.0
+    index: Annotated[float, Field(ge=1, lt=2)] | None = None
+    water: str | None = None
+    turbidity: Annotated[float, Field(ge=0, le=3)] | None = None
+    absorption_per_m: NotNegative | None = None
+    scattering_per_m: NotNegative | None = None
+    phase: str | phase_functions.DescribedPhase | None = None
+    asymmetry: phase_functions.Asymmetry = 0.924
+    particle_index: phase_functions.ParticleIndex = 1.10
+    particle_slope: phase_functions.ParticleSlope = 3.5835
+    backscatter_share: phase_functions.BackscatterShare | None = None
+
+    @field_validator("water")
+    @classmethod
+    def _known_water(cls, value: str | None) -> str | None:
+        if value is not None and value not in waters.water_names():
+            raise ValueError(f"unknown water; known are {', '.join(waters.water_names())}")
+        return value
+
+    @field_validator("phase")
+    @classmethod
+    def _known_phase(
+        cls, value: str | phase_functions.DescribedPhase | None
+    ) -> str | phase_functions.DescribedPhase | None:
+        if isinstance(value, str):
+            phase_functions.phase_function_kind(value)
+        elif value is not None:
+            value.phase_function()
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Medium":
+        if self.kind == "custom" and self.index is None:
+            raise ValueError("a custom medium needs its index")
+        if self.kind == "fresh" and self.salinity_g_kg > 0:
+            raise ValueError(f"fresh water with salinity {self.salinity_g_kg:g} g/kg: use kind = 'sea'")
+        if self.water is not None and self.turbidity is not None:
+            raise ValueError(f"give water ('{self.water}') or turbidity ({self.turbidity:g}), not both")
+        if self.kind == "air" and (self.water is not None or self.turbidity is not None):
+            raise ValueError("air has neither water nor turbidity: use kind = 'fresh', 'sea' or 'custom'")
+        if self.kind in ("fresh", "sea") and self.index is None:
+            self.refractive_index(635.0)
+        return self
+
+    def refractive_index(self, wavelength_nm: float) -> float:
+        """Refractive index relative to air; RangeError outside the formula's range."""
+        if self.index is not None:
+            return self.index
+        if self.kind == "air":
+            return 1.0
+        return media.water_index(
+            wavelength_nm=wavelength_nm, temperature_c=self.temperature_c, salinity_g_kg=self.salinity_g_kg
+        )
+
+    def index_per_kelvin(self, wavelength_nm: float) -> float:
+        """Change of the index with temperature; 0 where it is given."""
+        if self.index is not None or self.kind == "air":
+            return 0.0
+        # The formula ends at 30 degC.
+        here = self.model_copy(update={"temperature_c": min(self.temperature_c, 29.0)})
+        return here.warmer_by(1.0).refractive_index(wavelength_nm) - here.refractive_index(wavelength_nm)
+
+    def index_uncertainty(self, wavelength_nm: float, uncertainty: "Uncertainty") -> float:
+        """Standard uncertainty of the index, from the temperature's where it follows from that."""
+        if self.index is not None or self.kind == "air":
+            return uncertainty.index
+        return math.hypot(self.index_per_kelvin(wavelength_nm) * uncertainty.temperature_k, _INDEX_FORMULA)
+
+    def warmer_by(self, kelvin: float) -> "Medium":
+        """The same medium at another temperature."""
+        return self.model_copy(update={"temperature_c": self.temperature_c + kelvin})
+
+    def absorption_per_mm(self, wavelength_nm: float) -> float:
+        """Absorption coefficient a in 1/mm; RangeError outside the tables."""
+        if self.absorption_per_m is not None:
+            return 1e-3 * self.absorption_per_m
+        if not self._is_water():
+            return 0.0
+        pure = media.water_absorption_per_m(wavelength_nm=wavelength_nm)
+        return 1e-3 * (pure + self._particles(wavelength_nm).absorption_per_m)
+
+    def scattering_per_mm(self, wavelength_nm: float) -> float:
+        """Scattering coefficient b in 1/mm; RangeError outside the tables."""
+        return sum((part.coefficient_per_mm for part in self.scatterers(wavelength_nm)), 0.0)
+
+    def scatterers(self, wavelength_nm: float) -> tuple[phase_functions.Scatterer, ...]:
+        """What scatters, with its part of b and its phase function; RangeError outside the tables."""
+        if self.scattering_per_m is not None:
+            parts = [(self.scattering_per_m, self._phase_function())]
+        elif self._is_water():
+            molecules = media.water_scattering_per_m(wavelength_nm=wavelength_nm, salinity_g_kg=self.salinity_g_kg)
+            particles = self._particles(wavelength_nm).scattering_per_m
+            parts = [(molecules, phase_functions.Molecular()), (particles, self._phase_function())]
+        else:
+            parts = []
+        return tuple(phase_functions.Scatterer(1e-3 * b, phase) for b, phase in parts if b > 0)
+
+    def _is_water(self) -> bool:
+        """Whether absorption and scattering are those of water, pure or not, unless given."""
+        return self.kind in ("fresh", "sea") or self.water is not None or self.turbidity is not None
+
+    def _particles(self, wavelength_nm: float) -> waters.Particles:
+        if self.turbidity is not None:
+            return waters.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
+        return waters.particles_of(self.water or "pure", wavelength_nm=wavelength_nm)
+
+    def _phase_function(self) -> phase_functions.PhaseFunction:
+        if isinstance(self.phase, phase_functions.DescribedPhase):
+            return self.phase.phase_function()
+        if self.phase is not None:
+            name = self.phase
+        elif self.turbidity is not None:
+            # The scale runs over Petzold's stations.
+            name = "petzold"
+        else:
+            name = "molecular" if self.water is None else waters.named_water(self.water).phase
+        keys = phase_functions.PhaseKeys(
+            self.asymmetry, self.particle_index, self.particle_slope, self.backscatter_share
+        )
+        return phase_functions.phase_function_kind(name).of_keys(keys)
+
+    def extinction_per_mm(self, wavelength_nm: float) -> float:
+        """Extinction coefficient c = a + b in 1/mm, by which a beam grows weaker."""
+        return self.absorption_per_mm(wavelength_nm) + self.scattering_per_mm(wavelength_nm)
+
+
+class Detector(Description):
+    """Image sensor after EMVA 1288: photons to electrons to grey values. The gain maps the full well to full scale.
+
+    ``dark_current_e_per_s`` holds at ``reference_temperature_c`` and doubles with every ``dark_current_doubling_k``
+    up to ``temperature_c``, the image sensor's own.
+
+    How pixels differ belongs to the camera, for whose serial number ``pattern_seed`` stands. ``prnu`` is the rms of
+    their gain as a share of the light's signal. ``dsnu_e`` is the rms in electrons of the dark image of short exposure,
+    an offset of the readout that neither exposure nor temperature changes; ``dsnu_row_e`` and ``dsnu_column_e`` are
+    offsets in addition that whole rows and columns share. ``hot_pixels_per_million`` have a dark current on top of the
+    others', exponentially distributed about a mean of ``hot_pixel_dark_current_e_per_s`` at the reference temperature.
+
+    ``blooming`` is the share of the charge above the full well that spills along the columns; the rest is drained.
+    A "rolling" shutter starts to expose each row ``line_time_us`` after the row above it.
+    """
+
+    bits: Literal[8, 10, 12]
+    quantum_efficiency: Annotated[float, Field(gt=0, le=1)]
+    full_well_e: Positive
+    read_noise_e: NotNegative
+    dark_current_e_per_s: NotNegative = 0.0
+    reference_temperature_c: Annotated[float, Field(ge=-100, le=150)] = 25.0
+    dark_current_doubling_k: Annotated[float, Field(ge=1, le=100)] = 8.0
+    temperature_c: Annotated[float, Field(ge=-100, le=150)] = 25.0
+    prnu: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    dsnu_e: NotNegative = 0.0
+    dsnu_row_e: NotNegative = 0.0
+    dsnu_column_e: NotNegative = 0.0
+    hot_pixels_per_million: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    hot_pixel_dark_current_e_per_s: NotNegative = 0.0
+    pattern_seed: Annotated[int, Field(ge=0)] = 0
+    blooming: Annotated[float, Field(ge=0, le=1)] = 0.0
+    black_level_dn: NotNegative = 0.0
+    frame_rate_hz: Positive = 60.0
+    shutter: Literal["global", "rolling"] = "global"
+    line_time_us: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> "Detector":
+        if self.shutter == "rolling" and self.line_time_us == 0:
+            raise ValueError("a rolling shutter needs line_time_us, the delay from row to row; found 0")
+        if (self.hot_pixels_per_million > 0) != (self.hot_pixel_dark_current_e_per_s > 0):
+            raise ValueError(
+                f"hot_pixels_per_million is {self.hot_pixels_per_million:g} and hot_pixel_dark_current_e_per_s "
+                f"{self.hot_pixel_dark_current_e_per_s:g}: give both, or neither"
+            )
+        return self
+
+    def full_scale_dn(self) -> int:
+        """Largest grey value."""
+        return 2**self.bits - 1
+
+    def gain_dn_per_e(self) -> float:
+        """Overall system gain K in grey values per electron."""
+        return self.full_scale_dn() / self.full_well_e
+
+    def dark_current_growth(self) -> float:
+        """Dark current at the image sensor's temperature over that at the reference (EMVA 1288 release 4)."""
+        return 2.0 ** ((self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_k)
+
+
+class Exposure(Description):
+    """Exposure of laser and of lamp images in ms; "auto" brings the brightest light to ``auto_level`` of full scale."""
+
+    laser_ms: Positive | Literal["auto"] = "auto"
+    lamp_ms: Positive | Literal["auto"] = "auto"
+    auto_level: Annotated[float, Field(gt=0.05, lt=1)] = 0.8
+    longest_ms: Positive = 1000.0
+
+
+class Lamp(Description):
+    """Other light than the laser's, at the laser's wavelength: what it puts on every surface.
+
+    The lamp is on when the laser is off; ``ambient_w_per_m2`` is daylight behind the camera's filter, always there.
+    """
+
+    irradiance_w_per_m2: Positive = 5.0
+    ambient_w_per_m2: NotNegative = 0.0
+
+
+class Stage(Description):
+    """Linear stage that moves the sensor."""
+
+    travel_mm: Positive
+    resolution_mm: Positive
+    settling_s: NotNegative = 0.0
+
+
+class Volume(Description):
+    """Measuring volume along the camera's axis, counted from the outer face of its window."""
+
+    near_mm: Positive
+    far_mm: Positive
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Volume":
+        if self.near_mm >= self.far_mm:
+            raise ValueError(f"near_mm {self.near_mm:g} must be smaller than far_mm {self.far_mm:g}")
+        return self
+
+
+class Uncertainty(Description):
+    """Standard uncertainties of what drawings, data sheets and certificates say, for the joint calibration.
+
+    Of the windows: distance and tilt of the camera's, thickness and index of its glass, tilt of the laser's against the
+    sheet. ``bow_deg`` is the tilt of the beam into the line optics. ``temperature_k`` is that of a medium whose index
+    follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
+    medium whose index is given. Of the stage: each position, the scale of
+    all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
+    its plane when it bends like a dish, and the height of the steps. What is said to be zero is not estimated but
+    held as described.
+    """
+
+    window_distance_mm: NotNegative = 5.0
+    window_tilt_deg: NotNegative = 0.5
+    glass_thickness_mm: NotNegative = 0.05
+    glass_index: NotNegative = 1e-3
+    laser_window_tilt_deg: NotNegative = 0.5
+    bow_deg: NotNegative = 0.5
+    temperature_k: Positive = 1.0
+    drift_k: NotNegative = 0.2
+    index: Positive = 1e-4
+    stage_position_mm: Positive = 0.005
+    stage_scale: NotNegative = 1e-4
+    stage_alignment_deg: Positive = 0.5
+    target_bow_mm: NotNegative = 0.03
+    step_height_mm: Positive = 0.01
+
+
+class Sensor(Description):
+    """A complete sensor with the media it is used in. ``more_lasers`` shine further sheets at the same time."""
+
+    name: str
+    notes: str = ""
+    camera: Camera
+    laser: Laser
+    more_lasers: tuple[Laser, ...] = ()
+    detector: Detector
+    exposure: Exposure = Exposure()
+    lamp: Lamp = Lamp()
+    stage: Stage
+    volume: Volume
+    media: dict[str, Medium]
+    uncertainty: Uncertainty = Uncertainty()
+
+    def medium(self, name: str) -> Medium:
+        """One of the sensor's media; DescriptionError where it has none of this name."""
+        if name not in self.media:
+            raise DescriptionError(f"the sensor '{self.name}' knows the media {', '.join(self.media)}, not '{name}'")
+        return self.media[name]
+
+    @model_validator(mode="after")
+    def _one_wavelength(self) -> "Sensor":
+        for laser in self.more_lasers:
+            if laser.wavelength_nm != self.laser.wavelength_nm:
+                raise ValueError(
+                    f"the lasers have {self.laser.wavelength_nm:g} and {laser.wavelength_nm:g} nm; "
+                    "a sensor is rendered at one wavelength: give all lasers the same"
+                )
+        return self

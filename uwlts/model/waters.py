@@ -1,0 +1,151 @@
+"""Natural waters by name: what particles and dissolved matter add to pure water.
+
+A new water is an entry of `WATERS`: a sentence, its absorption and scattering, and the phase function of its particles.
+
+Petzold's stations (1972, SIO Ref. 72-78, Figs. 22 to 37, at 530 nm; texts after Mobley give 514 nm, the report itself
+530): their absorption and scattering beyond pure water are carried to other wavelengths by exp(-S (l - 530 nm)),
+S = 0.014 / nm (coloured dissolved matter, Bricaud and others 1981; 0.011 to 0.018 are found), and by 530 nm / l
+(exponents from 0.3 for large to 1.7 for small particles, Haltrin 1999); both forms and S are recalled, not checked
+against the papers. Around 635 nm they matter little. Towards 400 nm the absorption of "clear" is too high, as that
+station's is threefold pure water's already at 530 nm.
+
+Jerlov's types are the tables of Solonenko and Mobley (2015), 400-700 nm. Other authors' scattering differs up to 2.8
+times for the same type: sweep ``scattering_per_m`` where a result depends on it. The tables' pure water absorbs a few
+per cent less than Pope and Fry's beyond 650 nm, so that the clearest types then absorb less than "pure".
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from uwlts.model.errors import DescriptionError
+from uwlts.model.media import check_range, read_table, water_absorption_per_m, water_scattering_per_m
+
+_STATION_NM = 530.0
+_ABSORPTION_SLOPE_PER_NM = 0.014
+_SCATTERING_EXPONENT = 1.0
+
+
+@dataclass(frozen=True)
+class Particles:
+    """What particles and dissolved matter add to pure water's absorption and scattering, in 1/m.
+
+    The absorption may be slightly negative where a water's table takes pure water to absorb less than ours.
+    """
+
+    absorption_per_m: float
+    scattering_per_m: float
+
+
+@dataclass(frozen=True)
+class NaturalWater:
+    """A named water.
+
+    ``particles`` gives what it adds to pure water at a wavelength in nm; ``phase`` names the phase function of its
+    particles, one of `uwlts.model.phase_functions.KINDS`.
+    """
+
+    sentence: str
+    particles: Callable[[float], Particles]
+    phase: str = "petzold"
+
+
+def _station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: float) -> Particles:
+    """Beyond the sea water of a station, carried from 530 nm to another wavelength."""
+    _check_wavelength(wavelength_nm)
+    absorption = absorption_per_m - water_absorption_per_m(wavelength_nm=_STATION_NM)
+    scattering = scattering_per_m - water_scattering_per_m(wavelength_nm=_STATION_NM, salinity_g_kg=35.0)
+    return Particles(
+        absorption * math.exp(-_ABSORPTION_SLOPE_PER_NM * (wavelength_nm - _STATION_NM)),
+        scattering * (_STATION_NM / wavelength_nm) ** _SCATTERING_EXPONENT,
+    )
+
+
+def _jerlov(column: int, wavelength_nm: float) -> Particles:
+    """Beyond pure water, by a column of the tables, linear between their 25 nm.
+
+    What is linear is the difference from pure water, as its absorption climbs steeply between 575 and 600 nm. The
+    molecules' part taken off the scattering is the authors' own (their Eq. 8, after Haltrin 1999).
+    """
+    _check_wavelength(wavelength_nm)
+    wavelength, absorption = read_table("jerlov_absorption.csv")[[0, column]]
+    scattering = read_table("jerlov_scattering.csv")[column]
+    pure = np.array([water_absorption_per_m(wavelength_nm=w) for w in wavelength])
+    molecules = 5.83e-3 * (400 / wavelength) ** 4.322
+    return Particles(
+        float(np.interp(wavelength_nm, wavelength, absorption - pure)),
+        float(np.interp(wavelength_nm, wavelength, scattering - molecules)),
+    )
+
+
+def _check_wavelength(wavelength_nm: float) -> None:
+    check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, "the absorption and scattering of natural waters")
+
+
+WATERS = {
+    "pure": NaturalWater("pure water", lambda wavelength_nm: Particles(0.0, 0.0)),
+    "clear": NaturalWater("Petzold's AUTEC 8, Bahamas", partial(_station, 0.114, 0.037)),
+    "coastal": NaturalWater("Petzold's HAOCE 11, California", partial(_station, 0.179, 0.219)),
+    "harbour": NaturalWater("Petzold's NUC 2040, San Diego", partial(_station, 0.366, 1.824)),
+    "jerlov-I": NaturalWater("the clearest ocean", partial(_jerlov, 1)),
+    "jerlov-IB": NaturalWater("ocean, between I and II", partial(_jerlov, 2)),
+    "jerlov-II": NaturalWater("ocean", partial(_jerlov, 3)),
+    "jerlov-III": NaturalWater("the most turbid ocean", partial(_jerlov, 4)),
+    "jerlov-1C": NaturalWater("the clearest coast", partial(_jerlov, 5)),
+    "jerlov-3C": NaturalWater("coast", partial(_jerlov, 6)),
+    "jerlov-5C": NaturalWater("coast, more turbid", partial(_jerlov, 7)),
+    "jerlov-7C": NaturalWater("coast, turbid", partial(_jerlov, 8)),
+    "jerlov-9C": NaturalWater("the most turbid coast", partial(_jerlov, 9)),
+}
+"""All named waters: Petzold's by absorption and scattering in 1/m with sea water, Jerlov's by the tables' columns."""
+
+
+def water_names() -> tuple[str, ...]:
+    """Names of the known waters, from pure to the most turbid of either family."""
+    return tuple(WATERS)
+
+
+def named_water(name: str) -> NaturalWater:
+    """The water of a name; DescriptionError with the known names."""
+    if name not in WATERS:
+        raise DescriptionError(f"unknown water '{name}'; known are {', '.join(WATERS)}")
+    return WATERS[name]
+
+
+def particles_of(water: str, *, wavelength_nm: float) -> Particles:
+    """What a named water adds to pure water.
+
+    Raises
+    ------
+    DescriptionError
+        The name is unknown.
+    RangeError
+        Outside 400-700 nm, unless the water is pure.
+    """
+    return named_water(water).particles(wavelength_nm)
+
+
+def particles_at(turbidity: float, *, wavelength_nm: float) -> Particles:
+    """What water of a turbidity adds to pure water: 0 is "pure", 1 "clear", 2 "coastal", 3 "harbour".
+
+    Between 0 and 1 it grows in proportion, from 1 on geometrically: equal steps multiply by equal factors.
+
+    Raises
+    ------
+    RangeError
+        The turbidity is outside 0..3, or the wavelength outside 400-700 nm.
+    """
+    check_range("turbidity", turbidity, 0.0, 3.0, "the scale from pure water to a harbour's")
+    if turbidity <= 1:
+        clear = particles_of("clear", wavelength_nm=wavelength_nm)
+        return Particles(turbidity * clear.absorption_per_m, turbidity * clear.scattering_per_m)
+    below, above = ("clear", "coastal") if turbidity < 2 else ("coastal", "harbour")
+    share = turbidity - (1 if turbidity < 2 else 2)
+    low, high = (particles_of(name, wavelength_nm=wavelength_nm) for name in (below, above))
+    return Particles(
+        low.absorption_per_m ** (1 - share) * high.absorption_per_m**share,
+        low.scattering_per_m ** (1 - share) * high.scattering_per_m**share,
+    )

@@ -1,0 +1,1 @@
+"""Camera, window, laser sheet and brightness: arrays in, arrays out."""

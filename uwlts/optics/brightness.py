@@ -1,0 +1,201 @@
+"""What brightness that varies over a surface does to a stripe's centre.
+
+The sheet has a thickness. Where the surface under it shines brighter on one side, most of the light that is seen comes
+from there and not from the sheet's middle: for a sheet of Gaussian profile with the standard deviation s, from s^2
+times the slope of the brightness's logarithm beside it. The slope shows when the stage moves the sheet over the
+surface.
+
+The image is blurred, too. Where a stripe leans or bends in the image and fades along itself, as at the rim of a sphere,
+blur moves light from one line to the next and with it the centre that is seen there.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from uwlts.model.calibration import Calibration
+from uwlts.model.placement import laser_pose
+from uwlts.model.sensor import Laser, Sensor, Vector
+from uwlts.optics.reconstruction import reconstruct_profile
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA
+from uwlts.stripe.recording import FoundStripes
+
+_MOST_BLUR_PX = 0.1
+"""Where blur may move a centre by more, which is as much as speckle does, it is not worth using."""
+
+_REACH_MM = 2.0
+"""Images taken within this way of the stage tell of the brightness at a point."""
+
+_LEAST_APART_MM = 0.05
+"""Least standard deviation of the positions of images for their brightness to be compared: a third of a sheet."""
+
+_LINES = 12
+_BEND_LINES = 6
+_LEAST_SHARE = 0.2
+
+_LEAST_ACROSS = 0.3
+"""Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
+
+_MOVED_MM = 0.05
+_MOVED_PX = 0.5
+"""So far sheet and pixel are moved to find which ways the points go."""
+
+
+def beside_sheet(
+    calibration: Calibration,
+    sensor: Sensor,
+    line: np.ndarray,
+    centre_px: np.ndarray,
+    width_px: np.ndarray,
+    slopes: np.ndarray,
+    *,
+    medium_index: float,
+    stage_direction: Vector,
+) -> np.ndarray:
+    """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
+
+    The sheet is as thick as described, but no thicker than the stripes would make it on a surface square to the laser.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    sensor : Sensor
+        As described: how thick the sheet is.
+    line, centre_px, width_px : (N,)
+        Stripe centres, and full widths at half maximum.
+    slopes : (N,)
+        Of the brightness; see `slopes_of_brightness`.
+    medium_index : float
+    stage_direction : (3,)
+        As the capture describes it.
+    """
+    direction = np.array(calibration.stage_direction_of(stage_direction))
+    frame = calibration.object_transform()
+    across = float(np.array(calibration.sheet.normal) @ frame[:3, :3] @ direction)
+    if abs(across) < _LEAST_ACROSS or not slopes.any():
+        return np.zeros((len(slopes), 3))
+    sheet = calibration.sheet
+    window = calibration.window if sensor.camera.window.mounted else None
+
+    def points(offset_mm: float, further_px: float = 0.0) -> np.ndarray:
+        moved = calibration.model_copy(
+            update={"sheet": sheet.model_copy(update={"offset_mm": offset_mm}), "window": window}
+        )
+        found = reconstruct_profile(
+            moved, line, centre_px + further_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
+        )
+        return found.points_mm
+
+    on_sheet = points(sheet.offset_mm)
+    per_mm = (points(sheet.offset_mm + _MOVED_MM) - on_sheet) / _MOVED_MM
+    in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
+    away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
+    sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
+    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+    per_px = (points(sheet.offset_mm, _MOVED_PX) - on_sheet) / _MOVED_PX
+    thickest = np.median(width_px) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
+    return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
+
+
+def slopes_of_brightness(
+    frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray, exposure_ms: np.ndarray
+) -> np.ndarray:
+    """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where neighbours do not tell it.
+
+    A plane is fitted to the logarithms of all neighbours, so that noise and speckle of the single ones hardly count.
+
+    Parameters
+    ----------
+    frame, line : (N,) int
+    amplitude : (N,)
+        Positive.
+    stage_mm : (F,)
+        Position of every image, in any order; several may be taken at one.
+    exposure_ms : (F,)
+        Of every image; where that is not known of all, they are taken for exposed alike.
+    """
+    order = np.argsort(stage_mm, kind="stable")
+    rank = np.empty(len(order), np.intp)
+    rank[order] = np.arange(len(order))
+    used = np.unique(rank[frame])
+    row = np.searchsorted(used, rank[frame])
+    position = stage_mm[order][used]
+    within = np.searchsorted(position, position + _REACH_MM, side="right") - np.arange(len(position)) - 1
+    whole = position <= position[-1] - _REACH_MM
+    reach = int(np.median(within[whole])) if whole.any() else len(position) - 1
+    if reach < 1:
+        return np.zeros(len(frame))
+    exposure = exposure_ms[frame] if np.all(exposure_ms[np.unique(frame)] > 0) else 1.0
+    by_stage, _ = _slopes(row, line, np.log(amplitude / exposure), position, rows=reach, columns=_LINES)
+    return by_stage
+
+
+def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float) -> np.ndarray:
+    """Standard deviation of the sheet's profile, mm, so far from the laser in a medium, as described.
+
+    Half the 1/e2 radius w, with w^2 = w0^2 (1 + ((z - z0) / zR)^2), zR = pi w0^2 n / (M2 lambda) (Siegman, Lasers, Eqs.
+    17.5 and 17.6, with the beam quality M2).
+    """
+    waist = laser.waist_radius_mm
+    rayleigh = math.pi * waist**2 * medium_index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
+    return 0.5 * waist * np.sqrt(1.0 + ((distance_mm - laser.waist_distance_mm) / rayleigh) ** 2)
+
+
+def moved_by_blur_px(
+    frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, width_px: np.ndarray
+) -> np.ndarray:
+    """How far blur may move stripe centres (N,), px, by their neighbours in the same image.
+
+    A stripe y(x), blurred by the standard deviation b in all directions, is seen at E[y(x - e) A(x - e)] / E[A(x - e)]
+    with e of that deviation: beside y(x) by b^2 (y' (ln A)' + y'' / 2) to second order. The stripe's width squared,
+    less what it owes to leaning, stands for b^2, of which it is the largest possible value.
+    """
+    row = np.unique(frame, return_inverse=True)[1]
+    rows = np.arange(row.max() + 1.0)
+    _, lean = _slopes(row, line, centre_px, rows, rows=0, columns=_BEND_LINES)
+    _, bend = _slopes(row, line, lean, rows, rows=0, columns=_BEND_LINES)
+    _, fading = _slopes(row, line, np.log(amplitude), rows, rows=0, columns=_LINES)
+    variance = (width_px / FWHM_PER_SIGMA) ** 2 / (1.0 + lean**2)
+    return variance * (lean * fading + 0.5 * bend)
+
+
+def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px."""
+    if len(stripes.line) == 0:
+        return np.empty(0, np.intp), np.empty(0)
+    moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
+    sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
+    return sharp, moved[sharp]
+
+
+def _slopes(
+    row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int, columns: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes (N,) by position and by column of planes fitted to the values within so many rows and columns."""
+    first = column.min()
+    shape = len(position), int(column.max() - first) + 1
+    there, z = np.zeros(shape), np.zeros(shape)
+    there[row, column - first] = 1.0
+    z[row, column - first] = values - values.mean()
+    size: Any = (2 * rows + 1, 2 * columns + 1)  # SciPy takes a size for each axis
+    s = np.broadcast_to((position - position.mean())[:, None], shape)
+    x = np.broadcast_to(np.arange(shape[1]) - 0.5 * shape[1], shape)
+
+    def mean(of: np.ndarray) -> np.ndarray:
+        return uniform_filter(there * of, size, mode="constant") / share
+
+    share = np.maximum(uniform_filter(there, size, mode="constant"), 0.5 / (size[0] * size[1]))
+    ms, mx, mz = mean(s), mean(x), mean(z)
+    ss, xx, sx = mean(s * s) - ms * ms, mean(x * x) - mx * mx, mean(s * x) - ms * mx
+    sz, xz = mean(s * z) - ms * mz, mean(x * z) - mx * mz
+    wide = (share > _LEAST_SHARE) & (xx > 1.0)
+    # Neighbours in a row, or in images taken nearly at one place, tell nothing of the slope across it.
+    step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
+    least = max(0.15 * step**2, _LEAST_APART_MM**2)
+    deep = wide & (ss > least) & (ss < _REACH_MM**2) & (ss * xx - sx * sx > 1e-3 * ss * xx)
+    by_position, by_column = np.zeros(shape), np.zeros(shape)
+    np.divide(sz * xx - xz * sx, ss * xx - sx * sx, out=by_position, where=deep)
+    np.divide(xz, xx, out=by_column, where=wide)
+    return by_position[row, column - first], by_column[row, column - first]

@@ -1,0 +1,87 @@
+"""The calibration that follows from a sensor's description alone, for designs and for checks with true parameters."""
+
+import math
+
+import numpy as np
+
+from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
+from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.optics.window import trace_window
+
+_RAYS, _DEPTHS = 65, 9
+
+
+def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibration:
+    """The calibration a sensor would have if it were built exactly as its description says.
+
+    Without a medium the sheet is the plane of the fan as it leaves the laser. In a medium it is the
+    plane that fits the fan's rays best where the camera sees them, after they have passed the laser's window: a window
+    turned about the sheet's normal leaves the sheet as it is, one turned about the fan's direction turns and bends it.
+    """
+    camera, plate = sensor.camera, sensor.camera.window
+    f, (cx, cy) = camera.focal_length_px(), camera.principal_point()
+    return Calibration(
+        sensor_name=sensor.name,
+        stripe_along=camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
+        camera=CameraModel(
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            fx_px=f,
+            fy_px=f,
+            cx_px=cx,
+            cy_px=cy,
+            distortion=camera.distortion,
+        ),
+        window=WindowModel(
+            refractions=2,
+            distance_mm=plate.distance_mm,
+            normal=tuple(plate.normal()),
+            thickness_mm=plate.thickness_mm,
+            glass_index=plate.index(sensor.laser.wavelength_nm),
+        )
+        if plate.mounted
+        else None,
+        sheet=_fan_plane(sensor) if medium is None else _sheet(sensor, medium),
+        camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
+        provenance={"source": f"description of the sensor '{sensor.name}'"},
+    )
+
+
+def _fan_plane(sensor: Sensor) -> SheetModel:
+    pose = laser_pose(sensor)
+    return SheetModel(normal=tuple(pose.normal), offset_mm=float(pose.normal @ pose.origin_mm))
+
+
+def _sheet(sensor: Sensor, medium: Medium) -> SheetModel:
+    """Plane through the fan's rays in the medium, over the depths that the camera sees."""
+    laser, pose = sensor.laser, laser_pose(sensor)
+    half = math.radians(laser.fan_angle_deg / 2)
+    angle = np.linspace(-half, half, _RAYS)
+    fan = np.stack([np.zeros(_RAYS), np.sin(angle), np.cos(angle)], axis=1)
+    plate = laser.window
+    window = (
+        WindowModel(
+            refractions=2,
+            distance_mm=plate.distance_mm,
+            normal=tuple(plate.normal()),
+            thickness_mm=plate.thickness_mm,
+            glass_index=plate.index(laser.wavelength_nm),
+        )
+        if plate.mounted
+        else None
+    )
+    rays = trace_window(fan, window, medium_index=medium.refractive_index(laser.wavelength_nm))
+    # Module frame of the laser: x along the sheet's normal, y along the fan, z along the axis.
+    module = np.stack([pose.normal, pose.fan, pose.axis])
+    origins, directions = rays.origins @ module + pose.origin_mm, rays.directions @ module
+    view = view_of_sheet(sensor, medium)
+    outer = sensor.camera.window.distance_mm + sensor.camera.window.thickness_mm
+    depths = np.linspace(view.nearest_mm, view.farthest_mm, _DEPTHS) + outer
+    reach = (depths[:, None] - origins[:, 2]) / directions[:, 2]
+    points = (origins + reach[..., None] * directions).reshape(-1, 3)
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    normal *= np.sign(normal @ pose.normal)
+    return SheetModel(normal=tuple(normal), offset_mm=float(normal @ middle))

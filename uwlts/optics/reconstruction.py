@@ -1,0 +1,253 @@
+"""From stripe centres in the image to points on the surface.
+
+By lens, window and sheet, then the stage (thesis Fig. 43); or by polynomials, position to Z and Z to Y (thesis, section
+4.7).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import RangeError
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.optics.camera import directions
+from uwlts.optics.sheet import SheetSurface, sheet_surface
+from uwlts.optics.window import RaysInMedium, RayStatus, trace_window
+
+# Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
+# angle would meet a sheet 1 mm away after a million kilometres.
+_PARALLEL = 1e-12
+
+# Pixels computed together, so that all intermediate results stay in the processor's cache.
+_BLOCK = 4096
+
+
+@dataclass(frozen=True)
+class SheetPoints:
+    """Points where camera rays cross the laser sheet, in the camera frame.
+
+    Attributes
+    ----------
+    points_camera_mm : (N, 3) float64, NaN where the status is not OK
+    status : (N,) uint8, `uwlts.optics.window.RayStatus`
+    """
+
+    points_camera_mm: np.ndarray
+    status: np.ndarray
+
+
+@dataclass(frozen=True)
+class ObjectPoints:
+    """Measured points in the object coordinate system (OCS), at the stage position 0.
+
+    Attributes
+    ----------
+    points_mm : (N, 3) float64, NaN where the status is not OK
+    status : (N,) uint8, `uwlts.optics.window.RayStatus`
+    """
+
+    points_mm: np.ndarray
+    status: np.ndarray
+
+
+def reconstruct_profile(
+    calibration: Calibration,
+    lines: np.ndarray,
+    centres_px: np.ndarray,
+    *,
+    medium_index: float,
+    stage_mm: np.ndarray | float,
+    stage_direction: np.ndarray,
+) -> ObjectPoints:
+    """Measured points of the stripe centres of one profile, or of many joined together.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    lines : (N,)
+        Numbers of the profile lines: image columns if the stripe runs along the width, else image rows.
+    centres_px : (N,)
+        Stripe centre in each line.
+    medium_index, stage_mm, stage_direction
+        As for `reconstruct_pixels`.
+    """
+    pair = (lines, centres_px) if calibration.stripe_along == "width" else (centres_px, lines)
+    return reconstruct_pixels(
+        calibration,
+        np.stack(pair, axis=1),
+        medium_index=medium_index,
+        stage_mm=stage_mm,
+        stage_direction=stage_direction,
+    )
+
+
+def reconstruct_pixels(
+    calibration: Calibration,
+    pixels: np.ndarray,
+    *,
+    medium_index: float,
+    stage_mm: np.ndarray | float,
+    stage_direction: np.ndarray,
+) -> ObjectPoints:
+    """Measured points in the OCS of pixels (N, 2), given as (u, v) in px; see `points_on_sheet` and `to_object`."""
+    found = points_on_sheet(calibration, pixels, medium_index=medium_index)
+    points = to_object(calibration, found.points_camera_mm, stage_mm=stage_mm, stage_direction=stage_direction)
+    return ObjectPoints(points, found.status)
+
+
+def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_index: float) -> SheetPoints:
+    """Where the camera rays of pixels cross the laser sheet in the medium (thesis Eqs. 3.3 to 3.9).
+
+    Parameters
+    ----------
+    calibration : Calibration
+    pixels : (N, 2)
+        (u, v) in px; the pixels of many frames may be given at once.
+    medium_index : float
+        Refractive index of the medium relative to air; not used by a calibration without a window.
+
+    Returns
+    -------
+    SheetPoints
+
+    Raises
+    ------
+    RangeError
+        A pixel is not finite, or the index is not finite and positive.
+    """
+    pixels = np.asarray(pixels, dtype=float)
+    blocks = [
+        _crossings(
+            trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index),
+            sheet_surface(calibration.sheet, medium_index=medium_index),
+        )
+        for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK))
+    ]
+    return SheetPoints(
+        np.concatenate([block.points_camera_mm for block in blocks]), np.concatenate([block.status for block in blocks])
+    )
+
+
+def to_object(
+    calibration: Calibration, points_camera: np.ndarray, *, stage_mm: np.ndarray | float, stage_direction: np.ndarray
+) -> np.ndarray:
+    """Points (N, 3) in the OCS at stage position 0, mm, from points (N, 3) in the camera frame at ``stage_mm``.
+
+    ``p_object = T_object_camera p_camera + stage_mm * stage_direction``; rows of NaN stay NaN.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    points_camera : (N, 3)
+    stage_mm : float or (N,)
+        Position of the stage, of all points or of each.
+    stage_direction : (3,)
+        Unit direction in the OCS in which the stage moves the sensor.
+
+    Raises
+    ------
+    RangeError
+        A stage position is not finite, or the direction is not a unit vector.
+    """
+    travel = stage_travel(stage_mm, stage_direction)
+    object_from_camera = np.linalg.inv(calibration.object_transform())
+    points = object_from_camera[:3, :3] @ np.asarray(points_camera, dtype=float).T + object_from_camera[:3, 3, None]
+    points += travel
+    return np.ascontiguousarray(points.T)
+
+
+def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> np.ndarray:
+    """What the stage's motion adds to points in the OCS: (3, N), or (3, 1) where all share a position.
+
+    Raises
+    ------
+    RangeError
+        A stage position is not finite, or the direction is not a unit vector.
+    """
+    stage_mm, stage_direction = np.asarray(stage_mm, dtype=float), np.asarray(stage_direction, dtype=float)
+    if not np.isfinite(stage_mm).all():
+        raise RangeError("a stage position is not finite")
+    if not abs(np.linalg.norm(stage_direction) - 1.0) <= 1e-6:
+        raise RangeError(f"the stage's direction {stage_direction} is not a unit vector")
+    return np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
+
+
+def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> SheetPoints:
+    """Crossings of rays in the medium with the sheet (thesis Eq. 3.9 for a plane).
+
+    A crossing that is not ahead of the ray is BEHIND if the light passed the sheet between the pupil and the medium,
+    that is, if the two lie on different sides of it; otherwise the ray runs away from the sheet.
+    """
+    normal = sheet.normal
+    gap = sheet.offset_mm - rays.origins @ normal
+    approach = rays.directions @ normal
+    parallel = np.abs(approach) <= _PARALLEL
+    if parallel.any():
+        approach[parallel] = np.nan
+    length = gap / approach if sheet.is_plane() else sheet.crossings(rays.origins.T, rays.directions.T)[0]
+    points = (rays.origins.T + length * rays.directions.T).T
+    status = rays.status
+    if not np.all(length > 0):
+        passed = gap * sheet.offset_mm <= 0
+        missed = (status == RayStatus.OK) & ~(length > 0)
+        status = np.where(missed, np.where(passed, RayStatus.BEHIND, RayStatus.NO_CROSSING), status).astype(np.uint8)
+        points[status != RayStatus.OK] = np.nan
+    return SheetPoints(points, status)
+
+
+def reconstruct_by_polynomials(
+    calibration: PolynomialCalibration,
+    lines: np.ndarray,
+    centres_px: np.ndarray,
+    *,
+    stage_mm: np.ndarray | float,
+    stage_direction: np.ndarray,
+) -> ObjectPoints:
+    """Measured points in the OCS at stage position 0 of stripe centres; X is 0 but for the stage's travel.
+
+    A centre outside the range that its line was calibrated for, or on a line that was not calibrated, has no point:
+    its status is OUTSIDE_CALIBRATION.
+
+    Parameters
+    ----------
+    calibration : PolynomialCalibration
+    lines : (N,) int
+        Numbers of the profile lines: image columns if the stripe runs along the width, else image rows.
+    centres_px : (N,)
+        Stripe centre in each line.
+    stage_mm : float or (N,)
+    stage_direction : (3,)
+        Unit direction in the OCS in which the stage moves the sensor.
+
+    Raises
+    ------
+    RangeError
+        A centre or a stage position is not finite, or the direction is not a unit vector.
+    """
+    lines, centres_px = np.asarray(lines), np.asarray(centres_px, dtype=float)
+    if not np.isfinite(centres_px).all():
+        raise RangeError("a stripe centre is not finite")
+    domains = calibration.domains()
+    rows = lines - calibration.first_line
+    known = (rows >= 0) & (rows < len(domains))
+    rows = np.where(known, rows, 0)
+    # Comparisons with the NaN of a line without a range are false.
+    known &= (centres_px >= domains[rows, 0]) & (centres_px <= domains[rows, 1])
+    rows = rows[known]
+    depth = _polynomial_values(calibration.depth_coefficients, rows, centres_px[known], calibration.position_range_px)
+    along = _polynomial_values(calibration.along_coefficients, rows, depth, calibration.depth_range_mm)
+    points = np.full((len(lines), 3), np.nan)
+    points[known] = np.column_stack([np.zeros(len(rows)), along, depth])
+    points += stage_travel(stage_mm, stage_direction).T
+    status = np.where(known, RayStatus.OK, RayStatus.OUTSIDE_CALIBRATION).astype(np.uint8)
+    return ObjectPoints(points, status)
+
+
+def _polynomial_values(
+    coefficients: tuple[tuple[float, ...], ...], rows: np.ndarray, x: np.ndarray, limits: tuple[float, float]
+) -> np.ndarray:
+    """Values (N,) of the polynomials in ``rows`` (N,) at x (N,)."""
+    low, high = limits
+    return legendre.legval((2 * x - low - high) / (high - low), np.array(coefficients)[rows].T, tensor=False)

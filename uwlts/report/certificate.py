@@ -1,0 +1,401 @@
+"""The certificate of a calibration: its content as typed objects, and the seal over it."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, JsonValue, field_serializer
+
+import uwlts
+from uwlts.calibration.joint.next_shot import Outlook, next_shots
+from uwlts.calibration.joint.observability import format_weaknesses, lengths_over, regions, weaknesses
+from uwlts.calibration.joint.stored_estimate import require_joint
+from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CaptureError
+from uwlts.model.joint_estimate import ImageFit
+from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
+from uwlts.model.sensor import Medium
+from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
+from uwlts.storage.capture_sources import sha256_of
+from uwlts.storage.files import read_json
+
+FORMAT = "uwlts-certificate"
+
+
+VERSION = 1
+
+
+_SEAL = "sha256"
+
+
+def canonical(content: Mapping[str, JsonValue]) -> bytes:
+    """The content but its seal as bytes that depend on nothing else: sorted keys, no spaces, UTF-8."""
+    bare = {key: value for key, value in content.items() if key != _SEAL}
+    text = json.dumps(bare, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8")
+
+
+def seal_of(content: Mapping[str, JsonValue]) -> str:
+    """The seal of a content: SHA-256 of its canonical bytes."""
+    return hashlib.sha256(canonical(content)).hexdigest()
+
+
+def read_certificate(path: str | Path) -> dict[str, JsonValue]:
+    """A certificate's JSON as it stands in the file, all of it sealed; CaptureError if it is missing or foreign."""
+    content = read_json(path, called="certificate")
+    if content.get("format") != FORMAT:
+        raise CaptureError(f'{path} is JSON but not a certificate: expected "format": "{FORMAT}"')
+    if content.get("version") != VERSION:
+        raise CaptureError(f"{path} has version {content.get('version')}; this program reads {VERSION}")
+    return content
+
+
+def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
+    """What speaks against a certificate and against its belonging to a calibration's file; nothing where all is well.
+
+    Raises
+    ------
+    CaptureError
+        A file cannot be read, or is no certificate.
+    """
+    content, found = read_certificate(path), sha256_of(calibration)
+    against = []
+    if content.get(_SEAL) != seal_of(content):
+        against.append(f"{path} was changed after it was issued: its seal does not fit its content")
+    certified = content.get("calibration")
+    if not isinstance(certified, dict):
+        raise CaptureError(f"{path} is damaged: it does not name its calibration")
+    if found != (told := certified.get("sha256")):
+        against.append(
+            f"{calibration} is not the calibration that {path} is about, or was changed since: its SHA-256 is {found}, "
+            f"the certificate's {told}"
+        )
+    return against
+
+
+NOT_JOINT = "the calibration was not estimated jointly: what lengths measured by it are worth is not known"
+
+
+# Shots that are listed besides the best one of each kind.
+_BEST_SHOTS = 3
+
+
+_Pair = tuple[float, float]
+
+
+class _Stored(BaseModel):
+    """Base of what a certificate's file holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class CertifiedFile(_Stored):
+    """The calibration's file: name, SHA-256, the digest by which clouds name it, when and by what it was made."""
+
+    file: str
+    sha256: str
+    digest: str
+    date: JsonValue
+    software: JsonValue
+
+
+class ParameterRow(_Stored):
+    """A parameter in words with its unit, value, and standard uncertainties after and before; None for unknown."""
+
+    name: str
+    words: str
+    unit: str
+    value: float
+    std: float | None
+    std_before: float | None
+
+
+class CalibratedMedium(_Stored):
+    """A medium and its refractive index."""
+
+    medium: Medium
+    index: float
+
+    @field_serializer("medium")
+    def _stored_medium(self, medium: Medium) -> dict[str, JsonValue]:
+        return medium.model_dump(mode="json", exclude_none=True)
+
+
+class Validity(_Stored):
+    """A region that the evidence covers, in which medium, and how well its index is known."""
+
+    name: str
+    medium: Medium
+    through_window: bool
+    index: float
+    index_std: float | None
+    camera_depth_mm: _Pair
+    y_mm: _Pair
+    z_mm: _Pair
+    outline_mm: tuple[_Pair, ...]
+    stripe_points: int
+
+    @field_serializer("medium")
+    def _stored_medium(self, medium: Medium) -> dict[str, JsonValue]:
+        return medium.model_dump(mode="json", exclude_none=True)
+
+
+class WeaknessRow(_Stored):
+    """Parameters that the evidence determines badly; see `uwlts.calibration.joint.observability.Weakness`."""
+
+    parameters: tuple[str, ...]
+    confused: bool
+    cost_mm: float
+    length_mm: float
+    along: str
+    depth_mm: float
+
+
+class NextShot(_Stored):
+    """A further shot: what it is, the standard uncertainty of lengths before and after, and the advice to take it."""
+
+    words: str
+    before_mm: float
+    after_mm: float
+    advice: str
+
+
+class Certificate(_Stored):
+    """What every certificate says. Fields that are not given are left out of the file."""
+
+    format: str
+    version: int
+    sensor: str
+    issued: str
+    software: str
+    calibration: CertifiedFile
+    wavelength_nm: float
+    made_from: dict[str, JsonValue]
+    parameters: tuple[ParameterRow, ...]
+    uncertainty_known: bool
+
+    def in_file(self) -> dict[str, JsonValue]:
+        """The content as plain JSON with the keys of files."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+
+class JointCertificate(Certificate):
+    """Certificate of a joint calibration; without a covered area (see ``remark``) no lengths are known."""
+
+    validity: tuple[Validity, ...]
+    scatter_px: dict[str, float]
+    shared_variance: dict[str, float]
+    residuals: int
+    strays: int
+    images: tuple[ImageFit, ...]
+    remark: str | None = None
+    lengths: tuple[LengthUncertainty, ...] = ()
+    lengths_std_mm: float | None = None
+    cannot_tell: tuple[str, ...] = ()
+    weaknesses: tuple[WeaknessRow, ...] = ()
+    next_shots: tuple[NextShot, ...] = ()
+    sha256: str = ""
+
+
+class SequentialCertificate(Certificate):
+    """Certificate of a calibration in steps, which knows no uncertainty of lengths."""
+
+    remark: str
+    use: str
+    media: tuple[CalibratedMedium, ...]
+    residuals: dict[str, dict[str, JsonValue]]
+    sha256: str = ""
+
+
+AnyCertificate = JointCertificate | SequentialCertificate
+
+
+class _Shared(TypedDict):
+    """Fields of `Certificate`."""
+
+    format: str
+    version: int
+    sensor: str
+    issued: str
+    software: str
+    calibration: CertifiedFile
+    wavelength_nm: float
+    made_from: dict[str, JsonValue]
+    parameters: tuple[ParameterRow, ...]
+    uncertainty_known: bool
+
+
+def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
+    """The sealed content of a certificate.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    path : path
+        Its file.
+    issued : str
+        When, in ISO 8601.
+
+    Raises
+    ------
+    CalibrationError
+        Its joint estimate is damaged.
+    """
+    shared: _Shared = {
+        "format": FORMAT,
+        "version": VERSION,
+        "sensor": calibration.sensor_name,
+        "issued": issued,
+        "software": f"uwlts {uwlts.__version__}",
+        "calibration": CertifiedFile(
+            file=Path(path).name,
+            sha256=sha256_of(path),
+            digest=calibration_digest(calibration),
+            date=calibration.provenance.get("date"),
+            software=calibration.provenance.get("software"),
+        ),
+        "wavelength_nm": calibration.wavelength_nm,
+        "made_from": calibration.provenance,
+        "parameters": parameter_rows(calibration),
+        "uncertainty_known": calibration.joint is not None,
+    }
+    content = _sequential(shared, calibration) if calibration.joint is None else _joint(shared, calibration)
+    return content.model_copy(update={"sha256": seal_of(content.in_file())})
+
+
+def certificate_lines(content: AnyCertificate) -> list[str]:
+    """The gist of a certificate for the terminal."""
+    if content.remark is not None:
+        return [content.remark]
+    assert isinstance(content, JointCertificate)
+    longest = {row.axis: row for row in content.lengths}
+    volume = content.validity[0]
+    return [
+        f"in {volume.name}, {volume.camera_depth_mm[0]:.0f} to {volume.camera_depth_mm[1]:.0f} mm from the "
+        "camera's pupil, expanded uncertainty (k = 2) by the calibration: "
+        + ", ".join(
+            f"{1e3 * row.calibration_mm:.1f} µm of {row.length_mm:g} mm along {axis}" for axis, row in longest.items()
+        ),
+        *content.cannot_tell,
+        *(f"next: {shot.advice}" for shot in content.next_shots[:1]),
+    ]
+
+
+def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
+    """Every parameter that was estimated."""
+    if (joint := calibration.joint) is not None:
+        rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
+        return tuple(_row(*row) for row in rows)
+    camera, window = calibration.camera, calibration.window
+    figures = calibration.residuals
+    std = figures.get("camera", {}).get("std", {})
+    names = ("f",) if camera.fx_px == camera.fy_px else ("fx", "fy")
+    values = {"f": camera.fx_px, "fx": camera.fx_px, "fy": camera.fy_px, "cx": camera.cx_px, "cy": camera.cy_px}
+    values |= camera.distortion.model_dump()
+    shown = [*names, "cx", "cy", *(name for name, value in camera.distortion.model_dump().items() if value)]
+    rows = [_row(parameter_of(name), values[name], std.get(name), None) for name in shown]
+    if window is not None:
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, figures.get("window", {}).get("std_mm"), None))
+        if window.refractions == 2:
+            rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm, None, None))
+            rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index, None, None))
+    return tuple(rows)
+
+
+def _row(key: ParameterKey, value: float, std: float | None, before: float | None) -> ParameterRow:
+    quantity = key.quantity
+    return ParameterRow(
+        name=key.text,
+        words=quantity.words,
+        unit=quantity.unit,
+        value=value * quantity.factor,
+        std=None if std is None else std * quantity.factor,
+        std_before=None if before is None else before * quantity.factor,
+    )
+
+
+def _sequential(shared: _Shared, calibration: Calibration) -> SequentialCertificate:
+    figures, window = calibration.residuals, calibration.window
+    rms = {
+        step: {
+            key: value
+            for key, value in table.items()
+            if key in ("rms_px", "rms_mm", "max_mm", "images") and not isinstance(value, list)
+        }
+        for step, table in figures.items()
+    }
+    return SequentialCertificate(
+        **shared,
+        remark=NOT_JOINT,
+        use=f"in {calibration.medium_kind} only" if window is None else "in air and in water",
+        media=tuple(CalibratedMedium(medium=found.medium, index=found.index) for found in calibration.media),
+        residuals={step: table for step, table in rms.items() if table},
+    )
+
+
+def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
+    joint, found = require_joint(calibration), regions(calibration)
+    content = JointCertificate(
+        **shared,
+        validity=tuple(_validity(in_use(calibration, region)) for region in found),
+        scatter_px=joint.scatter_px,
+        shared_variance=joint.shared_variance,
+        residuals=joint.residual_count,
+        strays=joint.outlier_count,
+        images=joint.images,
+    )
+    if not found:
+        remark = "the calibration does not tell what volume its evidence covers: calibrate again"
+        return content.model_copy(update={"remark": remark})
+    if not found[0].has_area():
+        remark = "the stripes of the evidence cover no area: what lengths are worth is not known"
+        return content.model_copy(update={"remark": remark})
+    use = in_use(calibration, found[0])
+    lengths, known = lengths_over(calibration, use.known, found[0]), use.known
+    weak = weaknesses(lengths, known.parameters.keys, known.covariance)
+    return content.model_copy(
+        update={
+            "lengths": tuple(length_uncertainties(use)),
+            "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
+            "cannot_tell": tuple(format_weaknesses(weak)),
+            "weaknesses": tuple(
+                WeaknessRow.model_validate(asdict(each) | {"parameters": tuple(key.text for key in each.parameters)})
+                for each in weak
+            ),
+            "next_shots": _shots(next_shots(calibration)),
+        }
+    )
+
+
+def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
+    """The best shots, and the best of each kind, in their order."""
+    kinds: dict[str, Outlook] = {}
+    for outlook in outlooks:
+        kinds.setdefault(outlook.words.split(",")[0], outlook)
+    return tuple(
+        NextShot(words=o.words.rstrip(","), before_mm=o.before_mm, after_mm=o.after_mm, advice=o.advice())
+        for place, o in enumerate(outlooks)
+        if place < _BEST_SHOTS or any(o is best for best in kinds.values())
+    )
+
+
+def _validity(use: InUse) -> Validity:
+    region, known, index = use.region, use.known, index_key(use.known)
+    low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
+    return Validity(
+        name=region.name,
+        medium=region.medium,
+        through_window=region.view.window,
+        index=known.parameters.medium_index(known.values, known.view),
+        index_std=None if index is None else require_joint(use.calibration).std_of(index),
+        camera_depth_mm=region.camera_depth_mm.tolist(),
+        y_mm=(float(low[0]), float(high[0])),
+        z_mm=(float(low[1]), float(high[1])),
+        outline_mm=region.outline_mm.tolist(),
+        stripe_points=region.points,
+    )

@@ -1,0 +1,262 @@
+"""Uncertainty of lengths and points over the volume that a joint calibration covers, and its change by another one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.calibration.joint.evidence import STEP, STRIPE
+from uwlts.calibration.joint.observability import Lengths, Region, estimate_in, lengths_between, pixels_at, points_at
+from uwlts.calibration.joint.scanned_surfaces import SCANNED
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import MediumIndex
+from uwlts.model.sensor import Uncertainty
+from uwlts.optics.reconstruction import points_on_sheet
+
+LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
+# Places tried along each axis for the largest uncertainty, which changes slowly over the volume.
+_PLACES = 9
+
+
+@dataclass(frozen=True)
+class LengthUncertainty:
+    """Expanded uncertainties (k = 2) in mm of one length along one axis, the largest over the volume.
+
+    Attributes
+    ----------
+    axis : {"X", "Y", "Z"}
+    length_mm : float
+    calibration_mm : float
+        By the calibration alone, as for points averaged over surfaces; along X by the stage alone.
+    point_mm : float
+        With the noise of a single stripe centre at each end.
+    """
+
+    axis: str
+    length_mm: float
+    calibration_mm: float
+    point_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class InUse:
+    """A joint estimate as it holds for measurements, in the region that it covers.
+
+    ``covariance`` (P, P) is that of the estimate with the drift of the medium's index since; ``noise_px`` the standard
+    deviation of a stripe's centre.
+    """
+
+    calibration: Calibration
+    region: Region
+    known: StoredEstimate
+    covariance: np.ndarray
+    uncertainty: Uncertainty
+    noise_px: float
+
+
+def in_use(calibration: Calibration, region: Region) -> InUse:
+    """A joint calibration in one of its regions; CalibrationError where it is damaged."""
+    known = estimate_in(calibration, region)
+    uncertainty = calibration.origin().known_before
+    covariance, index = known.covariance.copy(), index_key(known)
+    if index in known.parameters.keys:
+        place = known.parameters.keys.index(index)
+        drift = region.medium.index_per_kelvin(calibration.wavelength_nm) * uncertainty.drift_k
+        covariance[place, place] += drift**2
+    scatter = require_joint(calibration).scatter_px
+    noise = next((scatter[kind] for kind in (STRIPE, STEP, *SCANNED) if kind in scatter), 0.0)
+    return InUse(calibration, region, known, covariance, uncertainty, noise)
+
+
+def index_key(known: StoredEstimate) -> MediumIndex | None:
+    """The index of what the camera looks into; None in air."""
+    return None if known.view.medium is None else known.parameters.index_key(known.view.medium)
+
+
+def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
+    """Every length that fits into the volume, along X, Y and Z."""
+    found = [_along_x(length, use.uncertainty) for length in LENGTHS_MM]
+    for axis in "YZ":
+        for length in LENGTHS_MM:
+            ends = ends_over(use.region, axis, length)
+            if len(ends):
+                known = lengths_of(use, ends)
+                found.append(
+                    LengthUncertainty(
+                        axis,
+                        length,
+                        2 * float(known.std_mm(use.covariance).max()),
+                        2 * float(known.std_mm(use.covariance, noise_px=use.noise_px).max()),
+                    )
+                )
+    fitting = {worth.length_mm for worth in found if worth.axis != "X"}
+    return [worth for worth in found if worth.length_mm in fitting]
+
+
+def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
+    """Lengths between Y and Z (M, 2, 2)."""
+    points = points_at(use.calibration, use.known, ends.reshape(-1, 2))
+    first = 2 * np.arange(len(ends))
+    return lengths_between(points, first, first + 1)
+
+
+def _along_x(length_mm: float, uncertainty: Uncertainty) -> LengthUncertainty:
+    """A length along the stage's motion: the same place of the sheet sees both ends, so that only the stage counts."""
+    std = float(np.hypot(np.sqrt(2.0) * uncertainty.stage_position_mm, uncertainty.stage_scale * length_mm))
+    return LengthUncertainty("X", length_mm, 2 * std, 2 * std)
+
+
+def ends_over(region: Region, axis: str, length_mm: float) -> np.ndarray:
+    """Ends (M, 2, 2) of lengths along an axis all over a region; none where it does not fit."""
+    depths = region.mesh(_PLACES, 2)[:, 0, 1]
+    found = []
+    if axis == "Y":
+        for depth in depths:
+            low, high = region.width_at(depth)
+            starts = np.linspace(low, high - length_mm, _PLACES) if high - low >= length_mm else ()
+            found += [((y, depth), (y + length_mm, depth)) for y in starts]
+    elif np.ptp(depths) >= length_mm:
+        for depth in np.linspace(depths[0], depths[-1] - length_mm, _PLACES):
+            low, high = zip(region.width_at(depth), region.width_at(depth + length_mm), strict=True)
+            starts = np.linspace(max(low), min(high), _PLACES) if max(low) < min(high) else ()
+            found += [((y, depth), (y, depth + length_mm)) for y in starts]
+    return np.array(found).reshape(-1, 2, 2)
+
+
+# Mesh of the maps: rows along Z, columns along Y; finer meshes look the same.
+_ROWS, _COLUMNS = 17, 21
+_SHORT_SHARE = 0.25
+"""Of the volume's depth and width: a length whose uncertainty is shown where it is measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """Standard uncertainties over a mesh (R, C) of the sheet, mm.
+
+    Attributes
+    ----------
+    at_mm : (R, C, 2)
+        Y and Z.
+    calibration_mm, point_mm : (R, C, 3)
+        Of X, Y and Z of a point: by the calibration alone, and with the stripe's noise.
+    short_mm : float
+        A length that fits well into the volume.
+    along_y_mm, along_z_mm : (R, C)
+        Of that length by the calibration, about each point as far as the volume reaches.
+    """
+
+    at_mm: np.ndarray
+    calibration_mm: np.ndarray
+    point_mm: np.ndarray
+    short_mm: float
+    along_y_mm: np.ndarray
+    along_z_mm: np.ndarray
+
+
+def form_of(use: InUse) -> Form:
+    """The form's uncertainty in a calibration's region."""
+    mesh = use.region.mesh(_ROWS, _COLUMNS)
+    at = mesh.reshape(-1, 2)
+    points = points_at(use.calibration, use.known, at)
+    std = np.sqrt(np.diag(use.covariance))
+    scale = np.where(std > 0, std, 1.0)
+    values, vectors = np.linalg.eigh(use.covariance / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    moved = without_rigid_motion(at, (points.by_parameters @ root).transpose(2, 0, 1))
+    calibration = np.sqrt(np.sum(moved**2, axis=0))
+    noise = points.by_px * use.noise_px
+    short = _round_length(_SHORT_SHARE * float(np.ptp(use.region.outline_mm, axis=0).min()))
+    return Form(
+        at_mm=mesh,
+        calibration_mm=calibration.reshape(*mesh.shape[:2], 3),
+        point_mm=np.hypot(calibration, noise).reshape(*mesh.shape[:2], 3),
+        short_mm=short,
+        along_y_mm=_of_short(use, mesh, np.array([short, 0.0])),
+        along_z_mm=_of_short(use, mesh, np.array([0.0, short])),
+    )
+
+
+def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Displacements (R, N, 3) of points at Y and Z (N, 2) less the rigid motions that fit them best."""
+    points = np.column_stack([np.zeros(len(at_mm)), at_mm - at_mm.mean(axis=0)])
+    turns = np.cross(np.eye(3)[:, None], points[None])
+    shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
+    basis, _ = np.linalg.qr(np.concatenate([shifts, turns]).reshape(6, -1).T)
+    flat = moved.reshape(len(moved), -1)
+    return (flat - (flat @ basis) @ basis.T).reshape(moved.shape)
+
+
+def _of_short(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Standard uncertainty (R, C) of a length (2,) whose middle is at each point of the mesh, or as near as it fits."""
+    middle = mesh.reshape(-1, 2).copy()
+    low, high = use.region.outline_mm[:, 1].min(), use.region.outline_mm[:, 1].max()
+    half = length / 2
+    middle[:, 1] = np.clip(middle[:, 1], low + half[1], high - half[1])
+    for at in middle:
+        ranges = [use.region.width_at(z) for z in {at[1] - half[1], at[1] + half[1]}]
+        left, right = max(a for a, _ in ranges) + half[0], min(b for _, b in ranges) - half[0]
+        at[0] = np.clip(at[0], left, right) if left < right else (left + right) / 2
+    ends = np.stack([middle - half, middle + half], axis=1)
+    return lengths_of(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
+
+
+def _round_length(length_mm: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten within a length."""
+    power = 10.0 ** np.floor(np.log10(length_mm))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length_mm))
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """How points of the same pixels lie by a calibration against another one, mm.
+
+    Attributes
+    ----------
+    at_mm : (R, C, 2)
+        Y and Z.
+    moved_mm : (R, C, 3)
+        In X, Y and Z of the OCS, with a rigid motion of all taken out.
+    largest_mm : float
+        Before that.
+    """
+
+    at_mm: np.ndarray
+    moved_mm: np.ndarray
+    largest_mm: float
+
+
+def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
+    """CalibrationError where two calibrations cannot be of one sensor."""
+    for name, pair in {
+        "image size": [f"{c.camera.width_px} x {c.camera.height_px} px" for c in (calibration, other)],
+        "stripe_along": [c.stripe_along for c in (calibration, other)],
+    }.items():
+        if pair[0] != pair[1]:
+            raise CalibrationError(
+                f"the calibrations are of different sensors: {name} is {pair[0]} in one and {pair[1]} in the other"
+            )
+
+
+def change_from(calibration: Calibration, other: Calibration, region: Region) -> Change:
+    """What a calibration changed against another one, in its region.
+
+    Raises
+    ------
+    CalibrationError
+        The other one is of another sensor, or sees no sheet somewhere in the region.
+    """
+    require_same_sensor(calibration, other)
+    known: StoredEstimate = estimate_in(calibration, region)
+    mesh = region.mesh(_ROWS, _COLUMNS)
+    pixels = pixels_at(calibration, known, mesh.reshape(-1, 2))
+    points = []
+    for each in (calibration, other):
+        through = each if region.view.window else each.model_copy(update={"window": None})
+        found = points_on_sheet(through, pixels, medium_index=each.index_of(region.medium)).points_camera_mm
+        if not np.isfinite(found).all():
+            raise CalibrationError("one of the calibrations sees no sheet somewhere in the volume: they do not compare")
+        points.append(found)
+    moved = (points[0] - points[1]) @ calibration.object_transform()[:3, :3]
+    form = without_rigid_motion(mesh.reshape(-1, 2), moved[None])[0]
+    return Change(mesh, form.reshape(*mesh.shape[:2], 3), float(np.linalg.norm(moved, axis=1).max()))

@@ -1,0 +1,348 @@
+"""Files and sensors described for the terminal: what a file holds, and what a sensor's design formulas give."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uwlts.measurement.evaluation_file import FORMAT as EVALUATION_FORMAT
+from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CaptureError, DescriptionError, DesignError
+from uwlts.model.joint_estimate import JointEstimate
+from uwlts.model.library import load_sensor
+from uwlts.model.placement import camera_from_object, check_design, laser_pose, view_of_sheet
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.sensor import Camera, Medium, Sensor
+from uwlts.optics.design import (
+    FlatWindow,
+    Triangulation,
+    depth_mm,
+    depth_per_pixel_mm,
+    line_length_mm,
+    line_needed_mm,
+    measuring_volume,
+    scheimpflug_angle_rad,
+    speckle_limit_um,
+    thesis_factor,
+    window_thickness_mm,
+)
+from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
+from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
+from uwlts.storage.calibration_file import read_calibration, read_polynomials
+from uwlts.storage.capture import Capture
+from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
+from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
+
+
+class Quantity(NamedTuple):
+    """A row of the design table."""
+
+    name: str
+    value: float
+    unit: str
+    source: str
+
+
+def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]:
+    """The sensor's triangulation behind its window, and Z along the laser's axis per depth along the camera's.
+
+    A laser placed by its axis, or rolled, counts as the baseline and angle at which its sheet meets the plane of the
+    image's middle line across the stripe and the pupil. Lens distortion and tilts are left out.
+
+    Raises
+    ------
+    DesignError
+        The sheet does not cross the camera's axis before the window, the stripe runs along the other side of the image,
+        or no window keeps the medium out.
+    """
+    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
+    pose, index = laser_pose(sensor), medium.refractive_index(wavelength)
+    standoff = camera_from_object(sensor)[2, 3]
+    if not camera.window.mounted and index != 1:
+        raise DesignError(f"the camera's window is not mounted, but the medium's index is {index:.4f}: mount it")
+    side = 1 if camera.stripe_along == "width" else 0
+    if abs(pose.normal[side]) < 1e-6:
+        raise DesignError(f"the stripe runs across the image's {camera.stripe_along}, not along it: turn the camera")
+    trace = np.array([0.0, 0.0, 1.0])
+    trace[side] = -pose.normal[2] / pose.normal[side]
+    setup = Triangulation(
+        baseline_mm=standoff * abs(trace[side]),
+        triangulation_angle_rad=math.atan(abs(trace[side])),
+        focal_length_mm=camera.focal_length_mm,
+        pixel_size_mm=1e-3 * camera.pixel_size_um,
+        window=FlatWindow(
+            distance_mm=camera.window.distance_mm,
+            thickness_mm=camera.window.thickness_mm,
+            glass_index=camera.window.index(wavelength) if camera.window.mounted else 1.0,
+            medium_index=index,
+        ),
+    )
+    return setup, abs(trace @ pose.axis)
+
+
+def design_table(sensor: Sensor, medium: Medium) -> list[Quantity]:
+    """What the formulas say of a sensor in a medium; depths and ranges along the camera's axis unless named otherwise.
+
+    Raises
+    ------
+    DesignError
+        As `nominal_setup`.
+    """
+    camera = sensor.camera
+    setup, leaning = nominal_setup(sensor, medium)
+    window, tangent = setup.window, math.tan(setup.triangulation_angle_rad)
+    sides = {"width": camera.width_px, "height": camera.height_px}
+    along = sides.pop(camera.stripe_along)
+    (across,) = sides.values()
+    standoff, outer = float(depth_mm(setup, 0.0)), window.outer_mm
+    per_pixel = float(depth_per_pixel_mm(setup, 0.0))
+    by_factor = float(depth_per_pixel_mm(replace(setup, window=thesis_factor(window.medium_index)), 0.0))
+    near, far = measuring_volume(setup, side_px=across)
+    near_line, line, far_line = line_length_mm(
+        setup, np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer]), side_px=along
+    )
+    apparent = float(window.reach_mm(standoff))
+    tilt = scheimpflug_angle_rad(
+        triangulation_angle_rad=math.atan(window.medium_index * tangent),
+        magnification=camera.focal_length_mm / apparent,
+    )
+    speckle = speckle_limit_um(
+        wavelength_nm=sensor.laser.wavelength_nm,
+        focal_length_mm=camera.focal_length_mm,
+        f_number=camera.f_number,
+        distance_mm=apparent,
+    )
+    glass = window_thickness_mm(
+        pressure_mpa=1.0, unsupported_diameter_mm=camera.window.aperture_diameter_mm, strength_mpa=60.0
+    )
+    needed = line_needed_mm(pipe_diameter_mm=300.0, passes=5)
+    snell = "with Snell's law"
+    return [
+        Quantity("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),
+        Quantity("stand-off from the window", standoff - outer, "mm", f"Eq. 2.8 {snell}"),
+        Quantity("sheet in view, nearest to the window", near - outer, "mm", f"Eq. 2.8 {snell}"),
+        Quantity("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
+        Quantity("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
+        Quantity("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
+        Quantity("depth per pixel at the stand-off", per_pixel, "mm/px", f"Eq. 2.9 {snell}"),
+        Quantity("depth per pixel along the laser's axis", per_pixel * leaning, "mm/px", "over cos theta_t"),
+        Quantity("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
+        Quantity("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        Quantity("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        Quantity("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        Quantity("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
+        Quantity("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
+        Quantity("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994"),
+        Quantity("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
+        Quantity("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
+    ]
+
+
+def table_lines(rows: list[Quantity]) -> list[str]:
+    """The table as text."""
+    width = max(len(row.name) for row in rows)
+    return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]
+
+
+def describe(name_or_path: str) -> str:
+    """Text about a file, or about a sensor that ships with the package.
+
+    Raises
+    ------
+    CaptureError, DescriptionError
+        The file is missing, foreign or damaged.
+    """
+    path = Path(name_or_path)
+    suffixes = [s for s in path.suffixes if s != ".part"]
+    if suffixes[-2:] == [".truth", ".h5"]:
+        return "\n".join(truth_lines(*read_truth(path)))
+    if is_cloud(path):
+        return "\n".join(cloud_lines(read_cloud(path)))
+    if suffixes[-1:] == [".h5"]:
+        with Capture(path) as capture:
+            return "\n".join(capture_lines(capture))
+    if suffixes[-1:] == [".json"]:
+        return "\n".join(_json_lines(path))
+    if suffixes and suffixes[-1] != ".toml":
+        raise DescriptionError(f"{path}: expected a .h5, .ply, .json or .toml file, or the name of a sensor")
+    return "\n".join(sensor_lines(load_sensor(name_or_path)))
+
+
+def _json_lines(path: Path) -> list[str]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8")).get("format")
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, AttributeError, RecursionError) as error:
+        raise CaptureError(f"{path} is not a file of this program, or is truncated") from error
+    try:
+        if found == CALIBRATION_FORMAT:
+            return calibration_lines(read_calibration(path))
+        if found == POLYNOMIAL_FORMAT:
+            return polynomial_lines(read_polynomials(path))
+        if found == EVALUATION_FORMAT:
+            return evaluation_lines(read_evaluation(path))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise CaptureError(f"{path} is damaged: something in it is missing or no number ({error})") from error
+    raise CaptureError(f"{path} is neither a calibration nor an evaluation: format is {found!r}")
+
+
+def capture_lines(capture: Capture) -> list[str]:
+    """What a capture holds."""
+    header, camera = capture.header, capture.header.sensor.camera
+    laser = int(capture.laser_on.sum())
+    lines = [
+        f"capture of the sensor '{header.sensor.name}' in {header.medium_name} "
+        f"({_medium(header.medium, header.sensor)})",
+        f"{len(capture)} frames of {camera.width_px} x {camera.height_px} pixels, {laser} with the laser on"
+        + ("" if capture.finished else "; the recording was interrupted"),
+    ]
+    if len(capture):
+        exposures = ", ".join(f"{value:.3g}" for value in np.unique(capture.exposure_ms))
+        lines.append(
+            f"stage from {capture.stage_mm.min():.3f} to {capture.stage_mm.max():.3f} mm along OCS "
+            f"{tuple(round(x, 4) for x in header.stage_direction)}; exposure {exposures} ms"
+        )
+    for name, thing in (("target", header.target), ("artefact", header.artefact)):
+        if thing:
+            lines.append(f"{name}: {', '.join(f'{key} {value}' for key, value in thing.items())}")
+    lines.append(f"recorded by: {', '.join(f'{key} {value}' for key, value in header.provenance.items()) or 'unknown'}")
+    return lines
+
+
+def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
+    """What a ground-truth file holds."""
+    frames, lines = truth.status.shape
+    visible = int(np.count_nonzero(truth.status == TruthStatus.VISIBLE))
+    return [
+        f"ground truth of the sensor '{header.sensor.name}' ({_medium(header.medium, header.sensor)})",
+        f"{frames} frames of {lines} profile lines, {visible} of them show the stripe",
+    ]
+
+
+def cloud_lines(cloud: PointCloud) -> list[str]:
+    """What a cloud holds."""
+    if len(cloud) == 0:
+        return ["cloud without points", *(f"{key}: {value}" for key, value in cloud.metadata.items())]
+    low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
+    lines = [f"cloud of {len(cloud)} points from {len(np.unique(cloud.frame))} frames"]
+    lines += [f"{axis}: {a:.3f} to {b:.3f} mm" for axis, a, b in zip("XYZ", low, high, strict=True)]
+    if cloud.deviation_mm is not None and np.isfinite(cloud.deviation_mm).any():
+        lines.append(f"deviation: standard deviation {np.nanstd(cloud.deviation_mm):.4f} mm")
+    return lines + [f"{key}: {value}" for key, value in cloud.metadata.items()]
+
+
+def calibration_lines(calibration: Calibration) -> list[str]:
+    """What a calibration says, with its residuals."""
+    camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
+    d = camera.distortion
+    lines = [
+        f"calibration of the sensor '{calibration.sensor_name}' "
+        f"({calibration.provenance.get('source', 'unknown source')})",
+        f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
+        f"k1 {d.k1:.5f}, k2 {d.k2:.5f}, p1 {d.p1:.5f}, p2 {d.p2:.5f}, k3 {d.k3:.5f}",
+        f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
+    ]
+    if window is None:
+        lines.append("window: none; for use in air only")
+    else:
+        glass = (
+            f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""
+        )
+        lines.append(
+            f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
+        )
+    figures = {
+        "camera": ("rms_px", "px"),
+        "sheet": ("rms_mm", "mm"),
+        "window": ("std_mm", "mm standard uncertainty of d"),
+    }
+    for step, (name, unit) in figures.items():
+        value = calibration.residuals.get(step, {}).get(name)
+        if value is not None:
+            lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
+    return lines + _joint_lines(calibration.joint)
+
+
+def _joint_lines(joint: JointEstimate | None) -> list[str]:
+    """Parameters of a joint estimate with their standard uncertainties, before and after."""
+    if joint is None:
+        return []
+    lines = ["joint estimate, with standard uncertainties after and before:"]
+    for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
+        known = "" if before is None else f" ({before:.2g})"
+        lines.append(f"  {key.text.replace('_', ' ')}: {value:.6g} ± {std:.2g}{known}")
+    scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
+    return [*lines, f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out"]
+
+
+def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
+    """What a calibration by polynomials says, with its residuals."""
+    last = calibration.first_line + len(calibration.domains_px) - 1
+    reached = sum(domain is not None for domain in calibration.domains_px)
+    low, high = calibration.depth_range_mm
+    lines = [
+        f"polynomials of the sensor '{calibration.sensor_name}' in {calibration.medium_name} "
+        f"({calibration.provenance.get('source', 'unknown source')})",
+        f"degree {calibration.degree}, for {reached} of the lines {calibration.first_line} to {last}, Z from {low:.1f} "
+        f"to {high:.1f} mm",
+    ]
+    for name, what in (("depth", "Z(position)"), ("along", "Y(Z)"), ("map", "target's points on the plate")):
+        value = calibration.residuals.get(name, {}).get("rms_mm")
+        if value is not None:
+            lines.append(f"{what}: residual {value:.4f} mm (rms)")
+    return lines
+
+
+def evaluation_lines(record: EvaluationRecord) -> list[str]:
+    """What an evaluation says."""
+    lines = [f"evaluation of {record.cloud}"]
+    if evaluation := record.evaluation:
+        for name, value in evaluation.figures_mm.items():
+            known = record.uncertainty.get(name)
+            expanded = " mm" if known is None else f" ± {known.expanded_mm:.4f} mm (k = 2)"
+            lines.append(f"  {name}: {value:+.4f}{expanded}")
+        lines.append(f"  points: {evaluation.points_used} used, {evaluation.points_rejected} rejected")
+    if truth := record.truth:
+        for name, part in (("against truth", truth), ("the same after a best-fit motion", truth.after_best_fit)):
+            if part is not None:
+                lines.append(
+                    f"  {name}: rms {part.rms_mm:.4f} mm, 99 % within {part.p99_mm:.4f} mm, "
+                    f"{100 * part.share_within_tolerance:.1f} % within {part.tolerance_mm:g} mm"
+                )
+        lines.append(f"  {truth.missed} stripe points missed, {truth.false_points} false")
+    return lines
+
+
+def sensor_lines(sensor: Sensor) -> list[str]:
+    """What a sensor can do in each of its media; the line length for both ways to turn the camera."""
+    laser = sensor.laser
+    lines = [f"sensor '{sensor.name}': {sensor.notes}", f"image {sensor.camera.width_px} x {sensor.camera.height_px}"]
+    if laser.baseline_mm is not None:
+        lines.append(f"baseline {laser.baseline_mm:g} mm, triangulation angle {laser.triangulation_angle_deg:g} deg")
+    for name, medium in sensor.media.items():
+        view = check_design(sensor, medium)
+        lines.append(
+            f"{name} ({_medium(medium, sensor)}): stand-off {view.standoff_mm:.1f} mm outside the window, sheet in "
+            f"view from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
+        )
+        for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
+            turned = sensor.model_copy(update={"camera": _turned(sensor.camera, along)})
+            length = view_of_sheet(turned, medium).line_length_mm
+            chosen = " (this sensor)" if along == sensor.camera.stripe_along else ""
+            lines.append(f"  line length at the stand-off, stripe along the {side} side: {length:.1f} mm{chosen}")
+    return lines
+
+
+def _turned(camera: Camera, along: str) -> Camera:
+    return camera.model_copy(update={"stripe_along": along})
+
+
+def _medium(medium: Any, sensor: Sensor) -> str:
+    index = medium.refractive_index(sensor.laser.wavelength_nm)
+    water = f", {medium.temperature_c:g} degC, {medium.salinity_g_kg:g} g/kg" if medium.kind in ("fresh", "sea") else ""
+    return f"{medium.kind}, n {index:.5f}{water}"

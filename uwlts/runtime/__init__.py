@@ -1,0 +1,1 @@
+"""Working processes, the terminal, and system libraries: what both packages need to run."""

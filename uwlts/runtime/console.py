@@ -1,0 +1,57 @@
+"""What both commands share on the terminal: progress bars, and errors that speak instead of tracebacks."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from cyclopts import App, CycloptsError
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from uwlts.model.errors import Error
+
+USER_ERROR, INTERRUPTED = 2, 130
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error, moved by calling ``progress(done, total)``; silent where nobody watches."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def run(app: App) -> int:
+    """Run a command line and return its exit code: 2 with a message for the user's errors, 130 for Ctrl-C.
+
+    A wrong command line is explained by cyclopts, on standard error like all errors.
+    """
+    # Ctrl-C would end the program before anything can be said.
+    app.suppress_keyboard_interrupt = False
+    try:
+        app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_value")
+        sys.stdout.flush()
+    except CycloptsError:
+        return USER_ERROR
+    except Error as error:
+        print(f"error: {error}", file=sys.stderr)
+        return USER_ERROR
+    except KeyboardInterrupt:
+        print("interrupted; what is complete is kept: run it again, recordings with --resume", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader has seen enough; what is left unwritten must not be tried again when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"error: {error.strerror or error}: {error.filename}", file=sys.stderr)
+        return USER_ERROR
+    return 0

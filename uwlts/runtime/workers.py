@@ -1,0 +1,417 @@
+"""Working processes of this machine, or the workers of a Dask cluster, for many jobs at a time.
+
+`work_through` does a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
+of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. Processes end when their command
+ends, however that happens: `concurrent.futures` finishes what it has begun and queued before it lets a command end,
+and leaves its processes behind where the command is killed.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future
+from concurrent.futures import wait as wait_for_futures
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from typing import Any, Literal, TypeVar, assert_never
+
+from uwlts.model.errors import Error, SetupError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+Tell = Callable[[Any], None]
+
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+_GRACE_S = 5.0
+"""How long a process may take to leave its files in order before it is killed."""
+
+_AHEAD = 2
+"""Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A job whose process ended before it did, with the reason.
+
+    ``by_error`` marks an error of the program, whose traceback stands on standard error.
+    """
+
+    reason: str
+    by_error: bool = False
+
+
+class Workers(ABC):
+    """Workers that do jobs many at a time, for as many rounds of jobs as needed; made by `open_workers`.
+
+    Attributes
+    ----------
+    count : int
+        How many work at the same time.
+    """
+
+    count: int
+
+    @abstractmethod
+    def processes_for(self, jobs: int) -> int:
+        """Number of processes that each of so many jobs may start itself."""
+
+    @abstractmethod
+    def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
+        """Pairs of a job and the result of ``function(job)``, in the order in which they are done.
+
+        Jobs are taken from ``jobs`` only shortly before they are begun. A job whose process dies is done once more; if
+        its process dies again, its result is `Lost`. What a job raises leaves this function.
+
+        Raises
+        ------
+        SetupError
+            The cluster is gone, or a job fails unexpectedly; its traceback stands on standard error.
+        """
+
+
+@contextmanager
+def open_workers(
+    *, workers: int | None = None, scheduler: str | None = None, patience_s: float = 20.0
+) -> Iterator[Workers]:
+    """So many processes of this machine (one per processor unless given), or the workers of a Dask scheduler.
+
+    ``patience_s`` is how long the scheduler at the address may take to answer. Processes share the machine's threads.
+    When an exception leaves the body, KeyboardInterrupt stops the jobs that are under way; no process is left.
+
+    Raises
+    ------
+    SetupError
+        Dask is not installed, or no scheduler answers at the address, or it has no workers.
+    """
+    if scheduler is not None:
+        with _cluster(scheduler, patience_s) as cluster:
+            yield cluster
+        return
+    processors = _processors()
+    count = workers or processors
+    pool = _Processes(count, threads=max(1, processors // count))
+    try:
+        yield pool
+    except BaseException:
+        pool.close(at_once=True)
+        raise
+    finally:
+        pool.close()
+
+
+def work_through(
+    work: Callable[[Job, Tell], Result],
+    jobs: Sequence[Job],
+    *,
+    workers: int | None = None,
+    heard: Tell = lambda message: None,
+) -> list[Result]:
+    """Results of ``work(job, tell)`` for all jobs, in their order, from several processes.
+
+    Jobs are begun in their order. What a job passes to ``tell`` is passed to ``heard`` in this process. When an
+    exception leaves this function, KeyboardInterrupt stops the jobs that are under way, and no process is left.
+    ``workers`` is the number of processes, one per processor unless given; with 1, jobs run in this process. Each
+    process does linear algebra in one thread, unless the environment sets another number.
+
+    Raises
+    ------
+    Error, OSError
+        As the first job that fails raises it.
+    SetupError
+        A process has ended before its job.
+    """
+    if workers == 1:
+        return [work(job, heard) for job in jobs]
+    results: dict[int, Result] = {}
+    pool = _Processes(max(1, min(len(jobs), workers or _processors())), threads=1)
+    try:
+        for number, _, result in pool.run(work, jobs, heard):
+            if isinstance(result, Lost):
+                raise SetupError(result.reason)
+            results[number] = result
+    finally:
+        pool.close(at_once=len(results) < len(jobs))
+    return [results[number] for number in range(len(jobs))]
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+class _Processes(Workers):
+    """Processes of this machine, started when the first jobs come."""
+
+    def __init__(self, count: int, *, threads: int):
+        self.count, self._threads = count, threads
+        self._processes: list[_Process] = []
+
+    def processes_for(self, jobs: int) -> int:
+        """More than one where there are more processes than jobs."""
+        return max(1, self.count // max(jobs, 1))
+
+    def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
+        """See `Workers.completed`."""
+        silent, lost = partial(_without_messages, function), []
+        for _, job, result in self.run(silent, jobs):
+            if isinstance(result, Lost):
+                if result.by_error:
+                    raise SetupError(result.reason)
+                lost.append(job)
+            else:
+                yield job, result
+        # One at a time: a process that died for want of memory has all of it now.
+        for job in lost:
+            yield from ((job, result) for _, _, result in self.run(silent, [job]))
+
+    def run(
+        self, work: Callable[[Job, Tell], Result], jobs: Iterable[Job], heard: Tell = lambda message: None
+    ) -> Iterator[tuple[int, Job, Result | Lost]]:
+        """Number, job and result of each job as it is done."""
+        waiting = enumerate(jobs)
+        busy: dict[object, tuple[_Process, int, Job]] = {}
+        idle = deque(self._processes)
+        more = True
+        while more or busy:
+            while len(busy) < self.count:
+                try:
+                    number, job = next(waiting)
+                except StopIteration:
+                    more = False
+                    break
+                process = idle.popleft() if idle else self._started()
+                busy[process.connection] = process, number, job
+                process.give(work, job)
+            # Without a connection `wait` would wait for ever.
+            for connection in wait([process.connection for process, _, _ in busy.values()]) if busy else ():
+                process, number, job = busy[connection]
+                match process.message():
+                    case ("told", message):
+                        heard(message)
+                        continue
+                    case ("raised", error):
+                        raise error
+                    case ("done", result):
+                        idle.append(process)
+                    case Lost() as result:
+                        self._processes.remove(process)
+                        process.end(0.0)
+                    case _ as never:
+                        assert_never(never)
+                del busy[connection]
+                yield number, job, result
+
+    def close(self, *, at_once: bool = False) -> None:
+        """End the processes, by KeyboardInterrupt where it is to be at once; after a while they are killed."""
+        for process in self._processes:
+            process.stop(at_once=at_once)
+        deadline = time.monotonic() + _GRACE_S
+        for process in self._processes:
+            process.end(deadline)
+        self._processes.clear()
+
+    def _started(self) -> "_Process":
+        process = _Process(self._threads)
+        self._processes.append(process)
+        return process
+
+
+def _without_messages(function: Callable[[Job], Result], job: Job, tell: Tell) -> Result:
+    return function(job)
+
+
+class _Process:
+    """A process and the connection to it."""
+
+    def __init__(self, threads: int):
+        context = multiprocessing.get_context("spawn")
+        self.connection, theirs = context.Pipe()
+        # Not a daemon, which could start no processes of its own; it watches its parent itself.
+        self._process = context.Process(target=_serve, args=(theirs,))
+        with _interrupts_held(), _limited_threads(threads):
+            self._process.start()
+        theirs.close()
+        self._work: Callable[[Any, Tell], Any] | None = None
+
+    def give(self, work: Callable[[Any, Tell], Any], job: Any) -> None:
+        """Hand over a job, and what to do with it where that is new."""
+        # If the process has ended, `message` reports it.
+        with suppress(BrokenPipeError):
+            if work is not self._work:
+                self.connection.send(("work", work))
+                self._work = work
+            self.connection.send(("job", job))
+
+    def message(self) -> tuple[Literal["told", "raised", "done"], Any] | Lost:
+        """What the job tells ("told"), its result ("done") or its error ("raised"), or that the process has ended."""
+        try:
+            return self.connection.recv()
+        except (EOFError, ConnectionResetError):
+            self._process.join(_GRACE_S)
+            code = self._process.exitcode
+            how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
+            return Lost(
+                f"a working process has ended unexpectedly ({how}), perhaps for want of memory: run fewer workers at a "
+                "time",
+                by_error=code == 1,  # Python's exit code after an exception.
+            )
+
+    def stop(self, *, at_once: bool) -> None:
+        """Ask the process to end, after its job or at once."""
+        if at_once:
+            self._process.terminate()
+        else:
+            with suppress(OSError):
+                self.connection.send(None)
+
+    def end(self, deadline: float) -> None:
+        """Wait until a time of the monotonic clock for the process to end, then kill it."""
+        self._process.join(max(0.0, deadline - time.monotonic()))
+        self._process.kill()
+        self._process.join()
+        self.connection.close()
+
+
+@contextmanager
+def _limited_threads(threads: int) -> Iterator[None]:
+    """Processes started meanwhile do linear algebra in so many threads, unless the environment says otherwise.
+
+    With a thread for each processor in each of as many processes they wait for each other: two joint calibrations at a
+    time took 17 to 25 s instead of 6 to 8 s on two processors.
+    """
+    given = {name: os.environ[name] for name in _THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(_THREADS, str(threads)) | given)
+    try:
+        yield
+    finally:
+        for name in _THREADS:
+            if name not in given:
+                del os.environ[name]
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Block SIGINT: a process that is started meanwhile never receives Ctrl-C, which the command alone handles."""
+    # Starting Python's tracker of shared resources would let interrupts through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _serve(connection: Connection) -> None:
+    """What a process does: one job after the other, until there are no more or it is stopped."""
+    stopped = threading.Event()
+
+    def stop(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        stopped.set()
+        raise KeyboardInterrupt
+
+    def send(kind: str, content: Any) -> None:
+        try:
+            connection.send((kind, content))
+        except BrokenPipeError:
+            stop()
+
+    work: Callable[[Any, Tell], Any] | None = None
+    try:
+        signal.signal(signal.SIGTERM, stop)
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+        while (given := connection.recv()) is not None:
+            kind, content = given
+            if kind == "work":
+                work = content
+                continue
+            assert work is not None
+            try:
+                result = work(content, partial(send, "told"))
+            except (Error, OSError) as error:
+                send("raised", error)
+            else:
+                send("done", result)
+    finally:
+        # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
+        if stopped.is_set():
+            os._exit(1)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_GRACE_S)
+    os._exit(1)
+
+
+class _Cluster(Workers):
+    """Workers of a Dask cluster, which does jobs of lost workers again by itself."""
+
+    def __init__(self, client: Any, count: int, killed: type[Exception]):
+        self.count, self._killed = count, killed
+        self._executor = client.get_executor(pure=False)
+
+    def processes_for(self, jobs: int) -> int:
+        """One: a worker of a cluster may not start processes."""
+        return 1
+
+    def completed(self, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[tuple[Job, Result | Lost]]:
+        """See `Workers.completed`."""
+        waiting, running = iter(jobs), dict[Future[Result], Job]()
+        while True:
+            while len(running) < self.count * _AHEAD:
+                try:
+                    job = next(waiting)
+                except StopIteration:
+                    break
+                running[self._executor.submit(function, job)] = job
+            if not running:
+                return
+            done, _ = wait_for_futures(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                job = running.pop(future)
+                try:
+                    result = future.result()
+                except self._killed as error:
+                    yield job, Lost(str(error))
+                except CancelledError as error:
+                    raise SetupError("the Dask cluster is gone: start it, and run the sweep again") from error
+                else:
+                    yield job, result
+
+    def close(self) -> None:
+        """Leave the cluster; what waits is not begun."""
+        self._executor.shutdown(wait=False)
+
+
+@contextmanager
+def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
+    try:
+        from distributed import Client
+        from distributed.scheduler import KilledWorker
+    except ImportError as error:
+        raise SetupError("a scheduler needs Dask: pip install 'dask[distributed]'") from error
+    try:
+        client: Any = Client(address, timeout=patience_s, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise SetupError(f"no Dask scheduler answers at {address}: {error}") from error
+    with client:
+        count = sum(client.nthreads().values())
+        if count == 0:
+            raise SetupError(f"the scheduler at {address} has no workers: start some with 'dask worker {address}'")
+        cluster = _Cluster(client, count, KilledWorker)
+        try:
+            yield cluster
+        finally:
+            cluster.close()

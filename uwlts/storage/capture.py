@@ -1,0 +1,431 @@
+"""The capture file: images of a scan with everything known about them, written frame by frame.
+
+An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle, Fletcher-32
+checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, and attributes
+``format``, ``version`` and ``header``: JSON with sensor, medium, target, artefact and provenance. Nothing in it is ever
+executed, and real and synthetic captures look the same.
+
+While it is being recorded the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so
+an interrupted recording keeps all its complete frames; closing it gives it its name.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any
+
+import h5py
+import hdf5plugin
+import numpy as np
+from pydantic import Field, field_validator
+
+from uwlts.model.errors import CaptureError, ImageError, OutputError
+from uwlts.model.sensor import Description, Medium, Sensor, Vector
+from uwlts.storage.hdf5_file import UnfinishedFile, has_writer, read_label, write_label
+
+FORMAT = "uwlts-capture"
+VERSION = 1
+_PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
+# What h5py raises on a damaged file depends on where the damage is.
+_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+# Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
+_MARGIN_BYTES = 2**18
+
+
+class CaptureHeader(Description):
+    """What holds for all frames of a capture.
+
+    ``stage_direction`` is the nominal unit direction in which the stage moves the sensor, in the OCS; ``target`` and
+    ``artefact`` describe what was before the sensor, as known to whoever recorded it; ``saturation_dn`` is the grey
+    value at which pixels clip.
+    """
+
+    name: str
+    sensor: Sensor
+    medium_name: str
+    medium: Medium
+    stage_direction: Vector
+    saturation_dn: Annotated[int, Field(gt=0)]
+    target: dict[str, Any] | None = None
+    artefact: dict[str, Any] | None = None
+    provenance: dict[str, Any] = {}
+
+    @field_validator("stage_direction")
+    @classmethod
+    def _unit(cls, value: Vector) -> Vector:
+        if not np.isclose(np.linalg.norm(value), 1, atol=1e-6):
+            raise ValueError(f"stage_direction {value} is not a unit vector")
+        return value
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image (H, W) with its stage position in mm, light, exposure in ms, time in s, and pose (4, 4) if known."""
+
+    image: np.ndarray
+    stage_mm: float
+    laser_on: bool
+    exposure_ms: float
+    time_s: float
+    pose: np.ndarray | None = None
+
+
+def part_path(path: Path) -> Path:
+    """Name of an unfinished recording of ``path``."""
+    return path.with_name(path.name + ".part")
+
+
+def _cut_to_used(path: Path) -> None:
+    """Cut off space that was claimed and not used, as HDF5 does when a file is opened and closed once more."""
+    h5py.File(path, "r+", locking=False).close()
+
+
+class CaptureWriter:
+    """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
+
+    Raises
+    ------
+    OutputError
+        The file exists (give ``overwrite``), a part is left over (give ``resume`` or ``overwrite``), or storage fails.
+    CaptureError
+        ``resume`` of a part that is damaged or belongs to another recording.
+    """
+
+    def __init__(
+        self, path: str | Path, header: CaptureHeader, *, dtype: np.dtype, overwrite: bool = False, resume: bool = False
+    ):
+        self.path, self.header = Path(path), header
+        self._part = part_path(self.path)
+        camera = header.sensor.camera
+        self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
+        if self._dtype not in (np.uint8, np.uint16):
+            raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
+        try:
+            self._refuse_existing(overwrite=overwrite, resume=resume)
+            if resume and self._part.exists():
+                with self._left_over() as unfinished:
+                    self._begin(unfinished)
+            else:
+                self._begin(())
+            # Nothing is locked: whoever looks at a running recording must not stop it.
+            self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
+            self._file.swmr_mode = True
+        except (OSError, RuntimeError) as error:
+            raise self._storage_failed(error) from error
+
+    def _refuse_existing(self, *, overwrite: bool, resume: bool) -> None:
+        if self.path.exists() and not self.path.is_file():
+            raise OutputError(f"{self.path} exists and is not a regular file; give another name")
+        if self.path.exists() and not overwrite:
+            raise OutputError(f"{self.path} exists already; give another name, or --overwrite to replace it")
+        if not self.path.parent.is_dir():
+            raise OutputError(f"the folder {self.path.parent} does not exist; create it first")
+        if self._part.exists() and not (resume or overwrite):
+            raise OutputError(f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite")
+
+    def _left_over(self) -> "Capture":
+        """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
+        try:
+            unfinished = Capture(self._part)
+        except CaptureError as error:
+            raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
+        same_header = unfinished.header.model_dump_json() == self.header.model_dump_json()
+        if not same_header or unfinished.dtype != self._dtype:
+            unfinished.close()
+            raise CaptureError(f"{self._part} belongs to another recording; give --overwrite to start afresh")
+        return unfinished
+
+    def _begin(self, unfinished: "Capture | Sequence[Frame]") -> None:
+        """Put a valid part in place, empty or with the complete frames of the one left over.
+
+        HDF5 cannot append to a killed writer's file, so a new one is made; it is made aside, so that a run that is
+        killed meanwhile leaves the old one.
+        """
+        fresh = self._part.with_suffix(".fresh")
+        try:
+            with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
+                self._claim_space()
+                self._lay_out()
+                for frame in unfinished:
+                    self._store(frame)
+            _cut_to_used(fresh)
+            os.replace(fresh, self._part)
+        finally:
+            fresh.unlink(missing_ok=True)
+
+    def _lay_out(self) -> None:
+        write_label(self._file, format=FORMAT, version=VERSION, header=self.header)
+        # The checksum finds damage that the compression would decode to a different picture.
+        self._file.create_dataset(
+            "frames",
+            (0, *self._shape),
+            self._dtype,
+            maxshape=(None, *self._shape),
+            chunks=(1, *self._shape),
+            fletcher32=True,
+            **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+        )
+        for name, shape in _PER_FRAME.items():
+            kind = bool if name == "laser_on" else float
+            # No checksum here: a kill while 256 rows are rewritten would then lose them all, not only the last one.
+            self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=(256, *shape))
+
+    def __len__(self) -> int:
+        """Number of complete frames written."""
+        return self._dataset("time_s").shape[0]
+
+    def _dataset(self, name: str) -> h5py.Dataset:
+        dataset = self._file[name]
+        if not isinstance(dataset, h5py.Dataset):
+            raise CaptureError(f"{self._part} is damaged: '{name}' is not a dataset")
+        return dataset
+
+    def append(self, frame: Frame) -> None:
+        """Store one frame; once this returns, the frame survives the end of the program.
+
+        Raises
+        ------
+        ImageError
+            The image has another size or type than the capture.
+        CaptureError
+            Stage position, exposure, time or pose is not finite, or the pose is not (4, 4).
+        OutputError
+            Storage fails; the frames before are kept.
+        """
+        if frame.image.shape != self._shape or frame.image.dtype != self._dtype:
+            raise ImageError(
+                f"frame is {frame.image.shape} {frame.image.dtype}, the capture holds {self._shape} {self._dtype}"
+            )
+        if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all():
+            raise CaptureError(
+                f"a frame at stage position {frame.stage_mm} mm, exposure {frame.exposure_ms} ms and time "
+                f"{frame.time_s} s cannot be stored: all three must be finite"
+            )
+        if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
+            raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
+        try:
+            self._store(frame)
+        except (OSError, RuntimeError) as error:
+            raise self._storage_failed(error) from error
+
+    def _store(self, frame: Frame) -> None:
+        self._claim_space()
+        pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
+        values = {"frames": frame.image, "stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
+        values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
+        count = len(self)
+        for name, value in values.items():
+            dataset = self._dataset(name)
+            dataset.resize(count + 1, axis=0)
+            dataset[count] = value
+            dataset.flush()
+
+    def _claim_space(self) -> None:
+        """Make the file long enough for one more frame, by zeros behind what HDF5 uses; OSError where the disk is full.
+
+        HDF5 does not survive a full disk: closing the file fails and the process may crash.
+        """
+        frame_bytes = self._shape[0] * self._shape[1] * self._dtype.itemsize
+        wanted = self._file.id.get_filesize() + frame_bytes + _MARGIN_BYTES
+        with open(self._file.filename, "r+b", buffering=0) as file:
+            size = file.seek(0, os.SEEK_END)
+            while size < wanted:
+                size += file.write(bytes(wanted - size))
+
+    def _storage_failed(self, error: OSError | RuntimeError) -> OutputError:
+        number = getattr(error, "errno", None)
+        reason = os.strerror(number) if number else " ".join(str(error).split())
+        kept = f"; complete frames are kept in {self._part.name}" if os.path.exists(self._part) else ""
+        return OutputError(f"cannot write {self.path}: {reason}{kept}")
+
+    def __enter__(self) -> "CaptureWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._file.close()
+            if kind is None:
+                _cut_to_used(self._part)
+                os.replace(self._part, self.path)
+        except (OSError, RuntimeError) as error:
+            raise self._storage_failed(error) from error
+
+
+def _what_is_wrong(error: Exception) -> str:
+    """HDF5's message about a file that it cannot open; the two most usual ones in plain English."""
+    found = re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error))
+    if found:
+        return f"{int(found[1]):,} of its {int(found[2]):,} bytes are there; copy it again"
+    if "file signature not found" in str(error):
+        return "it is no HDF5 file"
+    return f"HDF5 says: {error}"
+
+
+class Capture:
+    """A capture opened for reading: per-frame arrays in memory, images read on demand.
+
+    A recording that is still going on can be read too; it has the frames that were complete when it was opened.
+
+    Attributes
+    ----------
+    header : CaptureHeader
+        What holds for all frames.
+    dtype : dtype
+        Type of the images, uint8 or uint16.
+    stage_mm, exposure_ms, time_s : (N,) float64
+        Stage position in mm, exposure in ms, time in s of every frame; finite.
+    laser_on : (N,) bool
+        Whether the laser was on, rather than the lamp.
+    pose : (N, 4, 4) float64
+        ``T_scene_object`` of the sensor's OCS; all NaN for a frame without one.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, foreign, truncated, of a newer version, or contradicts itself.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise CaptureError(f"no capture at {self.path}")
+        try:
+            unfinished = not self.finished or has_writer(self.path)
+            self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
+        except _DAMAGE as error:
+            raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
+        try:
+            self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
+            self._read_frames()
+        except _DAMAGE as error:
+            self.file.close()
+            raise CaptureError(f"{self.path} is damaged: {error}") from error
+        except BaseException:
+            self.file.close()
+            raise
+
+    def _read_frames(self) -> None:
+        camera = self.header.sensor.camera
+        images = self._dataset("frames", (camera.height_px, camera.width_px), "u")
+        if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
+            raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
+        columns = {
+            name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()
+        }
+        self._images, self.dtype = images, images.dtype
+        self._count = min(len(images), *map(len, columns.values()))
+        # HDF5 shows chunks that were never stored as zeros.
+        if images.id.get_num_chunks() < self._count:
+            raise CaptureError(f"{self.path} is damaged: it holds {images.id.get_num_chunks()} of {self._count} images")
+        self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
+            dataset[: self._count] for dataset in columns.values()
+        )
+        if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
+            raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
+        finite = np.isfinite(self.pose).reshape(self._count, 16)
+        if (finite.any(axis=1) != finite.all(axis=1)).any():
+            raise CaptureError(f"{self.path} holds poses of which only some elements are known")
+
+    def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
+        """A dataset with one row of a shape per frame; CaptureError where it is something else."""
+        dataset = self.file.get(name)
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim == 0:
+            raise CaptureError(f"{self.path} is damaged: it has no '{name}' for every frame")
+        if dataset.shape[1:] != shape or dataset.dtype.kind != kind:
+            raise CaptureError(
+                f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, "
+                f"expected {shape} of kind '{kind}'"
+            )
+        return dataset
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def finished(self) -> bool:
+        """Whether the recording was closed, rather than interrupted."""
+        return self.path.suffix != ".part"
+
+    def image(self, index: int) -> np.ndarray:
+        """Image (H, W) of a frame; raises CaptureError where its data are damaged."""
+        if not 0 <= index < self._count:
+            raise IndexError(f"frame {index} of {self._count}")
+        try:
+            return self._images[index]
+        except _DAMAGE as error:
+            raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
+
+    def __getitem__(self, index: int) -> Frame:
+        """A frame with everything known about it; raises CaptureError where its data are damaged."""
+        index = index + self._count if index < 0 else index
+        image = self.image(index)
+        pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
+        return Frame(
+            image=image,
+            stage_mm=float(self.stage_mm[index]),
+            laser_on=bool(self.laser_on[index]),
+            exposure_ms=float(self.exposure_ms[index]),
+            time_s=float(self.time_s[index]),
+            pose=pose,
+        )
+
+    def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
+        """Index and image of all frames, or only of those with the laser on or off."""
+        for index in range(self._count):
+            if laser_on is None or bool(self.laser_on[index]) == laser_on:
+                yield index, self.image(index)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[index] for index in range(self._count))
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    def __enter__(self) -> "Capture":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_capture(path: str | Path) -> Capture:
+    """Open a capture for reading.
+
+    Per-frame values are read at once, images when they are asked for. A recording that is still being written can be
+    opened by its name ``NAME.part``; it has the frames that were complete when it was opened.
+
+    Parameters
+    ----------
+    path : str or Path
+        Capture file (HDF5).
+
+    Returns
+    -------
+    Capture
+        A context manager and a sequence of frames: ``capture[12]`` has ``image`` (H, W), ``stage_mm``, ``laser_on``,
+        ``exposure_ms``, ``time_s`` and ``pose``; the arrays ``capture.stage_mm`` (N,), ``capture.laser_on`` (N,) and so
+        on hold the values of all frames, ``capture.header`` the sensor and the medium.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, foreign, truncated, of a newer version, or contradicts itself.
+
+    Examples
+    --------
+    >>> with uwlts.open_capture("spheres.h5") as capture:
+    ...     images = [frame.image for frame in capture if frame.laser_on]
+    """
+    return Capture(path)
+
+
+def opened_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:
+    """A context with an opened capture: one that is open already stays so, a file is opened and closed."""
+    return nullcontext(capture) if isinstance(capture, Capture) else Capture(capture)

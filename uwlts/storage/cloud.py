@@ -1,0 +1,407 @@
+"""A measured point cloud, and its file: HDF5, or binary PLY that CloudCompare and MeshLab open with all its fields."""
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from uwlts.model.errors import CaptureError
+from uwlts.model.sensor import Description
+from uwlts.storage.files import written_aside
+from uwlts.storage.hdf5_file import format_of, read_label, write_label
+
+FORMAT = "uwlts-cloud"
+VERSION = 1
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
+
+NO_INDEX = -1
+"""Frame and line of points whose file does not name them."""
+
+_PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
+_PER_POINT = ("points_mm", "intensity", "frame", "line")
+_COMMENT = "uwlts-metadata"
+# CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
+_PIECE_LENGTH = 900
+_PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
+
+
+@dataclass(frozen=True, eq=False)
+class PointUncertainty:
+    """Standard uncertainty of points in the OCS, mm.
+
+    Attributes
+    ----------
+    random_mm2 : (N, 6) float32
+        Covariance of each point by the stripe's noise, independent from point to point; see `PAIRS`.
+    position_mm : (N, 3) float32
+        How each point moves for one standard deviation of its image's stage position, independent from image to image.
+    patterns_mm : (M, N, 3) float32
+        How each point moves for one standard deviation of what is independent in calibration and stage, largest first.
+    """
+
+    random_mm2: np.ndarray
+    position_mm: np.ndarray
+    patterns_mm: np.ndarray
+
+    def systematic_mm2(self) -> np.ndarray:
+        """Covariance (N, 6) of each point by calibration and stage."""
+        return np.stack([np.sum(self.patterns_mm[:, :, i] * self.patterns_mm[:, :, j], axis=0) for i, j in PAIRS], 1)
+
+    def covariance_mm2(self) -> np.ndarray:
+        """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
+        pairs = self.random_mm2 + self.systematic_mm2()
+        covariance = np.einsum("ni,nj->nij", self.position_mm, self.position_mm)
+        for column, (i, j) in enumerate(PAIRS):
+            covariance[:, i, j] += pairs[:, column]
+            if i != j:
+                covariance[:, j, i] += pairs[:, column]
+        return covariance
+
+    def std_mm(self) -> np.ndarray:
+        """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
+        return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points in the object coordinate system (OCS) and what is known of each.
+
+    OCS: X normal to the laser sheet (the direction of the scan), Y along the stripe, Z parallel to the laser's axis,
+    away from the sensor.
+
+    Attributes
+    ----------
+    points_mm : (N, 3) float64
+        Position, mm, OCS; finite.
+    intensity : (N,) float32
+        Brightness of the stripe, in the units of the image; NaN where unknown.
+    frame, line : (N,) int32
+        Image of the scan and row (or column) of that image; -1 where unknown.
+    deviation_mm : (N,) float32 or None
+        Signed distance to the fitted or true surface; NaN where not evaluated.
+    uncertainty : PointUncertainty or None
+        How well the points are known.
+    metadata : dict
+        What JSON can hold: medium, sensor, artefact, capture, digest of the calibration.
+
+    Raises
+    ------
+    CaptureError
+        The arrays do not fit together, points are not finite, or the metadata is not JSON.
+    """
+
+    points_mm: np.ndarray
+    intensity: np.ndarray
+    frame: np.ndarray
+    line: np.ndarray
+    deviation_mm: np.ndarray | None = None
+    uncertainty: PointUncertainty | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        points = _read_only(self.points_mm, np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise CaptureError(f"the points of a cloud have the shape (N, 3), not {points.shape}")
+        unusable = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
+        if unusable:
+            raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
+        object.__setattr__(self, "points_mm", points)
+        for name, kind in (("intensity", np.float32), ("frame", np.int32), ("line", np.int32)):
+            object.__setattr__(self, name, _per_point(name, getattr(self, name), kind, len(points)))
+        if self.deviation_mm is not None:
+            deviation = _per_point("deviation_mm", self.deviation_mm, np.float32, len(points))
+            object.__setattr__(self, "deviation_mm", deviation)
+        if self.uncertainty is not None:
+            random, patterns = self.uncertainty.random_mm2, self.uncertainty.patterns_mm
+            if random.shape != (len(points), 6) or patterns.shape[1:] != points.shape:
+                raise CaptureError(
+                    f"the uncertainty of {len(points)} points has the shapes {random.shape} and {patterns.shape}"
+                )
+        _as_json(self.metadata)
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+    @property
+    def covariance_mm2(self) -> np.ndarray | None:
+        """Covariance (N, 3, 3) of the coordinates of each point, mm2, of all kinds together; None where not known."""
+        return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
+
+
+def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
+    """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
+
+    In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by their names, with systematic_mm2 (N, 6)
+    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). Where
+    the uncertainty is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to
+    systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on (`PointUncertainty`). The
+    metadata is JSON in numbered comments, short enough for every reader.
+
+    Raises
+    ------
+    OutputError
+        The file exists and `overwrite` is not set, the folder is missing, the disk is full.
+    """
+    if _in_hdf5(path):
+        _write_arrays(path, _arrays(cloud), cloud.metadata, overwrite=overwrite)
+        return
+    vertices = np.empty(
+        len(cloud),
+        dtype=[
+            ("x", "<f8"),
+            ("y", "<f8"),
+            ("z", "<f8"),
+            ("intensity", "<f4"),
+            ("deviation", "<f4"),
+            ("frame", "<i4"),
+            ("line", "<i4"),
+            *((name, "<f4") for name in _uncertainty_names(cloud.uncertainty)),
+        ],
+    )
+    vertices["x"], vertices["y"], vertices["z"] = cloud.points_mm.T
+    vertices["intensity"] = cloud.intensity
+    vertices["deviation"] = np.nan if cloud.deviation_mm is None else cloud.deviation_mm
+    vertices["frame"] = cloud.frame
+    vertices["line"] = cloud.line
+    if cloud.uncertainty is not None:
+        for name, column in zip(_uncertainty_names(cloud.uncertainty), _columns(cloud.uncertainty), strict=True):
+            vertices[name] = column
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
+    with written_aside(path, overwrite=overwrite) as aside:
+        ply.write(str(aside))
+
+
+def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
+    """Read a cloud from HDF5 where the path ends with ``.h5``, else from PLY, also another program's (x, y, z suffice).
+
+    Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
+    missing frame and line are -1, a deviation that is missing or NaN throughout is None.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
+    """
+    path = Path(path)
+    if _in_hdf5(path):
+        return _from_hdf5(path)
+    vertices, comments = _read_ply(path)
+    names = vertices.dtype.names or ()
+    missing = [axis for axis in "xyz" if axis not in names]
+    if missing:
+        raise CaptureError(f"{path}: the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
+
+    def column(name: str, default: float, kind: type) -> np.ndarray:
+        for known_as in (name, f"scalar_{name}"):
+            if known_as in names:
+                return _numbers(path, vertices, known_as).astype(kind)
+        return np.full(len(vertices), default, kind)
+
+    deviation = column("deviation", np.nan, np.float32)
+    try:
+        return PointCloud(
+            points_mm=np.column_stack([_numbers(path, vertices, axis).astype(np.float64) for axis in "xyz"]),
+            intensity=column("intensity", np.nan, np.float32),
+            frame=_indices(path, "frame", column("frame", NO_INDEX, np.float64)),
+            line=_indices(path, "line", column("line", NO_INDEX, np.float64)),
+            deviation_mm=None if np.isnan(deviation).all() else deviation,
+            uncertainty=_uncertainty(names, column),
+            metadata=_metadata(path, comments),
+        )
+    except CaptureError as error:
+        raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def is_cloud(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
+    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else Path(path).suffix.lower() == ".ply"
+
+
+def _in_hdf5(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".h5"
+
+
+def _arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
+    arrays = {name: getattr(cloud, name) for name in _PER_POINT}
+    if cloud.deviation_mm is not None:
+        arrays["deviation_mm"] = cloud.deviation_mm
+    if cloud.uncertainty is not None:
+        arrays |= {part.name: getattr(cloud.uncertainty, part.name) for part in fields(PointUncertainty)}
+        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
+    return arrays
+
+
+def _from_hdf5(path: Path) -> PointCloud:
+    arrays, metadata = _read_arrays(path)
+    names = [part.name for part in fields(PointUncertainty)]
+    wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
+    known = PointUncertainty(**{name: arrays[name] for name in names}) if names[0] in arrays else None
+    try:
+        return PointCloud(
+            **{name: arrays[name] for name in _PER_POINT},
+            deviation_mm=arrays.get("deviation_mm"),
+            uncertainty=known,
+            metadata=metadata,
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
+def _uncertainty_names(uncertainty: PointUncertainty | None) -> list[str]:
+    if uncertainty is None:
+        return []
+    covariances = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
+    return covariances + _move_names(len(uncertainty.patterns_mm))
+
+
+def _move_names(patterns: int) -> list[str]:
+    return [f"{move}_{axis}" for move in ("position", *(f"pattern{m}" for m in range(patterns))) for axis in "xyz"]
+
+
+def _columns(uncertainty: PointUncertainty) -> np.ndarray:
+    """Columns (15 + 3 M, N) in the order of their names."""
+    patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
+    return np.vstack([uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns])
+
+
+def _uncertainty(names: Sequence[str], column: Callable[[str, float, type], np.ndarray]) -> PointUncertainty | None:
+    known = {name.removeprefix("scalar_") for name in names}
+    count = sum(f"pattern{m}_x" in known for m in range(len(known)))
+    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
+    if count == 0 or not known.issuperset(wanted):
+        return None
+    columns = np.stack([column(name, np.nan, np.float32) for name in wanted])
+    position, patterns = columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
+    return PointUncertainty(columns[:6].T.copy(), position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
+
+
+def _read_only(values: Any, kind: type) -> np.ndarray:
+    view = np.asarray(values, dtype=kind).view()
+    view.flags.writeable = False
+    return view
+
+
+def _per_point(name: str, values: Any, kind: type, count: int) -> np.ndarray:
+    column = _read_only(values, kind)
+    if column.shape != (count,):
+        raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {count} points")
+    return column
+
+
+def _as_json(metadata: dict[str, Any]) -> str:
+    try:
+        text = json.dumps(metadata, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError) as error:
+        raise CaptureError(f"the metadata of a cloud must be plain JSON without NaN: {error}") from error
+    if not isinstance(metadata, dict) or json.loads(text) != metadata:
+        raise CaptureError("the metadata of a cloud must be a dict of strings, numbers, booleans, lists and dicts")
+    return text
+
+
+def _comments(metadata: dict[str, Any]) -> list[str]:
+    text = _as_json(metadata)
+    pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
+    # The semicolon keeps a piece's last blank from being stripped by readers.
+    return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
+
+
+def _metadata(path: Path, comments: list[str]) -> dict[str, Any]:
+    own = [comment for comment in comments if comment.startswith(_COMMENT)]
+    if not own:
+        return {}
+    pieces = [_PIECE.fullmatch(comment) for comment in own]
+    wanted = [(str(number), str(len(own))) for number in range(1, len(own) + 1)]
+    if [piece and piece.groups()[:2] for piece in pieces] != wanted:
+        raise CaptureError(f"{path}: its metadata is incomplete; write the file again or remove those comments")
+    try:
+        metadata = json.loads("".join(piece.group(3) for piece in pieces if piece))
+    except json.JSONDecodeError as error:
+        raise CaptureError(f"{path}: its metadata is damaged: {error}") from error
+    if not isinstance(metadata, dict):
+        raise CaptureError(f"{path}: its metadata is a {type(metadata).__name__}; expected a JSON object")
+    return metadata
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray, list[str]]:
+    try:
+        ply = PlyData.read(str(path))
+    except FileNotFoundError as error:
+        raise CaptureError(f"{path} does not exist") from error
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (PlyParseError, ValueError, MemoryError) as error:
+        raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
+    if "vertex" not in ply:
+        raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
+    return ply["vertex"].data, ply.comments
+
+
+def _numbers(path: Path, vertices: np.ndarray, name: str) -> np.ndarray:
+    if vertices.dtype[name].kind not in "iuf":
+        raise CaptureError(f"{path}: the property {name} is a list; expected one number per point")
+    return vertices[name]
+
+
+def _indices(path: Path, name: str, values: np.ndarray) -> np.ndarray:
+    whole = np.isfinite(values) & (values == np.round(values)) & (np.abs(values) < 2**31)
+    if not whole.all():
+        raise CaptureError(f"{path}: {np.count_nonzero(~whole)} values of {name} are no whole numbers")
+    return values.astype(np.int32)
+
+
+class _CloudHeader(Description):
+    """What holds for a whole cloud: its metadata."""
+
+    metadata: dict[str, Any]
+
+
+def _write_arrays(
+    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: dict[str, Any], *, overwrite: bool
+) -> None:
+    """Write named arrays with their metadata, whole or not at all; OutputError where that fails."""
+    # In memory first: HDF5 does not survive a full disk.
+    content = BytesIO()
+    with h5py.File(content, "w", libver="latest") as file:
+        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=metadata))
+        for name, values in arrays.items():
+            file.create_dataset(
+                name, data=values, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
+            )
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.getbuffer())
+
+
+def _read_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Named arrays of numbers and the metadata.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, no cloud, newer or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaptureError(f"{path} does not exist" if not path.exists() else f"{path} is no file")
+    try:
+        with h5py.File(path, "r") as file:
+            header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
+            arrays = {name: np.asarray(dataset[...]) for name, dataset in file.items()}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
+    unusable = [name for name, values in arrays.items() if values.dtype.kind not in "iuf"]
+    if unusable:
+        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers")
+    return arrays, header.metadata

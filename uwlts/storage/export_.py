@@ -1,0 +1,205 @@
+"""Export of captures as folders of images that `uwlts import` reads back, and of clouds as PLY, HDF5, XYZ, LAZ, E57."""
+
+import csv
+import os
+import secrets
+import shutil
+from collections.abc import Callable
+from importlib import import_module
+from io import BytesIO
+from pathlib import Path
+from types import ModuleType
+from typing import Literal
+
+import cv2
+import numpy as np
+import tomli_w
+
+from uwlts.model.errors import OutputError, SetupError
+from uwlts.storage.capture import Capture, Frame
+from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.files import refuse_unsuitable, written_aside
+from uwlts.storage.import_.description import NAME
+from uwlts.storage.import_.matching import POSE_COLUMNS
+
+HEADER, TABLE = "header.json", "frames.csv"
+
+
+def export_capture(
+    capture: Capture,
+    folder: Path,
+    *,
+    image_format: Literal["png", "tiff"] = "png",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Write a capture's frames as images of its own depth, without loss, into a new folder; whole or not at all.
+
+    Beside them stand frames.csv (file, light, stage_mm, exposure_ms, time_s, and the pose's elements if any frame has
+    one), header.json and import.toml.
+
+    Raises
+    ------
+    OutputError
+        The folder exists, its parent is missing, or storage fails.
+    CaptureError
+        A frame's data are damaged.
+    """
+    if folder.exists():
+        raise OutputError(f"{folder} exists already; give the name of a new folder")
+    if not folder.parent.is_dir():
+        raise OutputError(f"cannot make {folder}: the folder {folder.parent} does not exist; create it first")
+    aside = folder.parent / f".{secrets.token_hex(8)}"
+    try:
+        aside.mkdir()
+        rows = []
+        for index, frame in enumerate(capture):
+            name = f"{index:05d}-{_light(frame)}.{image_format}"
+            _, encoded = cv2.imencode(f".{image_format}", frame.image)
+            (aside / name).write_bytes(encoded.tobytes())
+            rows.append(_row(name, frame))
+            progress(index + 1, len(capture))
+        with open(aside / TABLE, "w", newline="", encoding="utf-8") as file:
+            table = csv.DictWriter(file, _columns(rows), restval="", lineterminator="\n")
+            table.writeheader()
+            table.writerows(rows)
+        (aside / HEADER).write_text(capture.header.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        description = {"header": HEADER, "table": TABLE, "repeated": True}
+        (aside / NAME).write_text(tomli_w.dumps(description), encoding="utf-8")
+        os.rename(aside, folder)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _light(frame: Frame) -> str:
+    return "laser" if frame.laser_on else "lamp"
+
+
+def _row(name: str, frame: Frame) -> dict[str, str | float]:
+    row = {
+        "file": name,
+        "light": _light(frame),
+        "stage_mm": frame.stage_mm,
+        "exposure_ms": frame.exposure_ms,
+        "time_s": frame.time_s,
+    }
+    return row if frame.pose is None else row | dict(zip(POSE_COLUMNS, frame.pose.ravel().tolist(), strict=True))
+
+
+def _columns(rows: list[dict[str, str | float]]) -> list[str]:
+    posed = any(POSE_COLUMNS[0] in row for row in rows)
+    return ["file", "light", "stage_mm", "exposure_ms", "time_s", *(POSE_COLUMNS if posed else ())]
+
+
+CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")
+
+LAZ_STEP_M = 1e-7
+"""Coordinates in LAZ are whole multiples of it from the middle of the cloud: 0.1 um, over 214 m to either side."""
+
+_REACH_M = LAZ_STEP_M * (2**31 - 1)
+_INTENSITY_LIMITS = 0, 2**16 - 1
+
+
+def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> None:
+    """Write a cloud in the format that the path's suffix names, whole or not at all.
+
+    - ``.ply``, ``.h5``: as `uwlts.storage.cloud.write_cloud`; mm, everything kept.
+    - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
+      the digits that they have.
+    - ``.laz``: LAS 1.4, point format 6, metres in steps of 1e-7 m. The standard intensity is rounded to whole numbers
+      (0 where unknown); ``amplitude`` holds it as it is, ``frame``, ``line`` and ``deviation_mm`` the rest.
+    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate.
+
+    Raises
+    ------
+    OutputError
+        The suffix is none of these, the file exists, the cloud is empty, too wide for LAZ, or lacks intensities that
+        E57 cannot leave out; storage fails.
+    SetupError
+        The library of the format is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in CLOUD_FORMATS:
+        raise OutputError(f"{path} ends with none of {', '.join(CLOUD_FORMATS)}, which name the format of a cloud")
+    refuse_unsuitable(path, overwrite=overwrite)
+    if len(cloud) == 0:
+        raise OutputError("the cloud has no points: there is nothing to export")
+    match suffix:
+        case ".ply" | ".h5":
+            write_cloud(path, cloud, overwrite=overwrite)
+        case ".xyz":
+            _write_xyz(cloud, path, overwrite=overwrite)
+        case ".laz":
+            _write_laz(cloud, path, overwrite=overwrite)
+        case _:
+            _write_e57(cloud, path, overwrite=overwrite)
+
+
+def _write_xyz(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
+    with written_aside(path, overwrite=overwrite) as aside, open(aside, "w", encoding="utf-8") as file:
+        # CloudCompare takes the names from a first line that begins so.
+        file.write("//X Y Z Intensity\n")
+        rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
+        file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
+
+
+def _write_laz(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
+    laspy = _library("laspy", "LAZ")
+    _library("lazrs", "LAZ")
+    points = 1e-3 * cloud.points_mm
+    middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2, 3)
+    reach = np.abs(points - middle).max()
+    if reach > _REACH_M:
+        raise OutputError(
+            f"the cloud reaches {reach:.0f} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
+            f"only {_REACH_M:.0f} m: write PLY or E57"
+        )
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
+    extra = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
+    if cloud.deviation_mm is not None:
+        extra["deviation_mm"] = cloud.deviation_mm
+    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=values.dtype) for name, values in extra.items()])
+    table = laspy.LasData(header)
+    table.x, table.y, table.z = points.T
+    table.intensity = np.rint(np.nan_to_num(cloud.intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
+    for name, values in extra.items():
+        table[name] = values
+    # The compressor has errors of its own where storage fails.
+    content = BytesIO()
+    table.write(content, do_compress=True)
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.getvalue())
+
+
+def _write_e57(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
+    pye57 = _library("pye57", "E57")
+    unknown = np.isnan(cloud.intensity)
+    if unknown.any() and not unknown.all():
+        raise OutputError(
+            f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which E57 as written here cannot "
+            "mark: write PLY, XYZ or LAZ"
+        )
+    # Rounded before, so that the bounds in the file hold for the numbers in the file.
+    columns = (1e-3 * cloud.points_mm).astype(np.float32).astype(np.float64).T
+    data: dict[str, np.ndarray] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
+    if not unknown.any():
+        data["intensity"] = cloud.intensity
+    with written_aside(path, overwrite=overwrite) as aside:
+        try:
+            file = pye57.E57(str(aside), mode="w")
+            file.write_scan_raw(data, name=path.stem)
+            file.close()
+        except pye57.libe57.E57Exception as error:
+            raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from error
+
+
+def _library(name: Literal["laspy", "lazrs", "pye57"], format: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise SetupError(
+            f"{format} needs the library {name}, which is not installed: pip install 'uwlts[clouds]', or write "
+            "PLY or XYZ"
+        ) from error

@@ -1,0 +1,153 @@
+"""Files that appear whole or not at all, and files of JSON: one object, whose "format" and "version" say what it is.
+
+Outputs are written beside their place, flushed to the disk, then renamed.
+"""
+
+import errno
+import json
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from uwlts.model.errors import CaptureError, OutputError
+
+
+@contextmanager
+def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """Give the body a temporary file to write; move it to `path` when the body ends without an exception.
+
+    The temporary file lies empty in the folder of `path` (a rename is atomic only within one file system) and keeps
+    the suffix, by which some libraries choose the format. It is removed whatever exception leaves the body,
+    KeyboardInterrupt included, and an existing file at `path` is untouched until the new one is complete. A symbolic
+    link is followed, so that the file it names is replaced and not the link.
+
+    Parameters
+    ----------
+    path : path
+        Where the finished file shall be.
+    overwrite : bool
+        Replace an existing file; without it an existing file is refused, before the body runs and again at the end.
+
+    Yields
+    ------
+    Path
+        The temporary file; the body opens, writes and closes it.
+
+    Raises
+    ------
+    OutputError
+        The folder is missing or not writable, the file exists, `path` is a folder or a device, the disk is full: any
+        OSError of the body or of the renaming.
+    """
+    target = Path(os.path.realpath(path))
+    refuse_unsuitable(target, overwrite=overwrite)
+    aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
+    try:
+        # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
+        os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        raise OutputError(_cannot_write(target, error)) from error
+    try:
+        yield aside
+        _flush(aside)
+        refuse_unsuitable(target, overwrite=overwrite)
+        os.replace(aside, target)
+        _flush_folder(target.parent)
+    except OSError as error:
+        raise OutputError(_cannot_write(target, error)) from error
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def refuse_unsuitable(target: Path, *, overwrite: bool) -> None:
+    """Raise OutputError where nothing may be written; commands ask before the work and not only after it."""
+    if not target.parent.is_dir():
+        raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
+    if target.exists() and not target.is_file():
+        raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
+    if target.exists() and not overwrite:
+        raise OutputError(f"{target} exists already; give another name, or --overwrite to replace it")
+
+
+def _cannot_write(target: Path, error: OSError) -> str:
+    advice = {
+        errno.ENOSPC: "the disk is full; free some space",
+        errno.EDQUOT: "the disk quota is used up; free some space",
+        errno.EACCES: f"no permission to write in {target.parent}",
+        errno.EPERM: f"no permission to write in {target.parent}",
+        errno.EROFS: f"{target.parent} is on a read-only file system",
+    }
+    return f"cannot write {target}: {advice.get(error.errno, error.strerror or str(error))}"
+
+
+def _flush(file: Path) -> None:
+    descriptor = os.open(file, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Make the renaming itself last; only POSIX systems can open a folder."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+AnyModel = TypeVar("AnyModel", bound=BaseModel)
+
+_MOST_PROBLEMS = 5
+"""Problems named in a message; a damaged table would be reported number by number."""
+
+
+def read_json(path: str | Path, *, called: str) -> dict[str, Any]:
+    """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
+    a_thing = f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"cannot read the {called} {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path} is not {a_thing}, or is truncated: {error}") from error
+    if not isinstance(content, dict):
+        raise CaptureError(f'{path} is JSON but not {a_thing}: expected an object with a "format"')
+    return content
+
+
+def described(
+    content: dict[str, Any],
+    model: type[AnyModel],
+    *,
+    path: str | Path,
+    format: str,
+    version: int,
+    called: str,
+    foreign: str,
+) -> AnyModel:
+    """The description in a file's object; CaptureError where it is foreign (in these words), newer or damaged."""
+    if content.pop("format", None) != format:
+        raise CaptureError(f'{path} is JSON but {foreign}: expected "format": "{format}"')
+    if (found := content.pop("version", None)) != version:
+        raise CaptureError(f"{path} has version {found}; this program reads {version}")
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        problems = error.errors()[:_MOST_PROBLEMS]
+        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
+        raise CaptureError(f"{path} is not a valid {called}: {details}") from error
+
+
+def json_text(content: BaseModel | dict[str, Any] | list[Any], *, indent: int | None = None, ascii: bool = True) -> str:
+    """Text of a JSON file, of a model with the fields that were set; ValueError for numbers that are not finite."""
+    plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
+    return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"

@@ -1,0 +1,201 @@
+"""Description of a folder of images: a TOML file with the sensor, the medium, what each image is, and the stage."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from uwlts.model.artefacts import parse_artefact
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import find, load_sensor, merged, read_table, validated
+from uwlts.model.sensor import Description, NotNegative, Sensor, Vector
+from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.import_.intrinsics import read_intrinsics, with_intrinsics
+from uwlts.targets import parse_target
+
+NAME = "import.toml"
+"""File of this name in the folder of the images is read unless another is given."""
+
+Patterns = str | tuple[str, ...]
+Channel = Literal["red", "green", "blue", "grey", "max"]
+
+_OF_THE_HEADER = (
+    "name",
+    "sensor",
+    "intrinsics",
+    "medium",
+    "saturation_dn",
+    "target",
+    "artefact",
+    "provenance",
+    "bits",
+    "aligned",
+)
+
+
+class StageMotion(Description):
+    """Where the stage was: by start and step, by a list, or nowhere, when every image has a pose of its own (free).
+
+    ``direction`` is the unit direction in which growing positions move the sensor, in the OCS.
+    """
+
+    start_mm: float | None = None
+    step_mm: float | None = None
+    positions_mm: tuple[float, ...] | None = None
+    free: bool = False
+    direction: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "StageMotion":
+        if (self.start_mm is None) != (self.step_mm is None):
+            raise ValueError("start_mm and step_mm belong together: give both, or positions_mm")
+        ways = [self.start_mm is not None, self.positions_mm is not None, self.free]
+        if sum(ways) > 1:
+            raise ValueError("give the positions once: start_mm and step_mm, or positions_mm, or free = true")
+        return self
+
+
+class ImportDescription(Description):
+    """Everything that is known about a folder of images.
+
+    ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
+    description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
+    name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; ``table`` is a CSV
+    file with each image's values.
+    """
+
+    header: str | None = None
+    name: str | None = None
+    sensor: str | dict[str, Any] | None = None
+    intrinsics: str | None = None
+    medium: str | None = None
+    laser: Patterns = ()
+    lamp: Patterns = ()
+    background: Patterns = ()
+    ignore: Patterns = ()
+    table: str | None = None
+    channel: Channel | None = None
+    lamp_channel: Channel | None = None
+    bits: Annotated[int, Field(ge=8, le=16)] | None = None
+    aligned: Literal["low", "high"] = "low"
+    saturation_dn: Annotated[int, Field(gt=0)] | None = None
+    exposure_ms: NotNegative | None = None
+    lamp_exposure_ms: NotNegative | None = None
+    repeated: bool = False
+    stage: StageMotion = StageMotion()
+    target: dict[str, Any] | None = None
+    artefact: dict[str, Any] | None = None
+    provenance: dict[str, Any] | None = None
+
+    @model_validator(mode="after")
+    def _given_once(self) -> "ImportDescription":
+        if self.header is None:
+            missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
+            if missing:
+                raise ValueError(f"{' and '.join(missing)} missing: a capture says which sensor saw it, in what")
+        else:
+            twice = [name for name in _OF_THE_HEADER if name in self.model_fields_set]
+            twice += ["stage.direction"] if self.stage.direction is not None else []
+            if twice:
+                raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
+        return self
+
+
+def read_description(path: Path) -> ImportDescription:
+    """Description in a TOML file; DescriptionError where it is missing, no TOML, or holds an unknown or wrong key."""
+    if not path.is_file():
+        raise DescriptionError(
+            f"no description at {path}: write one with sensor, medium, and which image is what (docs/import.md)"
+        )
+    return validated(ImportDescription, read_table(path), path)
+
+
+def capture_header(
+    given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: dict[str, Any]
+) -> CaptureHeader:
+    """Header of the capture.
+
+    Parameters
+    ----------
+    given : ImportDescription
+    sensor : Sensor
+        As `described_sensor` gives it.
+    beside : Path
+        Folder of the description, where the files it names are sought.
+    name : str
+        Name of the capture unless the description has one.
+    saturation_dn : int
+        Grey value at which the capture's pixels clip.
+    remarks : dict
+        Provenance unless the description has one.
+
+    Raises
+    ------
+    DescriptionError
+        Medium, target, direction or header are missing, unknown or not valid.
+    EvaluationError
+        The artefact is not valid.
+    """
+    if given.header is not None:
+        return read_header(beside / given.header)
+    direction = given.stage.direction
+    if direction is None:
+        if not given.stage.free:
+            raise DescriptionError(
+                "stage.direction is missing: give the unit direction in which the stage moves the sensor, in the OCS, "
+                "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
+            )
+        direction = (1.0, 0.0, 0.0)
+    if given.medium is None:
+        raise DescriptionError("medium is missing: a capture states the medium in which the sensor was used")
+    if given.target is not None:
+        parse_target(given.target)
+    if given.artefact is not None:
+        parse_artefact(given.artefact)
+    table = {
+        "name": given.name or name,
+        "sensor": sensor,
+        "medium_name": given.medium,
+        "medium": sensor.medium(given.medium),
+        "stage_direction": direction,
+        "target": given.target,
+        "artefact": given.artefact,
+        "saturation_dn": saturation_dn,
+        "provenance": remarks if given.provenance is None else given.provenance,
+    }
+    return validated(CaptureHeader, table, "the header from the description")
+
+
+def read_header(path: Path) -> CaptureHeader:
+    """A capture's header from JSON; DescriptionError where it is missing, no JSON or not valid."""
+    try:
+        return validated(CaptureHeader, json.loads(path.read_text(encoding="utf-8")), path)
+    except OSError as error:
+        raise DescriptionError(f"cannot read the header {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise DescriptionError(f"{path} is no header in JSON, or is truncated: {error}") from error
+
+
+def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
+    """The sensor that took the images, with the intrinsics of another program's calibration where given."""
+    if given.header is not None:
+        return read_header(beside / given.header).sensor
+    if isinstance(given.sensor, dict):
+        table = dict(given.sensor)
+        base = table.pop("base", None)
+        if base is not None:
+            table = merged(read_table(find(_beside(beside, base), "sensors"), "sensors"), table)
+        sensor = validated(Sensor, table, "sensor")
+    else:
+        sensor = load_sensor(_beside(beside, given.sensor))
+    if given.intrinsics is None:
+        return sensor
+    return with_intrinsics(sensor, read_intrinsics(beside / given.intrinsics), source=given.intrinsics)
+
+
+def _beside(folder: Path, name: object) -> str:
+    """A sensor's name as it is, the path of a description sought beside the one that names it."""
+    if not isinstance(name, str):
+        raise DescriptionError(f"sensor is based on {name!r}; expected the name or path of a description")
+    return str(folder / name) if name.endswith(".toml") else name

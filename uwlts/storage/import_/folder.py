@@ -1,0 +1,320 @@
+"""Import of a folder of images as a capture, with checks for black, saturated and stripe-free images."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import uwlts
+from uwlts.model.errors import DescriptionError, ImageError
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage.files import refuse_unsuitable
+from uwlts.storage.import_.description import (
+    NAME,
+    ImportDescription,
+    capture_header,
+    described_sensor,
+    read_description,
+)
+from uwlts.storage.import_.images import bits_of, grey_values, one_channel, read_image, without_background
+from uwlts.storage.import_.matching import Matched, PlannedFrame, match, planned_frames, read_rows, stage_remark
+from uwlts.stripe.recording import BLACK, WHITE, has_stripe, is_black, runs_across, white_share
+
+
+def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> None:
+    """Refuse an image (H, W) or (H, W, 3) of another size than the sensor's; the advice differs for the ``first`` one.
+
+    Raises
+    ------
+    ImageError
+    """
+    camera = sensor.camera
+    height, width = image.shape[:2]
+    if (width, height) == (camera.width_px, camera.height_px):
+        return
+    wanted = f"{camera.width_px} x {camera.height_px}"
+    before = "" if first else " and the images before it"
+    if (width, height) == (camera.height_px, camera.width_px):
+        advice = (
+            "it is turned by a quarter turn: turn it back"
+            if not first
+            else "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
+            "sensor and see to stripe_along"
+        )
+    else:
+        advice = (
+            "leave it out (ignore), or import it on its own"
+            if not first
+            else "give the description of the sensor that took the images, or correct its width_px and height_px"
+        )
+    raise ImageError(
+        f"{name} has {width} x {height} pixels; expected {wanted} as the sensor '{sensor.name}' has{before}: {advice}"
+    )
+
+
+@dataclass(eq=False)
+class Content:
+    """Keeps account of the images of one import; ``saturation_dn`` is that of the files, ``target``: one is given.
+
+    ``black`` has the names of the dark images and ``seen`` the number of all, by whether the laser was on;
+    ``with_stripe`` counts the images with a stripe, ``sideways`` those with one across.
+    """
+
+    sensor: Sensor
+    saturation_dn: int
+    target: bool
+    black: dict[bool, list[str]] = field(default_factory=lambda: {False: [], True: []})
+    seen: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
+    with_stripe: int = 0
+    sideways: int = 0
+
+    def look(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
+        """Take an image (H, W) as the camera gave it into account.
+
+        Raises
+        ------
+        ImageError
+            Most of it is saturated.
+        """
+        self.seen[laser_on] += 1
+        white = white_share(image, self.saturation_dn)
+        if white > WHITE:
+            raise ImageError(
+                f"{name} is white: {100 * white:.0f} % of its pixels are saturated ({self.saturation_dn} DN): expose "
+                "shorter, or leave it out (ignore)"
+            )
+        if is_black(image, self.saturation_dn):
+            self.black[laser_on].append(name)
+
+    def look_for_stripe(self, image: np.ndarray) -> None:
+        """Take a laser image (H, W) into account, from which its background is subtracted if there is one."""
+        along = self.sensor.camera.stripe_along
+        if has_stripe(image, stripe_along=along):
+            self.with_stripe += 1
+        else:
+            self.sideways += runs_across(image, stripe_along=along)
+
+    def refuse_black(self) -> None:
+        """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
+        if self.seen[True] and len(self.black[True]) == self.seen[True]:
+            raise ImageError(
+                f"all {self.seen[True]} laser images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
+                "the laser on, the exposure long enough, the channel that of its colour, bits right?"
+            )
+        if self.target and self.seen[False] and len(self.black[False]) == self.seen[False]:
+            raise ImageError(
+                f"all {self.seen[False]} lamp images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
+                "the lamp on, the exposure long enough, bits right?"
+            )
+
+    def verdict(self) -> list[str]:
+        """Warnings, once all images were seen."""
+        warnings = [
+            f"{len(self.black[on])} of {self.seen[on]} {light} images are black, such as {self.black[on][0]}"
+            for on, light in ((True, "laser"), (False, "lamp"))
+            if self.black[on]
+        ]
+        lasers = self.seen[True]
+        if lasers and not self.with_stripe:
+            along = self.sensor.camera.stripe_along
+            turned = (
+                f"in {self.sideways} of them one runs across: the images are turned, or the sensor's stripe_along "
+                f"('{along}') is wrong"
+                if self.sideways
+                else "check which images are laser images, the channel, and the exposure"
+            )
+            warnings.append(f"no stripe in any of the {lasers} laser images: {turned}")
+        elif self.with_stripe < lasers:
+            warnings.append(f"{lasers - self.with_stripe} of {lasers} laser images show no stripe")
+        return warnings
+
+
+_UNKNOWN = 0.0
+"""Exposure and time of images of which nobody knows them; the provenance says so."""
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What was imported: number of laser and lamp images, and what is doubtful about them."""
+
+    laser: int
+    lamp: int
+    warnings: tuple[str, ...]
+
+
+def import_folder(
+    folder: Path,
+    out: Path,
+    *,
+    description: Path | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Imported:
+    """Write the images of a folder as a capture, whole or not at all.
+
+    Where laser images have a background, all images are stored with 16 bit, the laser images as the difference plus
+    2^bits: the sign of the noise about zero is part of the evidence.
+
+    Parameters
+    ----------
+    folder : Path
+        The images: PNG, TIFF, BMP or JPEG, in it or in folders below it.
+    out : Path
+        Capture to write.
+    description : Path, optional
+        TOML file of an `ImportDescription`; import.toml in the folder unless given.
+    overwrite : bool
+        Replace an existing capture.
+    progress : callable
+        Called with the number of images done and of all.
+
+    Raises
+    ------
+    DescriptionError
+        The description, or a file it names, is missing, wrong or contradictory.
+    ImageError
+        The folder holds no image; an image is foreign, truncated, of another size or depth than the others, has an
+        alpha channel, is of several colours without a chosen one, is saturated all over; or all are black.
+    OutputError
+        The capture cannot be written.
+    """
+    refuse_unsuitable(out, overwrite=overwrite)
+    if not folder.is_dir():
+        raise ImageError(f"no folder at {folder}")
+    path = folder / NAME if description is None else description
+    given = read_description(path)
+    sensor = described_sensor(given, beside=path.parent)
+    rows = None if given.table is None else read_rows(path.parent / given.table)
+    matched = match(folder, given, rows)
+    frames = planned_frames(folder, given, matched, in_table=rows is not None)
+    reader = _Reader(given, sensor, folder)
+    first, bits = reader.image(frames[0].path, laser_on=frames[0].laser_on)
+    zero = _zero_dn(given, frames, bits)
+    saturation = 2**bits - 1 if given.saturation_dn is None else given.saturation_dn
+    header = capture_header(
+        given,
+        sensor,
+        beside=path.parent,
+        name=folder.resolve().name,
+        saturation_dn=saturation + zero,
+        remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
+    )
+    if header.saturation_dn - zero > np.iinfo(first.dtype).max:
+        raise DescriptionError(
+            f"saturation_dn is {header.saturation_dn - zero}; images of {first.dtype} have no such value"
+        )
+    content = Content(header.sensor, header.saturation_dn - zero, header.target is not None)
+    dtype = np.dtype(np.uint16) if zero else first.dtype
+    _write(out, header, frames, reader, content, zero_dn=zero, dtype=dtype, overwrite=overwrite, progress=progress)
+    return Imported(len(matched.laser), len(matched.lamp), (*content.verdict(), *_unmatched(matched)))
+
+
+def _zero_dn(given: ImportDescription, frames: list[PlannedFrame], bits: int) -> int:
+    """What is added to a difference; 0 where nothing is subtracted."""
+    if all(frame.background is None for frame in frames):
+        return 0
+    if given.header is not None:
+        raise DescriptionError(
+            "a background is to be subtracted, but the header is that of a finished capture: leave out one of the two"
+        )
+    if bits == 16:
+        raise DescriptionError(
+            "a background is to be subtracted, but 16 bits leave no room for its sign: give the bits that the camera "
+            "used, or leave the background out"
+        )
+    return 2**bits
+
+
+class _Reader:
+    """Reads images as grey values that all have the size and depth of the first; keeps the last background."""
+
+    def __init__(self, given: ImportDescription, sensor: Sensor, folder: Path):
+        self._given, self._sensor, self._folder = given, sensor, folder
+        self.dtype: np.dtype | None = None
+        self._kept: tuple[Path, np.ndarray] | None = None
+
+    def image(self, path: Path, *, laser_on: bool) -> tuple[np.ndarray, int]:
+        """Grey image (H, W) and its bits; ImageError where it is not like the others."""
+        given, name = self._given, path.relative_to(self._folder).as_posix()
+        raw = read_image(path)
+        check_size(raw, self._sensor, name=name, first=self.dtype is None)
+        if self.dtype not in (None, raw.dtype):
+            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
+        channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
+        grey = one_channel(raw, channel, name=name)
+        # A header has no bits, and grey values that a capture held fit in it.
+        bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
+        self.dtype = raw.dtype
+        return grey_values(grey, bits=bits, aligned=given.aligned, name=name), bits
+
+    def background(self, path: Path) -> np.ndarray:
+        """Grey image (H, W) without laser, in the laser's channel."""
+        if self._kept is None or self._kept[0] != path:
+            self._kept = path, self.image(path, laser_on=True)[0]
+        return self._kept[1]
+
+
+def _write(
+    out: Path,
+    header: CaptureHeader,
+    frames: list[PlannedFrame],
+    reader: _Reader,
+    content: Content,
+    *,
+    zero_dn: int,
+    dtype: np.dtype,
+    overwrite: bool,
+    progress: Callable[[int, int], None],
+) -> None:
+    writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
+    try:
+        with writer:
+            for number, frame in enumerate(frames):
+                image, _ = reader.image(frame.path, laser_on=frame.laser_on)
+                content.look(image, laser_on=frame.laser_on, name=frame.path.name)
+                if frame.background is not None:
+                    dark = reader.background(frame.background)
+                    image = without_background(image, dark, zero_dn=zero_dn)
+                if frame.laser_on:
+                    content.look_for_stripe(image)
+                writer.append(_frame(image.astype(dtype, copy=False), frame))
+                progress(number + 1, len(frames))
+            content.refuse_black()
+    except BaseException:
+        # Unlike a recording an import can be made again: half of one is of no use.
+        part_path(out).unlink(missing_ok=True)
+        raise
+
+
+def _frame(image: np.ndarray, planned: PlannedFrame) -> Frame:
+    exposure, time = (_UNKNOWN if value is None else value for value in (planned.exposure_ms, planned.time_s))
+    return Frame(image, planned.stage_mm, planned.laser_on, exposure, time, planned.pose)
+
+
+def _remarks(
+    given: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int
+) -> dict[str, object]:
+    """What the capture says of its origin."""
+    remarks: dict[str, object] = {
+        "source": "imported images",
+        "uwlts": uwlts.__version__,
+        "folder": folder.resolve().name,
+        "bits": bits,
+        "stage": stage_remark(given),
+    }
+    remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
+    if zero_dn:
+        remarks["background"] = f"subtracted from the laser images, {zero_dn} added"
+    for name, values in (("exposure", [f.exposure_ms for f in frames]), ("time", [f.time_s for f in frames])):
+        if None in values:
+            remarks[name] = "not known of all images, stored as 0 where it is missing"
+    return remarks
+
+
+def _unmatched(matched: Matched) -> list[str]:
+    if not matched.unmatched:
+        return []
+    few = ", ".join(matched.unmatched[:3])
+    return [f"{len(matched.unmatched)} images of the folder are left out, as nothing says what they are: {few}"]

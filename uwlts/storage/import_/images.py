@@ -1,0 +1,182 @@
+"""Reads image files as grey values and finds those that are damaged.
+
+libpng, libjpeg and libtiff make up what they cannot decode, and say so on the process's standard error only. So that is
+read meanwhile: lines about damage are returned, everything else is passed on.
+"""
+
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from uwlts.model.errors import ImageError
+
+_STANDARD_ERROR = 2
+_DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
+# Such as of tags that nobody knows.
+_WARNING = b"[ WARN:"
+# OpenCV puts time, file, line and function around what the decoder said.
+_AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*error: \([^)]*\) )|in function '\w+'$")
+
+
+def decode(content: bytes) -> tuple[np.ndarray | None, str]:
+    """Image as OpenCV decodes it unchanged, None where it cannot, and the message about damage, empty if there is none.
+
+    Raises
+    ------
+    cv2.error
+        The content cannot be decoded at all.
+    """
+    with _heard() as said:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    return image, " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
+
+
+def pages(path: str) -> int:
+    """Number of images in a file."""
+    with _heard():
+        return cv2.imcount(path)
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """The lines about damage that are written to the standard error inside the ``with``, there after its end."""
+    said: list[str] = []
+    usual = os.dup(_STANDARD_ERROR)
+    with tempfile.TemporaryFile() as listener:
+        os.dup2(listener.fileno(), _STANDARD_ERROR)
+        try:
+            yield said
+        finally:
+            os.dup2(usual, _STANDARD_ERROR)
+            os.close(usual)
+            listener.seek(0)
+            for line in listener:
+                if _DAMAGE.search(line):
+                    said.append(line.decode(errors="replace"))
+                elif line.strip() and not line.startswith(_WARNING):
+                    os.write(_STANDARD_ERROR, line)
+
+
+SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+
+_SIGNATURES = {
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"II+\0": "TIFF",
+    b"MM\0+": "TIFF",
+    b"BM": "BMP",
+    b"\xff\xd8\xff": "JPEG",
+}
+# OpenCV's order of colours.
+_CHANNELS = {"blue": 0, "green": 1, "red": 2}
+
+
+def read_image(path: Path) -> np.ndarray:
+    """Image (H, W) or (H, W, 3) in blue, green, red, of uint8 or uint16, as stored: not turned by what EXIF says.
+
+    Raises
+    ------
+    ImageError
+        The file is missing, foreign, truncated, has an alpha channel, several pages, or other than whole numbers of 8
+        or 16 bit.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"cannot read {path}: {error.strerror}") from error
+    kind = next((kind for mark, kind in _SIGNATURES.items() if content.startswith(mark)), None)
+    if kind is None:
+        found = "it is empty" if not content else f"it begins with {content[:8]!r}"
+        raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
+    try:
+        image, damage = decode(content)
+    except cv2.error as error:
+        raise ImageError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    if image is None or damage:
+        found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
+        raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
+    if kind == "TIFF" and (count := pages(str(path))) > 1:
+        raise ImageError(f"{path} holds {count} pages; expected one image per file: split it")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ImageError(f"{path} holds values of {image.dtype}; expected whole numbers of 8 or 16 bit")
+    if image.ndim == 3 and image.shape[2] not in (1, 3):
+        raise ImageError(
+            f"{path} has {image.shape[2]} channels, that is with an alpha channel: grey values behind it have no "
+            "certain meaning; save it without transparency"
+        )
+    return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
+def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
+    """Grey image (H, W): red, green or blue of a colour image, its luminance (grey), or the brightest (max).
+
+    Raises
+    ------
+    ImageError
+        A colour image, and no channel is chosen.
+    """
+    if image.ndim == 2:
+        return image
+    if channel is None:
+        if (image[:, :, :1] == image[:, :, 1:]).all():
+            return np.ascontiguousarray(image[:, :, 0])
+        raise ImageError(
+            f"{name} is a colour image: choose the channel of the laser's colour, channel = 'red', 'green', 'blue', "
+            "or 'grey' or 'max'"
+        )
+    if channel == "grey":
+        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return image.max(axis=2) if channel == "max" else cv2.extractChannel(image, _CHANNELS[channel])
+
+
+def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
+    """Bits of the grey values: 8 for a file of 8 bit, else as given.
+
+    Raises
+    ------
+    ImageError
+        A file of 16 bit without given bits; a file of 8 bit that should have more.
+    """
+    if image.dtype == np.uint8:
+        if bits not in (None, 8):
+            raise ImageError(f"{name} is a file of 8 bit, but bits = {bits}: save it with 16 bit, or leave out bits")
+        return 8
+    if bits is None:
+        raise ImageError(f"{name} is a file of 16 bit: say how many the camera used, bits = 10, 12 or 16")
+    return bits
+
+
+def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.ndarray:
+    """Grey values from 0 to 2^bits - 1 of an image (H, W) whose camera put them into the lower or upper bits.
+
+    Raises
+    ------
+    ImageError
+        There are larger values, or bits below the upper ones are used.
+    """
+    if image.dtype == np.uint8:
+        return image
+    if aligned == "high":
+        spare = 16 - bits
+        if (image & np.uint16(2**spare - 1)).any():
+            raise ImageError(f"{name} uses more than its upper {bits} bits: check bits and aligned")
+        return image >> np.uint16(spare)
+    largest = int(image.max())
+    if largest >= 2**bits:
+        raise ImageError(
+            f"{name} holds the grey value {largest}, more than {bits} bits have: check bits, or give aligned = 'high' "
+            "if the camera uses the upper bits"
+        )
+    return image
+
+
+def without_background(image: np.ndarray, background: np.ndarray, *, zero_dn: int) -> np.ndarray:
+    """Image minus background (H, W) as uint16, without loss: ``zero_dn`` stands for no difference."""
+    return (image.astype(np.int32) - background + zero_dn).astype(np.uint16)

@@ -1,0 +1,177 @@
+"""Cameras that other programs calibrated: OpenCV's files and ROS CameraInfo."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import merged, validated
+from uwlts.model.sensor import Distortion, Sensor
+
+# Names in use for the same thing; compared without case and underscores.
+_MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
+_COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
+_WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
+_MODEL = ("distortionmodel",)
+_BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
+# Nominal data hold one focal length; a calibration of square pixels differs by less.
+_LARGEST_ASPECT = 0.01
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """Focal lengths and principal point in px, distortion, and the image size (width, height) where it is given."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: Distortion
+    size_px: tuple[int, int] | None
+
+
+def read_intrinsics(path: Path) -> KnownCamera:
+    """Camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
+
+    Raises
+    ------
+    DescriptionError
+        The file is missing or damaged, has no camera matrix or distortion, or the camera is another than a pinhole with
+        k1, k2, p1, p2, k3.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DescriptionError(f"cannot read the intrinsics {path}: {getattr(error, 'strerror', error)}") from error
+    of_opencv = text.lstrip().startswith(("%YAML", "<?xml", "{")) or "!!opencv-matrix" in text
+    entries = _opencv(text, path) if of_opencv else _plain_yaml(text, path)
+    known = {key.lower().replace("_", ""): value for key, value in entries.items()}
+    model = str(_first(known, _MODEL) or "").lower()
+    if model not in _BROWN_CONRADY:
+        raise DescriptionError(
+            f"{path}: the distortion model is {model!r}; this program's camera is a pinhole with k1, k2, p1, p2, k3 "
+            "(plumb_bob): calibrate with that model"
+        )
+    matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
+    if matrix.size != 9:
+        raise DescriptionError(f"{path}: the camera matrix has {matrix.size} elements; expected 3 x 3")
+    fx, skew, cx, _, fy, cy = matrix[:6].tolist()
+    if not (fx > 0 and fy > 0 and abs(skew) < 1e-6 * fx and np.allclose(matrix[[3, 6, 7, 8]], (0, 0, 0, 1))):
+        raise DescriptionError(
+            f"{path}: the camera matrix is {matrix.tolist()}; expected fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy"
+        )
+    return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), _size(known, path))
+
+
+def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
+    """The sensor with focal length, principal point and distortion of a known camera.
+
+    Raises
+    ------
+    DescriptionError
+        The camera has another image size, or its pixels are not square: a description has one focal length.
+    """
+    camera = sensor.camera
+    size = (camera.width_px, camera.height_px)
+    if known.size_px is not None and known.size_px != size:
+        raise DescriptionError(
+            f"{source} is for images of {known.size_px[0]} x {known.size_px[1]} pixels, the sensor's are {size[0]} x "
+            f"{size[1]}: give the intrinsics of this camera at this size"
+        )
+    focal = (known.fx_px + known.fy_px) / 2
+    if abs(known.fx_px - known.fy_px) > _LARGEST_ASPECT * focal:
+        raise DescriptionError(
+            f"{source}: the focal lengths are {known.fx_px:.1f} and {known.fy_px:.1f} px; a description has one, for "
+            "square pixels: calibrate with square pixels, or check the file"
+        )
+    changes = {
+        "focal_length_mm": 1e-3 * focal * camera.pixel_size_um,
+        "principal_point_px": (known.cx_px, known.cy_px),
+        "distortion": known.distortion.model_dump(),
+    }
+    return validated(Sensor, merged(sensor.model_dump(), {"camera": changes}), source)
+
+
+def _opencv(text: str, path: Path) -> dict[str, Any]:
+    """Top entries of a file of `cv2.FileStorage`: matrices, lists, numbers and texts."""
+    try:
+        # Its nodes hold only as long as the storage does.
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        names = storage.root().keys()
+        return {name: _value(storage.getNode(name)) for name in names}
+    # OpenCV's binding fails with a SystemError where the constructor throws.
+    except (cv2.error, SystemError) as error:
+        raise DescriptionError(f"{path} is no complete file of OpenCV: {' '.join(str(error).split())}") from error
+
+
+def _value(node: cv2.FileNode) -> Any:
+    if node.isMap():
+        # A matrix, with its tag or without, as ROS writes it.
+        return _value(node.getNode("data"))
+    if node.isSeq():
+        return [_value(node.at(place)) for place in range(node.size())]
+    if node.isString():
+        return node.string()
+    return node.real() if node.isInt() or node.isReal() else None
+
+
+def _plain_yaml(text: str, path: Path) -> dict[str, Any]:
+    try:
+        # What `rostopic echo` prints ends with the mark of a next document.
+        entries = next(iter(yaml.safe_load_all(text)), None)
+    except yaml.YAMLError as error:
+        raise DescriptionError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(entries, dict):
+        raise DescriptionError(f"{path} holds no table of names and values; expected ROS CameraInfo or an OpenCV file")
+    return {str(key): value for key, value in entries.items()}
+
+
+def _first(known: dict[str, Any], names: tuple[str, ...]) -> Any:
+    return next((known[name] for name in names if known.get(name) is not None), None)
+
+
+def _numbers(known: dict[str, Any], names: tuple[str, ...], path: Path) -> np.ndarray:
+    """Finite numbers (N,) of a matrix in any of its writings."""
+    value = _first(known, names)
+    if isinstance(value, dict):
+        value = value.get("data")
+    if value is None:
+        raise DescriptionError(
+            f"{path} has none of {', '.join(names)} (in any case, with or without underscores); it has "
+            f"{', '.join(known) or 'nothing'}"
+        )
+    try:
+        numbers = np.array(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError) as error:
+        raise DescriptionError(f"{path}: {names[0]} is {value!r}; expected numbers") from error
+    if not np.isfinite(numbers).all():
+        raise DescriptionError(f"{path}: {names[0]} holds {numbers.tolist()}; expected finite numbers")
+    return numbers
+
+
+def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
+    """k1, k2, p1, p2, k3; further ones of OpenCV's longer models must be zero."""
+    if len(coefficients) not in (0, 4, 5, 8, 12, 14):
+        raise DescriptionError(f"{path}: there are {len(coefficients)} distortion coefficients; expected 4 or 5")
+    if np.any(coefficients[5:]):
+        raise DescriptionError(
+            f"{path}: the distortion has {len(coefficients)} coefficients (rational or thin-prism model); this "
+            "program's camera has k1, k2, p1, p2, k3, and no choice of these five equals it: calibrate with the plain "
+            "model (plumb_bob)"
+        )
+    names = ("k1", "k2", "p1", "p2", "k3")
+    return Distortion(**dict(zip(names, coefficients.tolist()[:5], strict=False)))
+
+
+def _size(known: dict[str, Any], path: Path) -> tuple[int, int] | None:
+    width, height = _first(known, _WIDTH), _first(known, _HEIGHT)
+    if width is None or height is None:
+        return None
+    try:
+        return int(width), int(height)
+    except (TypeError, ValueError) as error:
+        raise DescriptionError(f"{path}: the image size is {width!r} x {height!r}; expected whole numbers") from error

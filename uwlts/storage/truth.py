@@ -1,0 +1,103 @@
+"""The ground-truth file that lies beside a rendered capture; nothing but the comparison with truth reads it."""
+
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from uwlts.model.errors import CaptureError
+from uwlts.model.sensor import Description, Medium, Sensor
+from uwlts.storage.files import written_aside
+from uwlts.storage.hdf5_file import read_label, write_label
+
+FORMAT = "uwlts-truth"
+VERSION = 1
+_DIMENSIONS = {"centre_px": 2, "point_mm": 3, "normal": 3, "status": 2, "crossings": 2, "depth_mm": 2}
+
+
+class TruthStatus(IntEnum):
+    """Whether a profile line truly shows the stripe."""
+
+    VISIBLE = 0
+    NO_STRIPE = 1
+
+
+class TruthHeader(Description):
+    """All true parameters: the sensor as rendered, its medium, and the scene's description."""
+
+    sensor: Sensor
+    medium: Medium
+    scene: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What every profile line of every frame truly shows; F frames, L lines.
+
+    ``centre_px (F, L)`` is the image coordinate across the stripe where the line's centre sees the middle of the
+    sheet; ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates; ``status (F, L)``
+    is a `TruthStatus`; ``crossings (F, L)`` counts lit crossings of the sheet, of which the brightest is given.
+    ``depth_mm (H, W)`` is the camera-frame z of what every pixel sees in the first frame. NaN where nothing is.
+    """
+
+    centre_px: np.ndarray
+    point_mm: np.ndarray
+    normal: np.ndarray
+    status: np.ndarray
+    crossings: np.ndarray
+    depth_mm: np.ndarray
+
+
+def truth_path(capture: str | Path) -> Path:
+    """Where the truth of a capture lies."""
+    path = Path(capture)
+    return path.with_name(path.name.removesuffix(".h5") + ".truth.h5")
+
+
+def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrite: bool = False) -> None:
+    """Write a truth file whole or not at all; OutputError where that fails."""
+    # HDF5's latest format has checksums over all that the file says of itself.
+    with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
+        write_label(file, format=FORMAT, version=VERSION, header=header)
+        for field in fields(truth):
+            values = getattr(truth, field.name)
+            file.create_dataset(field.name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
+
+
+def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
+    """Read a truth file; CaptureError where it is missing, foreign, newer, damaged, or contradicts itself."""
+    if not Path(path).is_file():
+        raise CaptureError(f"no truth file at {path}")
+    try:
+        with h5py.File(path, "r") as file:
+            header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
+            arrays = {field.name: _array(file, field.name, path) for field in fields(Truth)}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
+    truth = Truth(**arrays)
+    _require_consistent(truth, path)
+    return header, truth
+
+
+def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
+    dataset = file.get(name)
+    kinds = "iu" if name in ("status", "crossings") else "f"
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kinds or dataset.ndim != _DIMENSIONS[name]:
+        raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {_DIMENSIONS[name]} dimensions")
+    return dataset[...]
+
+
+def _require_consistent(truth: Truth, path: str | Path) -> None:
+    lines = truth.status.shape
+    shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}
+    expected = {name: lines if _DIMENSIONS[name] == 2 else (*lines, 3) for name in shapes}
+    if shapes != expected:
+        raise CaptureError(f"{path} contradicts itself: its arrays have the shapes {shapes}")
+    if not np.isin(truth.status, list(TruthStatus)).all():
+        raise CaptureError(f"{path} holds unknown statuses; known are {[int(status) for status in TruthStatus]}")
+    visible = truth.status == TruthStatus.VISIBLE
+    if not all(np.isfinite(values[visible]).all() for values in (truth.centre_px, truth.point_mm, truth.normal)):
+        raise CaptureError(f"{path} says that a stripe is visible where centre, point or normal are not finite")

@@ -1,1 +1,0 @@
-"""How well points and what is measured of them are known."""
