@@ -41,8 +41,6 @@ def calibrate(
     method : {"auto", "sequential", "joint"}
         sequential: camera and sheet from ``air``, then the window's distance from ``step``. joint: all parameters from
         all captures at once, with their covariance. auto: joint where ``water`` or ``scan`` needs it, else sequential.
-    options : CalibrationOptions, optional
-    progress : callable, optional
 
     Returns
     -------

@@ -16,8 +16,6 @@ from uwlts.model.errors import CalibrationError
 # Coordinates of size one: a direction in which points extend less than this share of the widest one, or a null vector
 # of the equations that is not alone by this share, cannot be told from rounding and lens distortion.
 _FLAT = 1e-4
-
-
 _AMBIGUOUS = 1e-9
 
 
@@ -40,10 +38,7 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> LinearCamera:
     points_mm : (N, 3), mm, any frame
     pixels : (N, 2), px
 
-    Raises
-    ------
-    CalibrationError
-        The points lie in one plane or are too few, or the image is mirrored against them.
+    Raises CalibrationError: the points lie in one plane or are too few, or the image is mirrored against them.
     """
     if len(points_mm) < 6:
         raise CalibrationError(f"the linear start needs at least 6 target points; there are {len(points_mm)}")
@@ -143,8 +138,6 @@ Poses = Literal["stage-normal", "stage", "free"]
 
 # Beyond these shares of f and of the image's side a camera counts as not determined: lengths would be wrong as much.
 _LARGEST_FOCAL_STD = 0.02
-
-
 _LARGEST_CENTRE_STD = 0.05
 
 
@@ -154,25 +147,16 @@ class CameraSolution:
 
     Attributes
     ----------
-    model : CameraModel
-    target_poses : (F, 4, 4)
-        ``T_camera_target`` of every image.
-    residuals_px : list of (N, 2)
-        Found minus calculated pixel, for every image.
-    parameters : tuple of str
-        Names of the camera parameters that were estimated.
-    covariance : (P, P)
-        Of these parameters.
-    sigma_px : float
-        Standard deviation of one coordinate, with the degrees of freedom counted.
-    stage_direction : (3,) or None
-        Unit direction in which the stage moves the sensor, camera frame; None where free poses do not follow a stage.
-    stage_tilt_rad, stage_tilt_std_rad : float or None
-        Angle between that direction and the target's normal and its standard deviation, for poses "stage"; the largest
-        of all placements.
-    rounds : int
-    stopped : str
-        Why the iteration ended.
+    target_poses : (F, 4, 4); ``T_camera_target`` of every image
+    residuals_px : list of (N, 2); found minus calculated pixel, for every image
+    parameters : names of the camera parameters that were estimated
+    covariance : (P, P); of these parameters
+    sigma_px : standard deviation of one coordinate, with the degrees of freedom counted
+    stage_direction : (3,) or None; unit direction in which the stage moves the sensor, camera frame; None where free
+        poses do not follow a stage
+    stage_tilt_rad, stage_tilt_std_rad : angle between that direction and the target's normal and its standard
+        deviation, for poses "stage"; the largest of all placements
+    stopped : why the iteration ended
     """
 
     model: CameraModel
@@ -217,22 +201,15 @@ def solve_camera(
 
     Parameters
     ----------
-    images : sequence of TargetImage
-    width_px, height_px : int
-        Size of the images.
-    poses : {"stage-normal", "stage", "free"}
-        "stage-normal" (the thesis): one pose per placement of the target, d is the target's normal. "stage": d is
-        estimated too, for each placement; needs square pixels. "free": one pose per image, stage positions unused.
-    approaching : bool
-        Whether growing stage positions bring the sensor nearer to the target; unused by "free".
-    options : CameraOptions
-    start : CameraSolution, optional
-        A solution for nearly the same pixels, with the same options and poses.
+    width_px, height_px : size of the images
+    poses : {"stage-normal", "stage", "free"}; "stage-normal" (the thesis): one pose per placement of the target, d is
+        the target's normal. "stage": d is estimated too, for each placement; needs square pixels. "free": one pose per
+        image, stage positions unused
+    approaching : whether growing stage positions bring the sensor nearer to the target; unused by "free"
+    start : a solution for nearly the same pixels, with the same options and poses
 
-    Raises
-    ------
-    CalibrationError
-        Too few images, a stage that did not move, a target mirrored against the stage, parameters not determined.
+    Raises CalibrationError: too few images, a stage that did not move, a target mirrored against the stage, parameters
+    not determined.
     """
     options = CameraOptions() if options is None else options
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)

@@ -37,14 +37,10 @@ def solve_without_bias(
 
     Parameters
     ----------
-    images : sequence of TargetImage
-        Pixels are centres of the circles' images.
-    solve : callable
-        Images and a solution to start from, or None, to a solution.
-    diameter_mm : float
-        Of the circles.
-    tolerance_px : float
-        Largest change of an offset at which the rounds end.
+    images : pixels are centres of the circles' images
+    solve : callable; images and a solution to start from, or None, to a solution
+    diameter_mm : of the circles
+    tolerance_px : largest change of an offset at which the rounds end
 
     Raises
     ------

@@ -32,17 +32,11 @@ class AirEvidence:
 
     Attributes
     ----------
-    target : Target
-    images : list of TargetImage
-        Images in which the target was found, one placement per capture.
-    frames : list of (capture, frame)
-        Where each of them comes from.
-    stripes : list of (N, 2)
-        Stripe pixels on the target at the position of each image; empty where there are none.
-    warnings : list of str
-        Images left out, and why.
-    no_stripe : str
-        Why there is no stripe at all; empty where there is one.
+    images : images in which the target was found, one placement per capture
+    frames : list of (capture, frame); where each of them comes from
+    stripes : list of (N, 2); stripe pixels on the target at the position of each image; empty where there are none
+    warnings : images left out, and why
+    no_stripe : why there is no stripe at all; empty where there is one
     """
 
     target: Target
@@ -127,13 +121,9 @@ def step_evidence(
 
     Parameters
     ----------
-    medium_index : float, optional
-        Replaces the index of the captures' medium at the laser's wavelength.
+    medium_index : replaces the index of the captures' medium at the laser's wavelength
 
-    Raises
-    ------
-    DescriptionError
-        A capture does not say which step standard it shows.
+    Raises DescriptionError: a capture does not say which step standard it shows.
     """
     total, done = sum(int(np.count_nonzero(capture.laser_on)) for capture in captures), 0
     found, warnings = [], []

@@ -25,22 +25,14 @@ class QualityLimits:
 
     Attributes
     ----------
-    fewest_points : int
-        Points of the target in an image, where it has so many.
-    smallest_share : float
-        Share of the target's points; a target larger than the image is seen in part.
-    largest_blur_px : float
-        Gaussian blur (standard deviation) of the edges, median over the points.
-    smallest_contrast : float
-        Grey levels between bright and dark, median over the points, as a share of the full scale.
-    largest_saturated : float
-        Share of the pixels of the target, or of the stripe's lines, that reach the full scale.
-    largest_motion_px : float
-        Way of the points between two images of one pose, see `way_px`.
-    smallest_change_px : float
-        Way of the points from the nearest pose recorded before.
-    fewest_lines : int
-        Profile lines with the stripe on the target.
+    fewest_points : points of the target in an image, where it has so many
+    smallest_share : share of the target's points; a target larger than the image is seen in part
+    largest_blur_px : Gaussian blur (standard deviation) of the edges, median over the points
+    smallest_contrast : grey levels between bright and dark, median over the points, as a share of the full scale
+    largest_saturated : share of the pixels of the target, or of the stripe's lines, that reach the full scale
+    largest_motion_px : way of the points between two images of one pose, see `way_px`
+    smallest_change_px : way of the points from the nearest pose recorded before
+    fewest_lines : profile lines with the stripe on the target
     """
 
     fewest_points: int = 12
@@ -90,8 +82,7 @@ def judge_target(
 
     Parameters
     ----------
-    full_dn : int
-        Grey value at which pixels clip.
+    full_dn : grey value at which pixels clip
     """
     count, of_all = len(view.pixels), len(target.indices)
     share = count / of_all

@@ -16,14 +16,10 @@ class CameraOptions:
 
     Attributes
     ----------
-    distortion : tuple of str
-        Those of k1, k2, p1, p2, k3 that are estimated; the others are zero.
-    square_pixels : bool
-        Whether fx and fy are one focal length f.
-    principal_point_px : (cx, cy), optional
-        Given, it is not estimated.
-    soft_limit_px : float, optional
-        Distances well beyond it count linearly ("soft L1") rather than squared.
+    distortion : those of k1, k2, p1, p2, k3 that are estimated; the others are zero
+    square_pixels : whether fx and fy are one focal length f
+    principal_point_px : (cx, cy), optional; given, it is not estimated
+    soft_limit_px : distances well beyond it count linearly ("soft L1") rather than squared
     """
 
     distortion: tuple[str, ...] = ("k1", "k2")

@@ -23,22 +23,12 @@ from uwlts.stripe import StripeOptions
 
 MOST_SMOOTH = 8
 """Degree of the coefficients over the lines."""
-
-
 # A degree over the lines needs several lines of its own.
 _LINES_PER_DEGREE = 10
-
-
 # Smallest singular value over the largest one: a full view has 0.1, one cut to a triangle some thousandths.
 _DETERMINED = 1e-6
-
-
 _STRAYS = 5.0
-
-
 _ROUNDS = 20
-
-
 _RETURNING_ROUNDS = 10
 
 
@@ -48,15 +38,11 @@ class LinePolynomials:
 
     Attributes
     ----------
-    first_line : int
-    range : (low, high)
-        Range of the variable, on which the Legendre polynomials' argument runs from -1 to 1; the same for all lines.
-    coefficients : (L, degree + 1)
-        Legendre coefficients of each line.
-    residuals : (N,)
-        Data less polynomial, outliers included.
-    used : (N,) bool
-        The data that were not left out as outliers.
+    range : (low, high); range of the variable, on which the Legendre polynomials' argument runs from -1 to 1; the same
+        for all lines
+    coefficients : (L, degree + 1); Legendre coefficients of each line
+    residuals : (N,); data less polynomial, outliers included
+    used : (N,) bool; the data that were not left out as outliers
     """
 
     first_line: int
@@ -81,13 +67,9 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
     ----------
     lines : (N,) int
     x, y : (N,)
-    degree : int
-        Of each line's polynomial.
+    degree : of each line's polynomial
 
-    Raises
-    ------
-    CalibrationError
-        The data do not determine the polynomials.
+    Raises CalibrationError: the data do not determine the polynomials.
     """
     span = int(np.ptp(lines)) + 1 if len(lines) else 0
     smooth = min(MOST_SMOOTH, (span - 1) // _LINES_PER_DEGREE)
@@ -139,11 +121,8 @@ def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *,
     Parameters
     ----------
     lines : (N,) int
-    pose : (N,) int
-        Number of the image of each stripe point.
-    centres_px : (N,)
-        Stripe centre on the line.
-    largest_gap : int
+    pose : (N,) int; number of the image of each stripe point
+    centres_px : (N,); stripe centre on the line
     """
     first, count = int(lines.min()), int(np.ptp(lines)) + 1
     domains = np.tile([np.inf, -np.inf], (count, 1))
@@ -163,19 +142,11 @@ def _scaled(x: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 _STRIPE = StripeOptions()
-
-
 _LARGEST_REJECTED = 0.2
-
-
 # Share of the lines that may lack a centre in succession and still borrow their range from both sides.
 _LARGEST_GAP = 0.1
-
-
 # The plate map should be good to two thousandths of the circles' spacing; twice that is worth a word.
 _LARGEST_MAP_SHARE = 0.004
-
-
 _LARGEST_LINE_EXCESS = 1.5
 
 
@@ -185,14 +156,9 @@ class PolynomialResult:
 
     Attributes
     ----------
-    calibration : PolynomialCalibration
-    stripes : PlateStripes
-    maps : list of PlateMap
-        From pixels to the plate, of each image.
-    depth, along : LinePolynomials
-        The fits of Z(position) and of Y(Z), with the residuals of the stripe points: of all for Z, of those that Z used
-        for Y.
-    warnings : list of str
+    maps : from pixels to the plate, of each image
+    depth, along : the fits of Z(position) and of Y(Z), with the residuals of the stripe points: of all for Z, of those
+        that Z used for Y
     """
 
     calibration: PolynomialCalibration
@@ -218,14 +184,10 @@ def calibrate_polynomials(
 
     Parameters
     ----------
-    captures : sequence of Capture
-        A target in the medium of use, square to the laser's axis, that stands still in all captures while the stage
-        moves the sensor along Z. Images with the laser off show the target, those with the laser on, at the same
+    captures : a target in the medium of use, square to the laser's axis, that stands still in all captures while the
+        stage moves the sensor along Z. Images with the laser off show the target, those with the laser on, at the same
         positions and in the same capture, the stripe on it.
-    degree : int
-        Of all polynomials.
-    stripe : StripeOptions
-    progress : callable, optional
+    degree : of all polynomials
 
     Returns
     -------

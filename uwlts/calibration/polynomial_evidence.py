@@ -22,14 +22,8 @@ from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 # What a lens and a flat window leave of a plane beside its homography is smooth: the fifth degree describes it to a
 # micrometre over a view 200 mm wide. Fewer points than three for each coefficient would be fitted, not smoothed.
 _HIGHEST_DEGREE = 5
-
-
 _LOWEST_DEGREE = 3
-
-
 _POINTS_PER_TERM = 3
-
-
 _X, _Y = np.eye(3)[:2]
 
 
@@ -40,14 +34,10 @@ class SmoothMap:
     Attributes
     ----------
     homography : (3, 3)
-    low, high : (2,)
-        Box of the points it was fitted to, on which the polynomial's arguments run from -1 to 1.
-    degree : int
-        Total degree of the polynomial.
-    coefficients : (terms, 2)
-        Legendre coefficients.
-    residuals : (N, 2)
-        Of the points it was fitted to.
+    low, high : (2,); box of the points it was fitted to, on which the polynomial's arguments run from -1 to 1
+    degree : total degree of the polynomial
+    coefficients : (terms, 2); Legendre coefficients
+    residuals : (N, 2); of the points it was fitted to
     """
 
     homography: np.ndarray
@@ -72,10 +62,8 @@ class PlateMap:
 
     Attributes
     ----------
-    to_plate : SmoothMap
-        From pixels to plate coordinates in mm; its residuals are those of the target's points.
-    hull : (K, 3)
-        Sides of the points' convex hull on the plate: outward normal and offset in mm.
+    to_plate : from pixels to plate coordinates in mm; its residuals are those of the target's points
+    hull : (K, 3); sides of the points' convex hull on the plate: outward normal and offset in mm
     """
 
     to_plate: SmoothMap
@@ -99,11 +87,9 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
 
     Parameters
     ----------
-    image : TargetImage
-    circle_diameter_mm : float, optional
-        The points are circles of this diameter and their pixels the centres of their images. The offsets from the
-        images of their centres are taken out by the map itself: refraction that stretches the image outwards shifts
-        the centres as much as perspective does.
+    circle_diameter_mm : the points are circles of this diameter and their pixels the centres of their images. The
+        offsets from the images of their centres are taken out by the map itself: refraction that stretches the image
+        outwards shifts the centres as much as perspective does.
 
     Raises
     ------
@@ -124,10 +110,7 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
 def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
     """Smooth map from points (N, 2) to points (N, 2), by least squares.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few points, or they determine no homography.
+    Raises CalibrationError: there are too few points, or they determine no homography.
     """
     degrees = [d for d in range(_LOWEST_DEGREE, _HIGHEST_DEGREE + 1) if _POINTS_PER_TERM * _count(d) <= len(start)]
     if not degrees:
@@ -163,12 +146,8 @@ def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -
 
 
 _SAME_POSITION_MM = 1e-6
-
-
 # Cosine of the angle between the stage's direction and the laser's axis.
 _ALONG_Z = 0.9
-
-
 # Stripe points about the camera's axis on which the origin of the OCS rests.
 _ORIGIN_POINTS = 100
 
@@ -180,14 +159,10 @@ class PlateStripes:
     Attributes
     ----------
     pixels : (N, 2)
-    lines : (N,) int
-        Profile line of each point.
-    centres_px : (N,)
-        Stripe centre on the line.
-    plate_mm : (N, 2)
-        Place on the plate, in the target's frame.
-    pose : (N,) int
-        Number of the image.
+    lines : (N,) int; profile line of each point
+    centres_px : (N,); stripe centre on the line
+    plate_mm : (N, 2); place on the plate, in the target's frame
+    pose : (N,) int; number of the image
     stage_mm : (N,)
     """
 
@@ -202,11 +177,8 @@ class PlateStripes:
 def common_header(captures: Sequence[Capture]) -> CaptureHeader:
     """The first capture's header.
 
-    Raises
-    ------
-    CalibrationError
-        There is no capture, one has no target, the others describe another arrangement, or the stage does not move
-        along Z.
+    Raises CalibrationError: there is no capture, one has no target, the others describe another arrangement, or the
+    stage does not move along Z.
     """
     if not captures:
         raise CalibrationError("no capture of a target is given: the polynomials are fitted to nothing else")
@@ -255,10 +227,7 @@ def stripes_on_plate(
         Of the images that have such points.
     warnings : list of str
 
-    Raises
-    ------
-    CalibrationError
-        There are fewer positions than a polynomial of this degree has coefficients.
+    Raises CalibrationError: there are fewer positions than a polynomial of this degree has coefficients.
     """
     target = evidence.target
     spacing, extent = target.spacing_mm, target.extent_mm

@@ -38,14 +38,10 @@ class SchurFit:
     global_values : (k,)
     local : list of (b,)
     residuals : list of (n, c)
-    covariance : (k, k)
-        Of the global parameters, scaled by the residuals' variance.
+    covariance : (k, k); of the global parameters, scaled by the residuals' variance
     local_covariances : list of (b, b)
-    sigma : float
-        Standard deviation of one coordinate of a residual, with the degrees of freedom counted.
-    rounds : int
-    stopped : str
-        Why the iteration ended.
+    sigma : standard deviation of one coordinate of a residual, with the degrees of freedom counted
+    stopped : why the iteration ended
     """
 
     global_values: np.ndarray
@@ -87,27 +83,18 @@ def schur_least_squares(
 
     Parameters
     ----------
-    model : callable
-        (group, shared, own of the group) to its `Observation`, or several that make it up, or None where the
-        parameters have no meaning.
-    global_values : (k,)
-        Start.
-    local : sequence of (b,)
-        Starts of the groups.
-    soft_limit : float, optional
-        Residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s; quadratic
-        without it.
-    smallest_gain : float
-        The iteration ends when a step lowers the cost by less than this share of it.
-    damping : float
-        Of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution.
-    enough_rounds : int, optional
-        The iteration ends after so many rounds, settled or not.
+    model : callable; (group, shared, own of the group) to its `Observation`, or several that make it up, or None where
+        the parameters have no meaning
+    global_values : (k,); start
+    local : sequence of (b,); starts of the groups
+    soft_limit : residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s;
+        quadratic without it
+    smallest_gain : the iteration ends when a step lowers the cost by less than this share of it
+    damping : of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution
+    enough_rounds : the iteration ends after so many rounds, settled or not
 
-    Raises
-    ------
-    CalibrationError
-        The start has no meaning, the observations do not determine the parameters, or no end within 60 rounds.
+    Raises CalibrationError: the start has no meaning, the observations do not determine the parameters, or no end
+    within 60 rounds.
     """
     global_values, local = np.array(global_values, dtype=np.float64), [np.array(o, dtype=np.float64) for o in local]
     normal = _assembled(model, global_values, local, soft_limit)

@@ -88,26 +88,16 @@ class CalibrationOptions:
 
     Attributes
     ----------
-    refractions : {1, 2}
-        2: a glass plate of known thickness and index; the images in air are taken without the window. 1: a single
-        interface; the images in air are taken with the window in place, whose effect goes into the distortion.
-    poses : {"stage-normal", "stage", "free"}
-        As for `solve_camera`.
-    camera : CameraOptions
-    stripe : StripeOptions
-    correct_circles : bool
-        Take out the offset between a circle's image and the image of its centre.
-    margin_mm : float, optional
-        How far the plate reaches beyond its outermost points; half their spacing unless given.
-    medium_index : float, optional
-        Replaces the index of the medium of the step images.
-    same_water : bool
-        Jointly: whether scans were taken in the same water as the target, not only in one described alike.
-    sizes_known : bool
-        Jointly: whether diameters and spacings of what was scanned count as calibrated where their uncertainty is
-        stated; they are estimated otherwise.
-    bounds_mm : (low, high), optional
-        Window distances to search.
+    refractions : 2: a glass plate of known thickness and index; the images in air are taken without the window. 1: a
+        single interface; the images in air are taken with the window in place, whose effect goes into the distortion
+    poses : as for `solve_camera`
+    correct_circles : take out the offset between a circle's image and the image of its centre
+    margin_mm : how far the plate reaches beyond its outermost points; half their spacing unless given
+    medium_index : replaces the index of the medium of the step images
+    same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
+    sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
+        uncertainty is stated; they are estimated otherwise
+    bounds_mm : (low, high), optional; window distances to search
     """
 
     refractions: Literal[1, 2] = 2
@@ -128,17 +118,8 @@ class CalibrationResult:
 
     Attributes
     ----------
-    calibration : Calibration
-    air : AirEvidence
-    camera : CameraSolution
-    bias_px : list of (N, 2) or None
-        Offsets taken out of the circles' centres.
-    stripe_points : StripePoints
-    sheet : SheetSolution
-    steps : list of StepEvidence
-        Those used for the window, in the order of its figures.
-    window : WindowSolution or None
-    warnings : list of str
+    bias_px : list of (N, 2) or None; offsets taken out of the circles' centres
+    steps : those used for the window, in the order of its figures
     """
 
     calibration: Calibration
@@ -158,21 +139,12 @@ class Evidence:
 
     Attributes
     ----------
-    sensor : Sensor
-        As the captures of the target describe it.
-    medium_kind : str
-        Kind of the medium in which the target was seen.
-    stage_direction : (3,)
-        Nominal direction of the stage before the target, in the OCS.
-    approaching : bool or None
-        Whether the stage moves the sensor towards the target; None where that does not matter.
-    air : AirEvidence
-    plate : Window or None
-        Description of the camera's window before the step standard; None without step captures.
-    steps : list of StepEvidence
-    sources : dict
-        What the captures say of themselves, for the calibration's provenance.
-    warnings : list of str
+    sensor : as the captures of the target describe it
+    medium_kind : kind of the medium in which the target was seen
+    stage_direction : (3,); nominal direction of the stage before the target, in the OCS
+    approaching : whether the stage moves the sensor towards the target; None where that does not matter
+    plate : description of the camera's window before the step standard; None without step captures
+    sources : what the captures say of themselves, for the calibration's provenance
     """
 
     sensor: Sensor
@@ -197,15 +169,11 @@ def calibrate_sequentially(
 
     Parameters
     ----------
-    air : sequence of Capture
-        A target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
+    air : a target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
         the target, those with the laser on, at the same stage positions, the stripe on it. Seen through the window in
-        another medium, and without step captures, they give the calibration of a single viewpoint: refraction goes
-        into focal length and distortion.
-    steps : sequence of Capture
-        A step standard in the medium of use.
-    options : CalibrationOptions
-    progress : callable, optional
+        another medium, and without step captures, they give the calibration of a single viewpoint: refraction goes into
+        focal length and distortion.
+    steps : a step standard in the medium of use
 
     Raises
     ------

@@ -39,19 +39,12 @@ class SheetSolution:
 
     Attributes
     ----------
-    model : SheetModel
-    residuals_mm : (N,)
-        Signed distances of all points from the plane.
-    used : (N,) bool
-        The points that were not left out as outliers.
-    rms_mm, max_mm : float
-        Over the points used.
-    rejected_share : float
-        Share of the points left out.
-    normal_std_rad : float
-        Largest standard deviation of the normal's direction.
-    turn_rad : float
-        Angle between the normal and the nominal one.
+    residuals_mm : (N,); signed distances of all points from the plane
+    used : (N,) bool; the points that were not left out as outliers
+    rms_mm, max_mm : over the points used
+    rejected_share : share of the points left out
+    normal_std_rad : largest standard deviation of the normal's direction
+    turn_rad : angle between the normal and the nominal one
     """
 
     model: SheetModel
@@ -76,15 +69,11 @@ def points_on_target(
 
     Parameters
     ----------
-    camera : CameraModel
-    stripes : sequence of (N, 2)
-        Stripe pixels (u, v) of each image.
-    target_poses : (F, 4, 4)
-        ``T_camera_target`` of each image.
-    extent_mm : (V, 2)
-        Points of the target's plane (x, y) whose convex hull is known to be plate: a stripe outside lies elsewhere.
-    margin_mm : float
-        Widens the hull by so much.
+    stripes : sequence of (N, 2); stripe pixels (u, v) of each image
+    target_poses : (F, 4, 4); ``T_camera_target`` of each image
+    extent_mm : (V, 2); points of the target's plane (x, y) whose convex hull is known to be plate: a stripe outside
+        lies elsewhere
+    margin_mm : widens the hull by so much
 
     Raises
     ------
@@ -124,17 +113,12 @@ def fit_sheet(
 
     Parameters
     ----------
-    points_mm : (N, 3)
-        Camera frame.
-    nominal_normal : (3,)
-        Unit vector; the normal is turned to its side.
-    largest_rejected : float
-        Share of the points that may lie elsewhere.
+    points_mm : (N, 3); camera frame
+    nominal_normal : (3,); unit vector; the normal is turned to its side
+    largest_rejected : share of the points that may lie elsewhere
 
-    Raises
-    ------
-    CalibrationError
-        The points do not determine a plane, do not lie on one, or its normal is far from the nominal one.
+    Raises CalibrationError: the points do not determine a plane, do not lie on one, or its normal is far from the
+    nominal one.
     """
     try:
         robust = fit_robustly(lambda points: fit_plane(points, towards=nominal_normal), points_mm)
@@ -184,10 +168,8 @@ def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
     X is the sheet's normal, Z the laser's axis (3,), camera frame, made square to it, Y = Z x X; the origin is where
     the camera's axis meets the sheet.
 
-    Raises
-    ------
-    CalibrationError
-        The laser's axis runs along the normal, or the camera's axis does not meet the sheet in front of the camera.
+    Raises CalibrationError: the laser's axis runs along the normal, or the camera's axis does not meet the sheet in
+    front of the camera.
     """
     x = np.array(sheet.normal)
     z = laser_axis - (laser_axis @ x) * x

@@ -11,8 +11,6 @@ from uwlts.calibration.schur_least_squares import Observation
 from uwlts.model.errors import CalibrationError
 
 _FEWEST = 6
-
-
 _COLLINEAR = 1e-3
 
 
@@ -22,14 +20,10 @@ class TargetImage:
 
     Attributes
     ----------
-    points_mm : (N, 3)
-        In the target's frame, z = 0.
-    pixels : (N, 2)
-        Where they appear, (u, v).
-    stage_mm : float
-        Position of the stage that moves the sensor.
-    placement : int
-        Counts how often the target was put up anew: images of one placement differ by the stage's motion only.
+    points_mm : (N, 3); in the target's frame, z = 0
+    pixels : (N, 2); where they appear, (u, v)
+    stage_mm : position of the stage that moves the sensor
+    placement : counts how often the target was put up anew: images of one placement differ by the stage's motion only
     """
 
     points_mm: np.ndarray
@@ -68,15 +62,11 @@ class Placement:
 
     Attributes
     ----------
-    points_mm : (N, 3)
-        In the target's frame.
-    shifts_mm : (N,)
-        Stage position s - s0 of each point's image, s0 that of the first image.
+    points_mm : (N, 3); in the target's frame
+    shifts_mm : (N,); stage position s - s0 of each point's image, s0 that of the first image
     pixels : (N, 2)
-    image : (N,)
-        Number of each point's image.
-    along_z : float
-        +1 or -1: the stage moves the sensor roughly along +z or -z of the target.
+    image : (N,); number of each point's image
+    along_z : +1 or -1: the stage moves the sensor roughly along +z or -z of the target
     """
 
     points_mm: np.ndarray
@@ -129,10 +119,8 @@ def observe(
 
     Parameters
     ----------
-    global_values : (P,)
-        Camera parameters, as `Intrinsics` names them.
-    local : (6,) or (8,)
-        Rotation vector, translation in mm and, where the stage's direction is free, its tilt (a, b).
+    global_values : (P,); camera parameters, as `Intrinsics` names them
+    local : (6,) or (8,); rotation vector, translation in mm and, where the stage's direction is free, its tilt (a, b)
     """
     direction = placement.direction(local[6:])
     points = placement.displaced(direction)

@@ -26,16 +26,11 @@ class StepImage:
 
     Attributes
     ----------
-    pixels : (N, 2)
-        Stripe pixels (u, v).
-    height_mm : float
-        Calibrated height of the step.
-    medium_index : float
-        Refractive index of the medium relative to air.
-    labels : (N,)
-        `StepFace` of every pixel, from `label_step`.
-    reference : {"lower", "upper"}
-        The tread to which the line is fitted.
+    pixels : (N, 2); stripe pixels (u, v)
+    height_mm : calibrated height of the step
+    medium_index : refractive index of the medium relative to air
+    labels : (N,); `StepFace` of every pixel, from `label_step`
+    reference : the tread to which the line is fitted
     """
 
     pixels: np.ndarray
@@ -51,21 +46,15 @@ class WindowSolution:
 
     Attributes
     ----------
-    model : WindowModel
-    heights_mm, errors_mm, height_std_mm : (S,)
-        Height of the step in every image, its error, and its standard deviation from the scatter of the points.
-    slopes : (S,)
-        Change of each height with the distance.
-    std_mm : float or None
-        Standard deviation of the distance from the height errors left over; None with a single image.
-    scatter_std_mm : float
-        Standard deviation that the scatter of the points alone gives.
-    per_height : float
-        Shift of the distance per shift of the calibrated height, if all images use the same step.
-    image_distances_mm : (S,)
-        Distance that each image alone gives (thesis, Table 4); NaN where none within the bounds does.
-    curve_mm : (C, 2)
-        Tried distances and root mean square height error, NaN where a point cannot be reconstructed.
+    heights_mm, errors_mm, height_std_mm : (S,); height of the step in every image, its error, and its standard
+        deviation from the scatter of the points
+    slopes : (S,); change of each height with the distance
+    std_mm : standard deviation of the distance from the height errors left over; None with a single image
+    scatter_std_mm : standard deviation that the scatter of the points alone gives
+    per_height : shift of the distance per shift of the calibrated height, if all images use the same step
+    image_distances_mm : (S,); distance that each image alone gives (thesis, Table 4); NaN where none within the bounds
+        does.
+    curve_mm : (C, 2); tried distances and root mean square height error, NaN where a point cannot be reconstructed
     bounds_mm : (2,)
     """
 
@@ -103,10 +92,7 @@ def label_step(
 ) -> StepImage:
     """Tell the treads apart at the window's nominal distance, where the profile is true to a few percent.
 
-    Raises
-    ------
-    EvaluationError
-        The profile does not show two treads.
+    Raises EvaluationError: the profile does not show two treads.
     """
     points = step_profile(calibration, window, pixels, medium_index=medium_index)
     found = np.isfinite(points).all(axis=1)
@@ -128,13 +114,9 @@ def solve_window(
 
     Parameters
     ----------
-    calibration : Calibration
-        Camera, sheet and OCS from air; its window is not used.
-    window : WindowModel
-        The window at its nominal distance; everything but the distance stays.
-    steps : sequence of StepImage
-    bounds_mm : (low, high), optional
-        Distances to search; by default 0.2 to 2.5 times the nominal one.
+    calibration : camera, sheet and OCS from air; its window is not used
+    window : the window at its nominal distance; everything but the distance stays
+    bounds_mm : (low, high), optional; distances to search; by default 0.2 to 2.5 times the nominal one
 
     Raises
     ------

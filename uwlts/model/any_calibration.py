@@ -39,18 +39,12 @@ def check_fits(header: RecordingDescription, calibration: AnyCalibration, *, sou
 
     Parameters
     ----------
-    header : RecordingDescription
-        As a capture's header.
-    calibration : Calibration or PolynomialCalibration
-    source : str
-        Name of the recording for messages.
+    header : as a capture's header
+    source : name of the recording for messages
 
-    Raises
-    ------
-    CalibrationError
-        Image size or stripe orientation differ; the recording was made in water and the calibration has no window; or
-        the calibration is one by polynomials and the recording was made in another medium, or with the window on in one
-        and off in the other.
+    Raises CalibrationError: image size or stripe orientation differ; the recording was made in water and the
+    calibration has no window; or the calibration is one by polynomials and the recording was made in another medium, or
+    with the window on in one and off in the other.
     """
     camera = header.sensor.camera
     model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera

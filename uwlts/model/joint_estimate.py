@@ -64,21 +64,12 @@ class JointEstimate(_Stored):
     Attributes
     ----------
     parameters : (P,)
-    values, std, std_before : (P,)
-        In the parameters' units; ``std_before`` is None where nothing was known before.
+    values, std, std_before : (P,); in the parameters' units; ``std_before`` is None where nothing was known before.
     covariance : (P, P)
-    nominal_sheet : NominalSheet
-    scatter_px : dict
-        Standard deviation of every kind of residual.
-    shared_variance : dict
-        Of every kind, variance of a mean of many residuals over that of as many independent ones.
-    residual_count, outlier_count : int
-    rounds : int or None
-        Of the least squares.
-    stopped : str or None
-        Why it ended.
-    images : tuple of ImageFit
-    covered : tuple of CoveredRegion
+    scatter_px : standard deviation of every kind of residual
+    shared_variance : of every kind, variance of a mean of many residuals over that of as many independent ones
+    rounds : of the least squares
+    stopped : why it ended
     """
 
     parameters: tuple[ParameterInFile, ...]

@@ -15,17 +15,9 @@ from uwlts.optics.camera import directions
 from uwlts.targets import Target
 
 TILT_RAD = np.radians(25.0)
-
-
 _PLACES = (0.2, 0.5, 0.8)
-
-
 _DEPTHS = (0.1, 0.5, 0.9)
-
-
 _MARGIN_PX = 10.0
-
-
 # So many of a candidate's points stand for all of them: the others repeat what these tell.
 _SAMPLE = 100
 
@@ -79,10 +71,8 @@ def candidates(
 
     Parameters
     ----------
-    range_mm : (nearest, farthest)
-        Distances along the camera's axis.
-    spin_rad : float
-        How the target is turned in the image, from its x axis to the image's.
+    range_mm : (nearest, farthest); distances along the camera's axis
+    spin_rad : how the target is turned in the image, from its x axis to the image's
     """
     points, middle = target.points_mm, target_middle(target)
     step = max(1, len(points) // _SAMPLE)
@@ -121,8 +111,6 @@ def _seen(points: np.ndarray, pose: np.ndarray, camera: CameraModel) -> np.ndarr
 
 
 _LONG_SIDE_CELLS = 8
-
-
 _POINTS_IN_CELL = 3
 
 
@@ -132,10 +120,8 @@ class Coverage:
 
     Attributes
     ----------
-    counts : (rows, columns)
-        Points in each cell.
-    width_px, height_px : int
-        Size of the image.
+    counts : (rows, columns); points in each cell
+    width_px, height_px : size of the image
     """
 
     counts: np.ndarray

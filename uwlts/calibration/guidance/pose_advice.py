@@ -46,14 +46,10 @@ class Wanted:
 
     Attributes
     ----------
-    focal_std_px, centre_std_px : float
-        Standard deviations of the focal length and of the principal point.
-    coverage : float
-        Share of the image's cells in which points were seen.
-    tilt_rad : float
-        Free poses: each of the target's four sides was once farther by as much. A scatter of pixels does not need
-        that, but a plate that is not quite flat, or not quite as described, then shows.
-    fewest_images : int
+    focal_std_px, centre_std_px : standard deviations of the focal length and of the principal point
+    coverage : share of the image's cells in which points were seen
+    tilt_rad : free poses: each of the target's four sides was once farther by as much. A scatter of pixels does not
+        need that, but a plate that is not quite flat, or not quite as described, then shows.
     """
 
     focal_std_px: float = 0.5
@@ -69,21 +65,11 @@ class State:
 
     Attributes
     ----------
-    setting : Setting
-    wanted : Wanted
-    recorded : tuple of RecordedPose
-    camera : CameraModel
-        As far as it is known.
-    solution : CameraSolution or None
-        None as long as the poses do not determine it.
-    undetermined : str
-        Why not.
-    poses : (F, 4, 4)
-        ``T_camera_target`` of the recorded poses.
-    coverage : Coverage
-    spread : Spread or None
-    information : (P, P)
-        What is known of the camera's parameters, of the description alone at first.
+    camera : as far as it is known
+    solution : None as long as the poses do not determine it
+    undetermined : why not
+    poses : (F, 4, 4); ``T_camera_target`` of the recorded poses
+    information : (P, P); what is known of the camera's parameters, of the description alone at first
     """
 
     setting: Setting
@@ -131,10 +117,7 @@ class PoseAdvice:
 def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted = Wanted()) -> State:
     """How far the recorded poses lead.
 
-    Raises
-    ------
-    CalibrationError
-        No pose of the target explains one of its images.
+    Raises CalibrationError: no pose of the target explains one of its images.
     """
     solution, undetermined = None, "no image yet"
     camera = nominal_camera(setting)

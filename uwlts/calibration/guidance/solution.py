@@ -66,10 +66,7 @@ def nominal_camera(setting: Setting) -> CameraModel:
 def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
     """``T_camera_target`` (4, 4) of a view by a known camera.
 
-    Raises
-    ------
-    CalibrationError
-        No pose explains the points.
+    Raises CalibrationError: no pose explains the points.
     """
     found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
     if not found or not np.isfinite(translation).all():

@@ -24,8 +24,6 @@ from uwlts.model.parameter_keys import (
 from uwlts.model.sensor import Sensor, Uncertainty
 
 _ALIGNMENT = "stage_direction in the captures, or uncertainty.stage_alignment_deg"
-
-
 _CHECK: dict[SingleParameter, str] = {
     WindowParameter.DISTANCE: "camera.window.distance_mm or uncertainty.window_distance_mm",
     WindowParameter.SLOPE_X: "the window's tilts or uncertainty.window_tilt_deg",
@@ -66,38 +64,18 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
 
 _LARGEST_TARGET_PX, _LARGEST_STRIPE_PX = 0.5, 1.0
 """Scatter beyond which target points or stripes were misdetected or contradict each other, whatever the image."""
-
-
 _FEWEST_VALUES = 20
-
-
 _OVER_OTHERS, _OVER_OTHERS_PX = 3.0, 0.15
-
-
 _OVER_NOISE = 2.5
-
-
 _WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
 """Lines that err together; the filter that finds the stripe, and speckle, join two to four."""
-
-
 _OUTLIER_SHARE = 0.2
-
-
 _DOUBTFUL, _WRONG = 4.0, 6.0
 """Standard uncertainties from what was known before. Those of drawings are guesses, so few are but doubtful."""
-
-
 _FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
 """Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
-
-
 _POSITIONS_WRONG = 3.0
-
-
 _FEWEST_POSITIONS = 4
-
-
 _MOST_NAMED, _MOST_SAID = 4, 6
 
 
@@ -137,13 +115,9 @@ def findings(
 
     Parameters
     ----------
-    result : Estimate
-    evidence : sequence
-        What it was made from.
-    sources : sequence of mapping
-        For every piece of evidence the names of its images by their numbers: capture and frame.
-    sensor : Sensor
-        As described.
+    evidence : what it was made from
+    sources : for every piece of evidence the names of its images by their numbers: capture and frame
+    sensor : as described
     """
     images = [
         _image(residuals, piece, names[residuals.image])

@@ -11,15 +11,9 @@ from uwlts.optics.camera import directions
 from uwlts.optics.sheet import behind_window_mm, fan_distances, sheet_surface
 
 LENS = tuple(key for key in LensParameter if key is not LensParameter.F)
-
-
 WINDOW = tuple(WindowParameter)
-
-
 COLUMNS = ("u", "v", *LENS, *WINDOW, "medium_index")
 """By what rays are differentiated."""
-
-
 _INNER = 8
 """Ideal image coordinates x and y, five numbers of the window, the medium's index."""
 
@@ -30,10 +24,8 @@ class RayDerivatives:
 
     Attributes
     ----------
-    origins, directions : (3, N)
-        Directions of length one.
-    origins_by, directions_by : (C, 3, N)
-        By the `COLUMNS`.
+    origins, directions : (3, N); directions of length one
+    origins_by, directions_by : (C, 3, N); by the `COLUMNS`
     """
 
     origins: np.ndarray
@@ -176,12 +168,9 @@ class DescribedSheet:
 
     Attributes
     ----------
-    normal, axis : (3,)
-        The sheet's normal in air; the laser's axis, square to it.
-    middle_mm : (3,)
-        Point of the sheet about which it turns.
-    apex_mm, pivot_mm : (3,)
-        Where the fan begins, and where it leaves the laser's window.
+    normal, axis : (3,); the sheet's normal in air; the laser's axis, square to it
+    middle_mm : (3,); point of the sheet about which it turns
+    apex_mm, pivot_mm : (3,); where the fan begins, and where it leaves the laser's window
     """
 
     normal: np.ndarray

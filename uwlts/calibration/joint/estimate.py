@@ -38,20 +38,13 @@ class Estimate:
 
     Attributes
     ----------
-    parameters : Parameters
     values : (P,)
     covariance : (P, P)
-    local : list of (b,)
-        Of every piece of evidence.
-    noise : dict
-        Of every kind of residual.
-    residuals : list of list of Residuals
-        Of every piece of evidence, outliers included.
-    outliers : int
-        Residuals left out.
-    rounds : int
-        Of the least squares, summed over all weightings.
-    stopped : str
+    local : list of (b,); of every piece of evidence
+    noise : of every kind of residual
+    residuals : of every piece of evidence, outliers included
+    outliers : residuals left out
+    rounds : of the least squares, summed over all weightings
     """
 
     parameters: Parameters
@@ -84,17 +77,13 @@ def estimate(
 
     Parameters
     ----------
-    global_values : (P,)
-        Start.
-    local : sequence of (b,)
-        Starts of the evidence's local parameters.
-    correct : callable, optional
-        Evidence as found, global and local parameters to the evidence without what is known to bias it there.
+    global_values : (P,); start
+    local : sequence of (b,); starts of the evidence's local parameters
+    correct : callable, optional; evidence as found, global and local parameters to the evidence without what is known
+        to bias it there
 
-    Raises
-    ------
-    CalibrationError
-        The start has no meaning, the evidence does not determine the parameters, or corrections do not settle.
+    Raises CalibrationError: the start has no meaning, the evidence does not determine the parameters, or corrections do
+    not settle.
     """
     problem = _Problem(parameters, uncertainty)
     found, local, rounds = list(evidence), list(local), 0

@@ -20,16 +20,11 @@ class Residuals:
 
     Attributes
     ----------
-    kind : str
-    values : (n,)
-        Of the target's points both coordinates in turn.
+    values : (n,); of the target's points both coordinates in turn
     by_global : (n, P)
-    by_local : (n, c)
-        By those of the evidence's local parameters that matter in this image.
-    local_columns : (c,)
-        Which of them these are.
-    image : int
-        Number of the image.
+    by_local : (n, c); by those of the evidence's local parameters that matter in this image
+    local_columns : (c,); which of them these are
+    image : number of the image
     """
 
     kind: str
@@ -49,25 +44,17 @@ class TargetEvidence:
 
     Attributes
     ----------
-    view : View
-    placement : Placement
-        The target's points as found.
+    placement : the target's points as found
     stripe_pixels : (M, 2)
-    stripe_image : (M,)
-        Number of each stripe pixel's image.
-    stripe_shifts_mm : (M,)
-        Stage position of each, from that of the first image.
-    across : {0, 1}
-        The coordinate of the pixel that runs across the stripe.
-    staged : bool
-        Whether the images are joined by the stage's motion.
-    radius_mm : float
-        Largest distance of a point of the target from its middle; there the target's bow is given.
+    stripe_image : (M,); number of each stripe pixel's image
+    stripe_shifts_mm : (M,); stage position of each, from that of the first image
+    across : {0, 1}; the coordinate of the pixel that runs across the stripe
+    staged : whether the images are joined by the stage's motion
+    radius_mm : largest distance of a point of the target from its middle; there the target's bow is given
     middle_mm : (2,)
-    predicted : (N, 2), optional
-        Pixels near those predicted of the target's points, where rays are taken; as found unless given.
-    stripe_predicted : (M, 2), optional
-        The same of the stripe.
+    predicted : (N, 2), optional; pixels near those predicted of the target's points, where rays are taken; as found
+        unless given
+    stripe_predicted : (M, 2), optional; the same of the stripe
     """
 
     view: View
@@ -279,20 +266,14 @@ class StepProfileEvidence:
 
     Attributes
     ----------
-    view : View
     pixels : (N, 2)
-    upper : (N,) bool
-        Which of them lie on the upper tread.
-    upward, along : (3,)
-        Unit vectors of the camera frame: away from the sensor turned round, that is from the lower tread to the upper
-        one, and along the stripe.
+    upper : (N,) bool; which of them lie on the upper tread
+    upward, along : (3,); unit vectors of the camera frame: away from the sensor turned round, that is from the lower
+        tread to the upper one, and along the stripe
     across : {0, 1}
-    height : StepHeight
-        The global parameter.
-    image : int
-        Number of the image among all of steps.
-    predicted : (N, 2), optional
-        Pixels near those predicted, where rays are taken; as found unless given.
+    height : the global parameter
+    image : number of the image among all of steps
+    predicted : (N, 2), optional; pixels near those predicted, where rays are taken; as found unless given
     """
 
     view: View

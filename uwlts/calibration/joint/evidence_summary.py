@@ -23,13 +23,9 @@ def joint_estimate(
 
     Parameters
     ----------
-    result : Estimate
-    evidence : sequence
-        What it was made from.
-    sources : sequence of mapping
-        For every piece of evidence the names of its images by their numbers.
-    object_frame : (4, 4)
-        ``T_camera_object`` of the OCS.
+    evidence : what it was made from
+    sources : for every piece of evidence the names of its images by their numbers
+    object_frame : (4, 4); ``T_camera_object`` of the OCS
     """
     images = []
     lit: dict[View, list[np.ndarray]] = {}

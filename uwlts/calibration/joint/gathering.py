@@ -35,12 +35,8 @@ class Series:
 
     Attributes
     ----------
-    view : View
-    found : AirEvidence
-    approaching : bool or None
-        Whether the stage moves the sensor towards the target; None where it moves otherwise.
-    names : list of str
-        Of the captures.
+    approaching : whether the stage moves the sensor towards the target; None where it moves otherwise
+    names : of the captures
     """
 
     view: View
@@ -61,16 +57,10 @@ class Gathered:
 
     Attributes
     ----------
-    sensor : Sensor
-        As the first capture describes it, with the window as mounted in the medium of use.
-    media : dict
-        Media other than air by their names.
-    series : list of Series
-        Target images, by what they were seen through.
+    sensor : as the first capture describes it, with the window as mounted in the medium of use
+    media : media other than air by their names
+    series : target images, by what they were seen through
     steps : list of (StepEvidence, View)
-    scans : list of ScanStripes
-    provenance : dict
-    warnings : list of str
     """
 
     sensor: Sensor
@@ -207,14 +197,10 @@ def priors_of(
 
     Parameters
     ----------
-    window : WindowModel or None
-        As described.
-    indices : list of float
-        Of the media, as described.
-    turns : (3,)
-        Where the sheet's turns and shift start.
-    heights : dict
-        Of the step standards.
+    window : as described
+    indices : of the media, as described
+    turns : (3,); where the sheet's turns and shift start
+    heights : of the step standards
     """
     sensor, known = gathered.sensor, gathered.sensor.uncertainty
     priors: dict[ParameterKey, Prior] = {}

@@ -27,8 +27,6 @@ from uwlts.optics.window import trace_window
 
 _LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3
 """Pixels, or a share of the focal length: what the stage's errors leave in the images that a start is found from."""
-
-
 # As robust as a median can be; what is left out here is judged again with the final sheet.
 _LARGEST_REJECTED = 0.45
 
@@ -108,10 +106,7 @@ def sheet_start(
 
     None where no stripe falls on the target.
 
-    Raises
-    ------
-    CalibrationError
-        The stripes do not lie on a plane, or do not determine one.
+    Raises CalibrationError: the stripes do not lie on a plane, or do not determine one.
     """
     views = {e.view for e in start.evidence if len(e.stripe_pixels)}
     if not views:

@@ -96,10 +96,7 @@ def surface_scan(
 ) -> tuple[SurfaceScanEvidence, np.ndarray]:
     """Evidence and the start of its local parameters, by a calibration nearly as sought.
 
-    Raises
-    ------
-    EvaluationError
-        The points do not show what was scanned.
+    Raises EvaluationError: the points do not show what was scanned.
     """
     along_width = start.stripe_along == "width"
     pixels = np.stack((stripes.line, stripes.centre_px) if along_width else (stripes.centre_px, stripes.line), axis=1)
@@ -154,10 +151,7 @@ def surface_scans(
 ) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
     """Evidence of every scan with the start of its local parameters, and warnings about scans left out.
 
-    Raises
-    ------
-    CalibrationError
-        The scans move along different directions.
+    Raises CalibrationError: the scans move along different directions.
     """
     found, warnings, image = [], [], 0
     if any(not np.allclose(scan.stage_direction, scans[0].stage_direction) for scan in scans):
@@ -190,10 +184,7 @@ def _surface(
     local : (k,)
         Start of its local parameters.
 
-    Raises
-    ------
-    EvaluationError
-        The points do not show what was scanned.
+    Raises EvaluationError: the points do not show what was scanned.
     """
     rotation = transform[:3, :3]
 

@@ -30,17 +30,9 @@ from uwlts.optics.sheet import sheet_surface
 from uwlts.targets import Target, parse_target
 
 _FEWEST_POINTS, _FEWEST_LINES = 20, 20
-
-
 _SAMPLES = 400
-
-
 STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
-
-
 SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
-
-
 _SEEN = np.radians(60)
 """A sphere is seen this far round from the side that faces the sensor."""
 
@@ -246,11 +238,7 @@ def _across(calibration: Calibration) -> int:
 
 
 _TILT_DEG = 20.0
-
-
 _PLACES = {"near": 0.05, "in the middle": 0.5, "far": 0.95}
-
-
 _TILTS = {
     "square": (0.0, 0.0),
     "left edge nearer": (0.0, -1.0),
@@ -259,8 +247,6 @@ _TILTS = {
     "lower edge nearer": (-1.0, 0.0),
 }
 """Turns about the camera's x and y axes."""
-
-
 _WORTH = 0.95
 
 
@@ -270,14 +256,9 @@ class Outlook:
 
     Attributes
     ----------
-    words : str
-    before_mm, after_mm : float
-        Standard uncertainty of lengths over the volume (root mean square), without and with it.
-    covariance : (P, P)
-        Of the parameters with it.
-    view : View
-    pose : (4, 4), optional
-        ``T_camera_target`` of a target.
+    before_mm, after_mm : standard uncertainty of lengths over the volume (root mean square), without and with it
+    covariance : (P, P); of the parameters with it
+    pose : (4, 4), optional; ``T_camera_target`` of a target
     """
 
     words: str
@@ -307,10 +288,7 @@ class _Candidate:
 def next_shots(calibration: Calibration) -> list[Outlook]:
     """Further shots, the most helpful one first; none where the evidence covers no area.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration holds no joint estimate, or a damaged one.
+    Raises CalibrationError: the calibration holds no joint estimate, or a damaged one.
     """
     region = next(iter(regions(calibration)), None)
     if region is None or not region.has_area():

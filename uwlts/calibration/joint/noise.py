@@ -25,13 +25,10 @@ class Noise:
 
     Attributes
     ----------
-    sigma_px : float
-        Standard deviation of one residual, without outliers.
-    together : float
-        Variance of a mean of many over that of as many independent ones: neighbours along a stripe, or images of the
-        same point of the target, err together.
-    besides : float
-        What to add to that for errors that the residuals do not show.
+    sigma_px : standard deviation of one residual, without outliers
+    together : variance of a mean of many over that of as many independent ones: neighbours along a stripe, or images of
+        the same point of the target, err together
+    besides : what to add to that for errors that the residuals do not show
     """
 
     sigma_px: float

@@ -16,12 +16,8 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project_through_window
 
 _ROWS, _COLUMNS = 7, 9
-
-
 _INSET = 0.02
 """Share of the depth left out at either end, where an outline may come to a point."""
-
-
 _LEAST_MM = 1.0
 
 
@@ -31,17 +27,11 @@ class Region:
 
     Attributes
     ----------
-    name : str
-        Of the medium.
-    medium : Medium
-    view : View
-        Through what it was seen.
-    outline_mm : (K, 2)
-        Convex, Y and Z in the OCS.
-    camera_depth_mm : (2,)
-        Nearest and farthest depth along the camera's axis, from its entrance pupil.
-    points : int
-        Stripe pixels in it.
+    name : of the medium
+    view : through what it was seen
+    outline_mm : (K, 2); convex, Y and Z in the OCS
+    camera_depth_mm : (2,); nearest and farthest depth along the camera's axis, from its entrance pupil
+    points : stripe pixels in it
     """
 
     name: str
@@ -80,11 +70,9 @@ class SheetPoints:
 
     Attributes
     ----------
-    at_mm : (N, 2)
-        Y and Z.
+    at_mm : (N, 2); Y and Z
     by_parameters : (N, 3, P)
-    by_px : (N, 3)
-        For one pixel across the stripe.
+    by_px : (N, 3); for one pixel across the stripe
     """
 
     at_mm: np.ndarray
@@ -98,12 +86,10 @@ class Lengths:
 
     Attributes
     ----------
-    ends_mm : (M, 2, 2)
-        Y and Z of both ends.
+    ends_mm : (M, 2, 2); Y and Z of both ends
     length_mm : (M,)
     by_parameters : (M, P)
-    by_px : (M,)
-        For a pixel's noise at each end, independent of the other's.
+    by_px : (M,); for a pixel's noise at each end, independent of the other's
     """
 
     ends_mm: np.ndarray
@@ -145,10 +131,7 @@ def estimate_in(calibration: Calibration, region: Region) -> StoredEstimate:
 def points_at(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray) -> SheetPoints:
     """Points of the sheet at Y and Z (N, 2) of the OCS, with their derivatives.
 
-    Raises
-    ------
-    CalibrationError
-        The camera does not see one of them.
+    Raises CalibrationError: the camera does not see one of them.
     """
     transform = calibration.object_transform()
     pixels = pixels_at(calibration, known, at_mm)
@@ -198,25 +181,13 @@ def lengths_over(calibration: Calibration, known: StoredEstimate, region: Region
 
 
 _MOST = 3
-
-
 _LEAST_SHARE = 0.1
 """Of the variance of all lengths; a direction that adds less is not worth a word."""
-
-
 _NAMED_SHARE = 0.4
-
-
 _CAUSE_SHARE = 0.3
-
-
 _CONFUSED = 0.3
 """Smallest eigenvalue of the correlation of two parameters or more that can no longer be told apart: 0.7 for two."""
-
-
 _NEGLIGIBLE_MM = 1e-3
-
-
 _AXIS_COSINE = 0.9
 
 
@@ -226,18 +197,12 @@ class Weakness:
 
     Attributes
     ----------
-    parameters : tuple of ParameterKey
-        Those that make it up, the most important first.
-    confused : bool
-        Whether the evidence cannot tell them apart, rather than knows each too little.
-    cost_mm : float
-        Standard uncertainty that it adds to the length that it changes most.
-    length_mm : float
-        That length.
-    along : str
-        Which way it runs: "Y", "Z" or "Y and Z".
-    depth_mm : float
-        Largest depth Z of its ends, OCS.
+    parameters : those that make it up, the most important first
+    confused : whether the evidence cannot tell them apart, rather than knows each too little
+    cost_mm : standard uncertainty that it adds to the length that it changes most
+    length_mm : that length
+    along : which way it runs: "Y", "Z" or "Y and Z"
+    depth_mm : largest depth Z of its ends, OCS
     """
 
     parameters: tuple[ParameterKey, ...]
@@ -264,9 +229,7 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
 
     Parameters
     ----------
-    lengths : Lengths
-        Over the volume.
-    keys : sequence of ParameterKey
+    lengths : over the volume
     covariance : (P, P)
     """
     std = np.sqrt(np.diag(covariance))

@@ -29,8 +29,8 @@ class EarlierEstimate:
     ----------
     values : (K,)
     covariance : (K, K)
-    whitening : (K, K)
-        W with W^T W the inverse of the covariance: W (x - values) are K residuals of variance one, independent.
+    whitening : (K, K); W with W^T W the inverse of the covariance: W (x - values) are K residuals of variance one,
+        independent
 
     Raises
     ------
@@ -93,17 +93,11 @@ class Parameters:
 
     Attributes
     ----------
-    intrinsics : Intrinsics
-    sheet : DescribedSheet
-        The sheet as described.
-    window : WindowModel or None
-        The window as described; None where nothing is seen through it.
-    media : tuple of str
-        Names of the media other than air.
-    priors : dict
-        `Prior` of every parameter but the lens's, in the order of the vector, which lacks those that are held.
-    earlier : EarlierEstimate, optional
-        What an earlier calibration says of the first parameters of the vector, besides the priors.
+    sheet : the sheet as described
+    window : the window as described; None where nothing is seen through it
+    media : names of the media other than air
+    priors : `Prior` of every parameter but the lens's, in the order of the vector, which lacks those that are held
+    earlier : what an earlier calibration says of the first parameters of the vector, besides the priors
     """
 
     intrinsics: Intrinsics

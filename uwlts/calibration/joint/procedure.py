@@ -35,18 +35,10 @@ class JointProblem:
 
     Attributes
     ----------
-    parameters : Parameters
-    evidence : list
-    global_values : (P,)
-        Start.
-    local : list of (b,)
-        Starts of the evidence's local parameters.
-    uncertainty : Uncertainty
-    diameter_mm : float or None
-        Of the target's circles, whose images are to be corrected; None where nothing is.
-    sources : list of dict
-        For every piece of evidence the names of its images by their numbers.
-    warnings : list of str
+    global_values : (P,); start
+    local : list of (b,); starts of the evidence's local parameters
+    diameter_mm : of the target's circles, whose images are to be corrected; None where nothing is
+    sources : for every piece of evidence the names of its images by their numbers
     """
 
     parameters: Parameters
@@ -72,14 +64,7 @@ class JointProblem:
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """A joint calibration with what a report shows of its making.
-
-    Attributes
-    ----------
-    calibration : Calibration
-    estimate : Estimate
-    warnings : list of str
-    """
+    """A joint calibration with what a report shows of its making."""
 
     calibration: Calibration
     estimate: Estimate
@@ -98,17 +83,12 @@ def calibrate_jointly(
 
     Parameters
     ----------
-    targets : sequence of Capture
-        A target in air or in a medium, with or without the camera's window, as each capture says; each capture is a
-        placement of its own, unless the poses are free. With the laser on at the same stage positions they show the
+    targets : a target in air or in a medium, with or without the camera's window, as each capture says; each capture is
+        a placement of its own, unless the poses are free. With the laser on at the same stage positions they show the
         sheet too.
-    steps : sequence of Capture
-        A step standard in a medium.
-    scans : sequence of Capture
-        Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
-    options : CalibrationOptions
-        Its ``refractions`` do not count: windows are plates as described.
-    progress : callable, optional
+    steps : a step standard in a medium
+    scans : scans of spheres, a plane or a pipe that stand still while the stage moves the sensor
+    options : its ``refractions`` do not count: windows are plates as described
 
     Raises
     ------

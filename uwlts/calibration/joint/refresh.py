@@ -35,11 +35,8 @@ class LengthChange:
 
     Attributes
     ----------
-    length_mm : float
-    before_mm, after_mm : float
-        Standard uncertainty by the calibration.
-    longer_mm : float
-        By how much it is measured longer than by what was known before.
+    before_mm, after_mm : standard uncertainty by the calibration
+    longer_mm : by how much it is measured longer than by what was known before
     """
 
     length_mm: float
@@ -80,9 +77,7 @@ def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChang
 
     Parameters
     ----------
-    calibration : Calibration
-        That of the estimate.
-    result : Estimate
+    calibration : that of the estimate
     """
     parameters, earlier = result.parameters, result.parameters.earlier
     if earlier is None:
@@ -225,12 +220,8 @@ def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -
 
 
 _AIR = Medium(kind="air")
-
-
 _ANY_INDEX = 0.02
 """Standard uncertainty of the index of a liquid of which nothing is known."""
-
-
 _TELLING = 4.0
 """Standard uncertainties by which steps must contradict an index to be told as doing so."""
 
@@ -241,10 +232,7 @@ class Refreshed:
 
     Attributes
     ----------
-    calibration : Calibration
-    changes : list of WaterChange
-        One for each new water.
-    warnings : list of str
+    changes : one for each new water
     """
 
     calibration: Calibration
@@ -264,16 +252,11 @@ def refresh(
 
     Parameters
     ----------
-    calibration : Calibration
-        All that it found, correlations included, is what is known before.
-    steps : sequence of Capture
-        A step standard in water of another day. The index of that is a parameter of its own, even where water that is
-        described alike was calibrated in.
-    options : CalibrationOptions
-        Of these ``stripe`` and ``medium_index`` count.
-    index_std : float, optional
-        How well the new water's index is known before, in place of what follows from the sensor's description.
-    progress : callable, optional
+    calibration : all that it found, correlations included, is what is known before
+    steps : a step standard in water of another day. The index of that is a parameter of its own, even where water that
+        is described alike was calibrated in.
+    options : of these ``stripe`` and ``medium_index`` count
+    index_std : how well the new water's index is known before, in place of what follows from the sensor's description
 
     Raises
     ------

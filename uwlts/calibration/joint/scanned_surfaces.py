@@ -19,12 +19,9 @@ class Distances:
 
     Attributes
     ----------
-    values_mm : (N,)
-        Signed, positive on the side of the normals.
-    outward : (3, N)
-        Unit normals, the derivatives by the points.
-    by_local : (N, k)
-        Derivatives by the surface's local parameters.
+    values_mm : (N,); signed, positive on the side of the normals
+    outward : (3, N); unit normals, the derivatives by the points
+    by_local : (N, k); derivatives by the surface's local parameters
     """
 
     values_mm: np.ndarray
@@ -64,12 +61,9 @@ class Spheres(Surface):
 
     Attributes
     ----------
-    diameters_mm, diameter_std_mm : (S,)
-        As known before; the standard uncertainty is infinite for unknown ones.
-    spacings_mm, spacing_std_mm : (S - 1,)
-        Distances of consecutive centres, likewise.
-    sphere : (N,) int
-        On which of them each pixel of the scan lies.
+    diameters_mm, diameter_std_mm : (S,); as known before; the standard uncertainty is infinite for unknown ones
+    spacings_mm, spacing_std_mm : (S - 1,); distances of consecutive centres, likewise
+    sphere : (N,) int; on which of them each pixel of the scan lies
     """
 
     kind: ClassVar[str] = "stripe on the spheres"
@@ -118,10 +112,8 @@ class Plane(Surface):
 
     Attributes
     ----------
-    point_mm, normal : (3,)
-        Of the plane nearby; the distance is that from the point.
-    across : (2, 3)
-        Unit vectors across the normal and each other, towards which the slopes lean.
+    point_mm, normal : (3,); of the plane nearby; the distance is that from the point
+    across : (2, 3); unit vectors across the normal and each other, towards which the slopes lean
     """
 
     kind: ClassVar[str] = "stripe on the plane"
@@ -149,12 +141,9 @@ class Cylinder(Surface):
 
     Attributes
     ----------
-    point_mm, axis : (3,)
-        Of the axis nearby.
-    across : (2, 3)
-        Unit vectors across the axis and each other, along which it shifts and leans.
-    diameter_mm, diameter_std_mm : float
-        As known before; the standard uncertainty is infinite for an unknown one.
+    point_mm, axis : (3,); of the axis nearby
+    across : (2, 3); unit vectors across the axis and each other, along which it shifts and leans
+    diameter_mm, diameter_std_mm : as known before; the standard uncertainty is infinite for an unknown one
     """
 
     kind: ClassVar[str] = "stripe on the pipe"
@@ -198,8 +187,6 @@ def leaning(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tu
 
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
 """How far the stage's direction leans from the one described, towards two directions across it."""
-
-
 # Where the ray's crossing with the sheet moves almost along the surface, a residual in px would be out of all bounds.
 _LEAST_SHARE = 0.4
 
@@ -213,26 +200,18 @@ class SurfaceScanEvidence:
 
     Attributes
     ----------
-    view : View
     pixels : (N, 2)
-    beside_mm : (3, N)
-        From the sheet's middle to where their light comes from, camera frame; see `uwlts.optics.brightness`.
-    surface : Surface
-        On which they lie.
-    frame : (N,) int
-        In which image each lies, from 0.
-    stage_mm : (F,)
-        Positions of the stage.
-    direction, across_stage : (3,), (2, 3)
-        In which growing positions move the sensor as described, and two directions across, orthonormal, camera frame.
-    across : {0, 1}
-        The coordinate of the pixel that runs across the stripe.
-    image : int
-        Number of the scan's first image among all of scans.
-    source : str
-        Name of the capture.
-    predicted : (N, 2), optional
-        Pixels near those predicted, where rays are taken; as found unless given.
+    beside_mm : (3, N); from the sheet's middle to where their light comes from, camera frame; see
+        `uwlts.optics.brightness`
+    surface : on which they lie
+    frame : (N,) int; in which image each lies, from 0
+    stage_mm : (F,); positions of the stage
+    direction, across_stage : (3,), (2, 3); in which growing positions move the sensor as described, and two directions
+        across, orthonormal, camera frame
+    across : {0, 1}; the coordinate of the pixel that runs across the stripe
+    image : number of the scan's first image among all of scans
+    source : name of the capture
+    predicted : (N, 2), optional; pixels near those predicted, where rays are taken; as found unless given
     """
 
     view: View

@@ -37,10 +37,7 @@ def stored_estimate(calibration: Calibration, sensor: Sensor, medium: Medium) ->
     In a medium that was calibrated in, its index may have drifted since. In another, the index is as known from the
     medium, independent of all else.
 
-    Raises
-    ------
-    CalibrationError
-        The calibration holds no joint estimate, or a damaged one.
+    Raises CalibrationError: the calibration holds no joint estimate, or a damaged one.
     """
     return _read(calibration, medium, mounted=sensor.camera.window.mounted, uncertainty=sensor.uncertainty)
 

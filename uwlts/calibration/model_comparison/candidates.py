@@ -25,16 +25,11 @@ class Candidate:
 
     Attributes
     ----------
-    refractions : {1, 2}
-        By the camera's window: one interface, or a glass plate.
-    window_tilt : bool
-        Whether the tilt of the camera's window is free.
-    bow : bool
-        Whether the sheet's bow is free.
-    window_turn : bool
-        Whether the turn of the laser's window is free.
-    distortion : tuple of str
-        Coefficients that are free; the others are zero.
+    refractions : by the camera's window: one interface, or a glass plate
+    window_tilt : whether the tilt of the camera's window is free
+    bow : whether the sheet's bow is free
+    window_turn : whether the turn of the laser's window is free
+    distortion : coefficients that are free; the others are zero
     """
 
     refractions: Literal[1, 2] = 2

@@ -35,13 +35,9 @@ class Choice:
 
     Attributes
     ----------
-    judged : list of Judged
-    ways : dict
-        `Split` by its name.
-    predictions : dict
-        Of the models that have scores, by the way of holding out.
-    tallies : dict
-        For each way of holding out, of those models in their order.
+    ways : `Split` by its name
+    predictions : of the models that have scores, by the way of holding out
+    tallies : for each way of holding out, of those models in their order
     """
 
     judged: list[Judged]
@@ -96,10 +92,7 @@ def choose(
 ) -> Choice:
     """Compare models on the evidence of a joint problem: the usual one, what differs by one thing, and the simplest.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images, or the usual model cannot be calibrated without those held out.
+    Raises CalibrationError: there are too few images, or the usual model cannot be calibrated without those held out.
     """
     ways, usual = splits(problem), Candidate()
     dimensions = dimensions_of(problem.parameters)
@@ -197,14 +190,10 @@ def compare_models(
 
     Parameters
     ----------
-    targets, steps : sequence of Capture
-        As `calibrate_jointly`.
-    options : CalibrationOptions
-        Its distortion and its refractions do not count: the models are compared in them.
-    workers : int, optional
-        Processes; as many as there are processors unless given.
-    searched, progress : callable, optional
-        Told of images searched, and of models calibrated.
+    targets, steps : as `calibrate_jointly`
+    options : its distortion and its refractions do not count: the models are compared in them
+    workers : processes; as many as there are processors unless given
+    searched, progress : callable, optional; told of images searched, and of models calibrated
 
     Raises
     ------

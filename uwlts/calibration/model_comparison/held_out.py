@@ -39,10 +39,7 @@ def splits(problem: JointProblem) -> list[Split]:
 
     Every fourth image is held out, or those in the outer sixths of where stripes lie. Images without a stripe are not.
 
-    Raises
-    ------
-    CalibrationError
-        There are too few images.
+    Raises CalibrationError: there are too few images.
     """
     inside: set[Image] = set()
     outside: set[Image] = set()
@@ -165,10 +162,8 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
     the errors of whose positions are the others' mean. Else the pose is fitted to the target's points, or the line of
     the lower tread to the stripe on a step: nothing of the calibration is.
 
-    Raises
-    ------
-    CalibrationError
-        The other images do not determine the model or do not fit it, or a ray of the images held out meets nothing.
+    Raises CalibrationError: the other images do not determine the model or do not fit it, or a ray of the images held
+    out meets nothing.
     """
     whole = recast(problem, candidate)
     training, numbers = without(whole, split.held)

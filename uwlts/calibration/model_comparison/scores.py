@@ -26,14 +26,10 @@ class Score:
 
     Attributes
     ----------
-    px : dict
-        Of the target's points and of the stripes.
-    mm : dict
-        The same on the object.
-    all_mm : float
-        Of both together.
-    std_mm : float
-        Its standard error, by drawing the images anew.
+    px : of the target's points and of the stripes
+    mm : the same on the object
+    all_mm : of both together
+    std_mm : its standard error, by drawing the images anew
     """
 
     px: dict[str, float]
@@ -48,10 +44,8 @@ class Tally:
 
     Attributes
     ----------
-    px, mm : dict
-        Squares (C, I) of misses, of points and of stripes.
-    counts : dict
-        Numbers (I,) of points.
+    px, mm : squares (C, I) of misses, of points and of stripes
+    counts : numbers (I,) of points
     """
 
     px: dict[str, np.ndarray]
@@ -143,12 +137,8 @@ class PolynomialScore:
 
     Attributes
     ----------
-    medium : str
-    images : int
-    all_mm, std_mm : float
-        By polynomials, with the standard error.
-    model_mm, model_std_mm : float
-        In the same images by the model they are compared with.
+    all_mm, std_mm : by polynomials, with the standard error
+    model_mm, model_std_mm : in the same images by the model they are compared with
     """
 
     medium: str
@@ -164,10 +154,7 @@ def polynomial_score(
 ) -> PolynomialScore | None:
     """Score of polynomials in the images of a series that are held out; None where there is no such image.
 
-    Raises
-    ------
-    CalibrationError
-        The series is not fit for polynomials.
+    Raises CalibrationError: the series is not fit for polynomials.
     """
     if not images:
         return None
