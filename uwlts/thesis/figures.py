@@ -1,117 +1,83 @@
-"""The thesis's figures, redrawn from our results as SVG."""
+"""The thesis's figures, redrawn from our results with matplotlib."""
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from uwlts.report.canvas import ticks
-from uwlts.report.svg_plot import COLOURS, FAINT, INK, Curve, Panel, svg
+from uwlts.report.page_toolkit import BLUE, COLOURS, INK, RED, legend_below, new_figure, plain_text
 from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED
 from uwlts.thesis.tables import MEAN, TableRow
 
-_BAR, _GAP, _LABEL, _ROOM = 15, 12, 300, 560
 
-
-def window_distance_figure(result: dict[str, Any]) -> str:
+def window_distance_figure(result: dict[str, Any]) -> Figure:
     """Figure 45: a step's profile for several window distances."""
-    curves = []
-    for number, profile in enumerate(result["window_profiles"]):
-        y, z = _columns(profile["points_mm"])
-        name = f"d = {profile['distance_mm']:.1f} mm"
-        curves.append(Curve(name, y, z, COLOURS[number], joined=False))
-    title = "One step image for different window distances"
-    whole = Panel(title, "Y / mm", "Z / mm", curves, y_range=_range(curves))
-    depths = np.concatenate([np.empty(0), *(curve.y for curve in curves)])
-    if not len(depths):
-        return svg([whole])
-    nearest = float(depths.min())
-    return svg([whole, Panel("Its upper tread", "Y / mm", "Z / mm", curves, y_range=(nearest - 0.2, nearest + 1.2))])
+    profiles = {f"d = {each['distance_mm']:.1f} mm": each["points_mm"] for each in result["window_profiles"]}
+    figure, (whole, upper) = new_figure(9.0, 3.2, columns=2)
+    _draw_profiles(whole, "One step image for different window distances", profiles)
+    _draw_profiles(upper, "Its upper face", profiles)
+    depths = [z for points in profiles.values() for _, z in points if np.isfinite(z)]
+    if depths:
+        # The face is flat within a few tenths of a millimetre for every window distance that is drawn.
+        upper.set_ylim(min(depths) - 0.2, min(depths) + 1.2)
+    legend_below(figure)
+    return figure
 
 
-def polynomials_figures(result: dict[str, Any]) -> tuple[str, str]:
+def polynomials_figures(result: dict[str, Any]) -> tuple[Figure, Figure]:
     """Figures 58 and 59: Z(v) and Y(Z) of three profile lines in air and in water."""
-    drawn = []
-    for title, x_key, y_key, x_label, y_label in (
-        ("Z(v)", "centre_px", "z_mm", "stripe position v / px", "Z / mm"),
-        ("Y(Z)", "z_mm", "y_mm", "Z / mm", "Y / mm"),
-    ):
-        panels = []
-        for medium, found in result["polynomials"].items():
-            curves = [
-                Curve(f"profile line, {name}", line[x_key], line[y_key], COLOURS[number], marked=False)
-                for number, (name, line) in enumerate(found["lines"].items())
-            ]
-            panels.append(Panel(f"{title} in {medium}", x_label, y_label, curves, y_range=_range(curves)))
-        drawn.append(svg(panels))
-    return drawn[0], drawn[1]
+    (by_row, rows), (by_depth, depths) = (new_figure(9.0, 3.2, columns=2) for _ in range(2))
+    for z_axes, y_axes, (medium, found) in zip(rows, depths, result["polynomials"].items(), strict=True):
+        for name, line in found["lines"].items():
+            z_axes.plot(line["centre_px"], line["z_mm"], label=f"profile line, {name}")
+            y_axes.plot(line["z_mm"], line["y_mm"], label=f"profile line, {name}")
+        z_axes.set(title=f"Z(v) in {medium}", xlabel="stripe position v / px", ylabel="Z / mm")
+        y_axes.set(title=f"Y(Z) in {medium}", xlabel="Z / mm", ylabel="Y / mm")
+    legend_below(by_row)
+    legend_below(by_depth)
+    return by_row, by_depth
 
 
-def line_figure(result: dict[str, Any]) -> str:
+def line_figure(result: dict[str, Any]) -> Figure:
     """Figure 67: the stripe on a 300 mm pipe at the stand-off, for either orientation of the camera."""
-    curves = []
-    for number, (side, profile) in enumerate(result["line_profiles"].items()):
-        y, z = _columns(profile["points_mm"])
-        name = f"along the image's {side}: {profile['length_mm']:.1f} mm"
-        curves.append(Curve(name, y, z, COLOURS[number], joined=False))
-    return svg([Panel("Stripe on a 300 mm pipe in water", "Y / mm", "Z / mm", curves, y_range=_range(curves))])
+    figure, (axes,) = new_figure(4.8, 3.2)
+    profiles = {
+        f"along the image's {side}: {profile['length_mm']:.1f} mm": profile["points_mm"]
+        for side, profile in result["line_profiles"].items()
+    }
+    _draw_profiles(axes, "Stripe on a 300 mm pipe in water", profiles)
+    legend_below(figure, columns=1)
+    return figure
 
 
-def comparison_figure(rows: Sequence[TableRow]) -> str:
+def comparison_figure(rows: Sequence[TableRow]) -> Figure:
     """Figure 66: means over the positions, ours as bars with the campaigns' range, the published ones as diamonds."""
-    width = _LABEL + _ROOM + 70
-    largest = max([0.02, *(max(row.ours) for row in rows if row.ours), *(row.published or 0.0 for row in rows)]) * 1.05
-    parts, y = [], 30.0
+    shown = [row for row in rows if row.ours]
+    figure, (axes,) = new_figure(9.0, 0.8 + 0.25 * len(shown))
+    places = np.arange(len(shown))
+    colours = [BLUE if "water" in row.row else RED for row in shown]
+    axes.barh(places, [np.mean(row.ours) for row in shown], height=0.55, color=colours, alpha=0.75)
+    axes.hlines(places, [min(row.ours) for row in shown], [max(row.ours) for row in shown], color=INK)
+    published = [(row.published, place) for place, row in enumerate(shown) if row.published is not None]
+    axes.plot(*np.array(published).reshape(-1, 2).T, "D", color=COLOURS[1], markeredgecolor=INK)
+    axes.set_yticks(places, [plain_text(_label(row)) for row in shown])
+    axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("mean of the campaigns / mm")
+    return figure
 
-    def at(value: float) -> float:
-        return _LABEL + _ROOM * value / largest
 
-    height = y + len(rows) * (_BAR + _GAP) + 34
-    for mark in ticks(0.0, largest, count=10):
-        parts.append(f'<line x1="{at(mark):.1f}" y1="20" x2="{at(mark):.1f}" y2="{height - 30}" stroke="{FAINT}"/>')
-        parts.append(f'<text x="{at(mark):.1f}" y="{height - 14}" text-anchor="middle">{mark:g}</text>')
-    for row in rows:
-        if not row.ours:
-            continue
-        colour = COLOURS[0] if "water" in row.row else COLOURS[3]
-        middle = y + _BAR / 2
-        parts.append(
-            f'<text x="{_LABEL - 8}" y="{middle + 4}" text-anchor="end">{escape(_label(row))}</text>'
-            f'<rect x="{_LABEL}" y="{y}" width="{at(row.mean) - _LABEL:.1f}" height="{_BAR}" fill="{colour}" '
-            'fill-opacity="0.75"/>'
-            f'<line x1="{at(min(row.ours)):.1f}" y1="{middle}" x2="{at(max(row.ours)):.1f}" y2="{middle}" '
-            f'stroke="{INK}" stroke-width="2"/>'
-        )
-        if row.published is not None:
-            x = at(row.published)
-            parts.append(
-                f'<path d="M{x:.1f} {middle - 6} L{x + 6:.1f} {middle} L{x:.1f} {middle + 6} L{x - 6:.1f} {middle} Z" '
-                f'fill="{COLOURS[1]}" stroke="{INK}"/>'
-            )
-        y += _BAR + _GAP
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-        f'font-family="Helvetica, Arial, sans-serif" font-size="12" fill="{INK}">'
-        f'<rect width="{width}" height="{height}" fill="white"/>{"".join(parts)}'
-        f'<text x="{_LABEL + _ROOM + 8}" y="{height - 14}">mm</text></svg>'
-    )
+def _draw_profiles(axes: Axes, title: str, profiles: Mapping[str, list[list[float]]]) -> None:
+    """Draw points (Y, Z) in mm of profiles by name."""
+    for name, points in profiles.items():
+        axes.plot(*np.array(points, float).reshape(-1, 2).T, ".", markersize=3, label=name)
+    axes.set(title=title, xlabel="Y / mm", ylabel="Z / mm")
 
 
 def _label(row: TableRow) -> str:
-    """What a bar shows: quantity, object, medium and method."""
+    """Quantity, object, medium and method of a bar."""
     method = {"Table 2": POLYNOMIALS, "Table 3": POLYNOMIALS, "Table 6": PROPOSED, "Table 7": PROPOSED}.get(row.table)
     shown = row.row.replace(f", {MEAN}", "").removesuffix(", thesis image processing")
     return f"{row.quantity}: {shown}" + (f", {method}" if method else "")
-
-
-def _columns(points: list[list[float]]) -> tuple[np.ndarray, np.ndarray]:
-    found = np.array(points, float).reshape(-1, 2)
-    found = found[np.isfinite(found).all(axis=1)]
-    return found[:, 0], found[:, 1]
-
-
-def _range(curves: Sequence[Curve]) -> tuple[float, float]:
-    values = np.concatenate([np.asarray(curve.y, float) for curve in curves])
-    margin = 0.05 * float(np.ptp(values))
-    return float(values.min()) - margin, float(values.max()) + margin

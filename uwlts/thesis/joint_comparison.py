@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
+from matplotlib.figure import Figure
 
 import uwlts
 from uwlts.calibration.joint.gathering import gather_jointly
@@ -22,8 +22,7 @@ from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.optics.design import speckle_limit_um
 from uwlts.report.inventory import nominal_setup
-from uwlts.report.page_toolkit import render_page
-from uwlts.report.svg_plot import COLOURS, Curve, Panel, svg
+from uwlts.report.page_toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
 from uwlts.runtime.workers import Tell, work_through
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
@@ -236,7 +235,7 @@ def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> st
                 "rows": _rows(summary[medium]),
                 "over_limit": summary[medium]["plane_std_over_speckle_limit"],
                 "coverage": summary[medium]["coverage_95"],
-                "picture": Markup(svg(_panels(results, medium))),
+                "picture": svg_of(_errors_figure(results, medium)),
             }
             for medium in media
         ],
@@ -262,22 +261,22 @@ def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _panels(results: Sequence[dict[str, Any]], medium: str) -> list[Panel]:
+def _errors_figure(results: Sequence[dict[str, Any]], medium: str) -> Figure:
     """Errors of all scans by campaign; the joint ones with their stated 95 % intervals."""
-    panels = []
-    for quantity, figures in _QUANTITIES.values():
-        curves = []
+    figure, panels = new_figure(9.0, 3.4, columns=len(_QUANTITIES))
+    for axes, (quantity, figures) in zip(panels, _QUANTITIES.values(), strict=True):
         for colour, (way, words) in zip((COLOURS[5], COLOURS[1], COLOURS[0]), _WORDS.items(), strict=True):
             points = [
-                (place + _BESIDE[way] + 0.03 * (number - 2.5), scan[way][figure], scan["std"][figure])
+                (place + _BESIDE[way] + 0.03 * (number - 2.5), 1000 * scan[way][figure], 1000 * scan["std"][figure])
                 for place, result in enumerate(results)
                 for number, scan in enumerate(s for s in result["spheres"] if s["medium"] == medium and way in s)
                 for figure in figures
             ]
             if points:
                 x, y, std = np.array(points).T
-                error = 1960 * std if way == JOINT else None
-                name = words if error is None else f"{words}, with the stated 95 % intervals"
-                curves.append(Curve(name, x, 1000 * y, colour, error, joined=False))
-        panels.append(Panel(f"{quantity} in {medium}", "campaign", "error / µm", curves))
-    return panels
+                is_joint = way == JOINT
+                name = f"{words}, with the stated 95 % intervals" if is_joint else words
+                axes.errorbar(x, y, _COVERAGE * std if is_joint else None, fmt="o", ms=4, color=colour, label=name)
+        axes.set(title=f"{quantity} in {medium}", xlabel="campaign", ylabel="error / µm", xticks=range(len(results)))
+    legend_below(figure)
+    return figure

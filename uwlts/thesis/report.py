@@ -8,11 +8,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-
 import uwlts
 from uwlts.report import plot
-from uwlts.report.page_toolkit import png_data_uri, render_page
+from uwlts.report.page_toolkit import png_data_uri, render_page, svg_of
 from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import read_cloud
@@ -207,13 +205,13 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
                 "Figure 66",
                 "Means over the positions: bars are ours (blue in water, red in air), the line spans the "
                 "campaigns, diamonds are the thesis's.",
-                Markup(comparison_figure([*headline, *shown])),
+                svg_of(comparison_figure([*headline, *shown])),
             ),
-            ("Figure 45", "Points on a step for several window distances.", Markup(window_distance_figure(first))),
-            ("Figure 58", "Polynomials Z(v).", Markup(z_of_v)),
-            ("Figure 59", "Polynomials Y(Z).", Markup(y_of_z)),
+            ("Figure 45", "Points on a step for several window distances.", svg_of(window_distance_figure(first))),
+            ("Figure 58", "Polynomials Z(v).", svg_of(z_of_v)),
+            ("Figure 59", "Polynomials Y(Z).", svg_of(y_of_z)),
         ]
-        + ([("Figure 67", "Stripe on a 300 mm pipe.", Markup(line_figure(first)))] if first["line_profiles"] else []),
+        + ([("Figure 67", "Stripe on a 300 mm pipe.", svg_of(line_figure(first)))] if first["line_profiles"] else []),
         monte_carlo=_monte_carlo(results),
         failures=[(number, m) for number, result in enumerate(results) for m in result["measurements"] if m["failure"]],
         pictures=_pictures(folder),
