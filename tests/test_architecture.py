@@ -32,7 +32,7 @@ SHARED_WITH_TWIN = {
     "hdf5_file",
     "console",
     "workers",
-    "aravis_library",
+    "shared_library",
     "report.page_toolkit",
 }
 

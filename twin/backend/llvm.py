@@ -13,16 +13,17 @@ import json
 import math
 import os
 import re
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from twin.backend import packages
+from twin.backend.packages import run_command
 from uwlts.model.errors import SetupError
+from uwlts.runtime.shared_library import file_of, load_with_companions, own_folders
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM_MAJOR = 17
@@ -58,6 +59,12 @@ Install what is missing:
   Fedora:          dnf install llvm-libs libatomic   (as root)
   Arch:            pacman -S llvm-libs gcc-libs   (as root)
   without root:    python -m twin.backend.llvm --install"""
+_EXAMINE = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+from twin.backend.llvm import describe
+print(json.dumps(describe(sys.argv[2])))
+"""
 # The number makes the kernel a new one, so that it is compiled rather than taken from Dr.Jit's cache on disk.
 _TRIAL = """
 from twin.backend.llvm import prepare_llvm
@@ -83,17 +90,6 @@ class LlvmLibrary:
         return f"libLLVM {'.'.join(map(str, self.version))}: {self.path}"
 
 
-@dataclass(frozen=True)
-class Unsuitable:
-    """A library that cannot be used, with the reason."""
-
-    path: Path
-    fault: str
-
-    def __str__(self) -> str:
-        return f"{self.path}: {self.fault}"
-
-
 def prepare_llvm() -> LlvmLibrary:
     """Choose a libLLVM and set DRJIT_LIBLLVM_PATH, which Dr.Jit reads when it is imported.
 
@@ -105,26 +101,21 @@ def prepare_llvm() -> LlvmLibrary:
         There is no suitable libLLVM, or Dr.Jit was imported without one.
     """
     if "drjit" in sys.modules:
-        return _library_in_use()
+        major, minor, patch = sys.modules["drjit"].detail.llvm_version()
+        if major < MINIMUM_MAJOR:
+            held = f"libLLVM {major}.{minor}.{patch}" if major > 0 else "no libLLVM"
+            raise SetupError(
+                f"Dr.Jit was imported before prepare_llvm() and holds {held}, but version {MINIMUM_MAJOR} or newer is "
+                f"needed. Call twin.backend.llvm.prepare_llvm() before the first import of drjit or mitsuba, or set "
+                f"{VARIABLE}."
+            )
+        return LlvmLibrary(Path(os.environ.get(VARIABLE, "libLLVM.so")), (major, minor, patch))
     library = find_llvm()
     # The loader takes a library that is already in the process for one of the same name that libLLVM asks for.
     for companion in library.companions:
         ctypes.CDLL(str(companion))
     os.environ[VARIABLE] = str(library.path)
     return library
-
-
-def _library_in_use() -> LlvmLibrary:
-    """The libLLVM that an imported Dr.Jit holds."""
-    major, minor, patch = sys.modules["drjit"].detail.llvm_version()
-    if major < MINIMUM_MAJOR:
-        held = f"libLLVM {major}.{minor}.{patch}" if major > 0 else "no libLLVM"
-        raise SetupError(
-            f"Dr.Jit was imported before prepare_llvm() and holds {held}, but version {MINIMUM_MAJOR} or newer is "
-            f"needed. Call twin.backend.llvm.prepare_llvm() before the first import of drjit or mitsuba, or set "
-            f"{VARIABLE}."
-        )
-    return LlvmLibrary(Path(os.environ.get(VARIABLE, "libLLVM.so")), (major, minor, patch))
 
 
 # --- search -----------------------------------------------------------------------------------------------------------
@@ -145,12 +136,13 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
         There is none, or the user's choice is unsuitable. The message lists what was found and how to install one.
     """
     if chosen := os.environ.get(VARIABLE):
-        library = examine(Path(chosen))
-        if isinstance(library, Unsuitable):
+        try:
+            library = examine(Path(chosen))
+        except SetupError as error:
             raise SetupError(
-                f"the environment variable {VARIABLE} names {library}\n"
+                f"the environment variable {VARIABLE} names {error}\n"
                 f"Let it name a libLLVM of version {MINIMUM_MAJOR} or newer, or unset it to have one searched."
-            )
+            ) from error
     else:
         library = _newest(folders)
     return replace(library, companions=library.companions + _runtime_library(library.path.parent))
@@ -159,17 +151,16 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
 def _newest(folders: Iterable[Path] | None) -> LlvmLibrary:
     """The newest suitable library; one whose file name claims an older version than the best so far is not loaded."""
     best: LlvmLibrary | None = None
-    unsuitable: list[Unsuitable] = []
+    unsuitable = ""
     for path in sorted(list_candidates(folders), key=named_version, reverse=True):
         if best is not None and named_version(path) <= best.version:
             break
-        examined = examine(path)
-        if isinstance(examined, Unsuitable):
-            unsuitable.append(examined)
-        elif best is None or examined.version > best.version:
-            best = examined
+        try:
+            best = max(filter(None, (best, examine(path))), key=lambda library: library.version)
+        except SetupError as error:
+            unsuitable += f"\n  {error}"
     if best is None:
-        found = "".join(f"\n  {library}" for library in unsuitable) or "\n  none"
+        found = unsuitable or "\n  none"
         raise SetupError(
             f"no suitable libLLVM: Dr.Jit needs the shared library of LLVM {MINIMUM_MAJOR} or newer. Found:{found}\n"
             f"{_HOW_TO_INSTALL}\n"
@@ -185,46 +176,43 @@ def _runtime_library(beside: Path) -> tuple[Path, ...]:
     try:
         ctypes.CDLL(RUNTIME_LIBRARY)
     except OSError as error:
-        for folder in (beside, *own_folders()):
-            for path in sorted(folder.glob(f"{RUNTIME_LIBRARY}*")):
+        for folder in (beside, *own_folders("llvm")):
+            if path := file_of(RUNTIME_LIBRARY, folder):
                 return (path,)
         raise SetupError(f"Dr.Jit needs {RUNTIME_LIBRARY}, which this machine lacks.\n{_HOW_TO_INSTALL}") from error
     return ()
 
 
-def examine(path: Path) -> LlvmLibrary | Unsuitable:
-    """Load the library in a child process, ask for its version and judge it. The file name is not trusted."""
-    command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("llvm_probe.py")), str(path)]
+def examine(path: Path) -> LlvmLibrary:
+    """Load a library and ask for its version, as the file name is not trusted; SetupError where it cannot be used.
+
+    A library of the wrong kind can end the process that loads it, and two libLLVM in one process may disturb each
+    other, so this happens in a child process.
+    """
+    child = [sys.executable, "-I", "-S", "-c", _EXAMINE, str(Path(__file__).parents[2]), str(path)]
+    found = json.loads(run_command(child, seconds=PROBE_SECONDS, shown=f"{path}: loading it"))
+    if "fault" in found:
+        raise SetupError(f"{path}: {found['fault']}")
+    return LlvmLibrary(path, tuple(found["version"]), tuple(map(Path, found["companions"])))
+
+
+def describe(library: str) -> dict[str, object]:
+    """Load a library into this process: its "version" and "companions", or the "fault" that makes it unsuitable."""
     try:
-        # The loader's messages are matched, so they must be the untranslated ones.
-        probe = subprocess.run(
-            command,
-            env=os.environ | {"LC_ALL": "C"},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=PROBE_SECONDS,
-        )
-    except subprocess.TimeoutExpired:
-        return Unsuitable(path, f"loading it did not end within {PROBE_SECONDS} s")
-    if probe.returncode != 0:
-        last_line = (probe.stderr.strip().splitlines() or [""])[-1]
-        return Unsuitable(path, f"loading it ended the process, exit status {probe.returncode} {last_line}".rstrip())
-    return judge(path, **json.loads(probe.stdout))
-
-
-def judge(
-    path: Path, *, version: Sequence[int] | None = None, companions: Sequence[str] = (), fault: str | None = None
-) -> LlvmLibrary | Unsuitable:
-    """Turn what the probe reports about a library into a usable library or the reason against it."""
-    if fault is not None:
-        return Unsuitable(path, fault)
-    if version is None:
-        return Unsuitable(path, f"too old: it has no LLVMGetVersion; version {MINIMUM_MAJOR} or newer is needed")
-    major, minor, patch = version
-    if major < MINIMUM_MAJOR:
-        return Unsuitable(path, f"version {major}.{minor}.{patch}; version {MINIMUM_MAJOR} or newer is needed")
-    return LlvmLibrary(path, (major, minor, patch), tuple(map(Path, companions)))
+        handle, companions = load_with_companions(library)
+    except OSError as error:
+        return {"fault": f"it does not load: {error}"}
+    if not hasattr(handle, "LLVMContextCreate"):
+        return {"fault": "it is no libLLVM: it lacks the function LLVMContextCreate"}
+    if not hasattr(handle, "LLVMGetVersion"):
+        return {"fault": f"too old: it has no LLVMGetVersion; version {MINIMUM_MAJOR} or newer is needed"}
+    numbers = [ctypes.c_uint() for _ in range(3)]
+    handle.LLVMGetVersion(*map(ctypes.byref, numbers))
+    version = [number.value for number in numbers]
+    if version[0] < MINIMUM_MAJOR:
+        stated = ".".join(map(str, version))
+        return {"fault": f"version {stated}; version {MINIMUM_MAJOR} or newer is needed"}
+    return {"version": version, "companions": companions}
 
 
 def named_version(path: Path) -> tuple[float, ...]:
@@ -248,7 +236,7 @@ def list_candidates(folders: Iterable[Path] | None = None) -> list[Path]:
 
 def search_folders() -> list[Path]:
     """The project's own folders first, then those of the environment in use, then the usual ones of the system."""
-    folders = own_folders()
+    folders = own_folders("llvm")
     folders += [Path(folder) for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
     folders += [Path(prefix, "lib") for prefix in (sys.prefix, os.environ.get("CONDA_PREFIX")) if prefix]
     for pattern in _SYSTEM_FOLDERS:
@@ -256,33 +244,14 @@ def search_folders() -> list[Path]:
     return folders
 
 
-def own_folders() -> list[Path]:
-    """Folders into which a libLLVM can be unpacked without administrator rights, the preferred one first."""
-    root = Path(__file__).parents[2]
-    folders = [root / ".llvm"] if (root / "pyproject.toml").is_file() else []
-    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return [*folders, Path(cache, "uwlts", "llvm")] if os.path.isabs(cache) else folders
-
-
 # --- installation -----------------------------------------------------------------------------------------------------
 
 
-def install_llvm(
-    *,
-    folders: Sequence[Path] | None = None,
-    target: Path | None = None,
-    report: Callable[[str], object] = lambda line: None,
-) -> LlvmLibrary:
+def install_llvm(report: packages.Report = lambda line: None) -> LlvmLibrary:
     """Find a suitable libLLVM, or obtain one: with apt-get as root, else unpacked from Debian packages or a wheel.
 
-    Parameters
-    ----------
-    folders
-        Where to look for one that is there already; without it everywhere.
-    target
-        Folder to unpack into; without it `.llvm` in the source tree, or the user's cache folder.
-    report
-        Called with a line of text for each step.
+    ``report`` is called with a line of text for each step. It is unpacked into `.llvm` in the source tree, or the
+    user's cache folder.
 
     Raises
     ------
@@ -290,12 +259,11 @@ def install_llvm(
         None of the ways led to a library; the message gives the reason of each.
     """
     return packages.obtain(
-        lambda unpacked: find_llvm(None if folders is None else [*unpacked, *folders]),
+        find_llvm,
         what="libLLVM",
         choose=_offered,
         wheel=WHEEL,
-        target=target,
-        folders=own_folders(),
+        folders=own_folders("llvm"),
         choice=VARIABLE,
         report=report,
     )
@@ -303,7 +271,7 @@ def install_llvm(
 
 def _offered(options: Sequence[str]) -> list[str]:
     """The packages to take according to the package lists; SetupError where there is none."""
-    policy = packages.run_command(["apt-cache", *options, "policy", *DEBIAN_PACKAGES])
+    policy = run_command(["apt-cache", *options, "policy", *DEBIAN_PACKAGES])
     offered = set(re.findall(r"^(\S+):\n  Installed: .*\n  Candidate: (?!\(none\))", policy, flags=re.MULTILINE))
     for package in DEBIAN_PACKAGES:
         if package in offered:
@@ -319,14 +287,8 @@ def run_trial_kernel() -> None:
     SetupError
         The kernel did not run; the message holds the end of what was printed.
     """
-    command = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
-    try:
-        trial = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS)
-    except subprocess.TimeoutExpired as error:
-        raise SetupError(f"Dr.Jit did not finish a trial kernel within {TRIAL_SECONDS} s") from error
-    if trial.returncode != 0:
-        end = "\n  ".join(trial.stderr.strip().splitlines()[-5:])
-        raise SetupError(f"Dr.Jit could not run a trial kernel (exit status {trial.returncode}):\n  {end}")
+    child = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
+    run_command(child, seconds=TRIAL_SECONDS, shown="a trial kernel of Dr.Jit")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -338,10 +300,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         if options.install:
-            print(install_llvm(report=partial(print, flush=True)))
+            print(install_llvm(partial(print, flush=True)))
         else:
             for path in list_candidates():
-                print(f"found: {examine(path)}")
+                try:
+                    print(f"found: {examine(path)}")
+                except SetupError as unsuitable:
+                    print(f"found: {unsuitable}")
             print(f"chosen: {find_llvm()}")
         run_trial_kernel()
     except SetupError as error:

@@ -7,26 +7,20 @@ there is none.
 
 import sys
 from functools import partial
-from pathlib import Path
 
 from twin.backend.packages import Report, obtain
 from uwlts.model.errors import SetupError
-from uwlts.runtime.aravis_library import VARIABLE, load_aravis, own_folders
+from uwlts.runtime.shared_library import ARAVIS_VARIABLE, load_aravis, own_folders
 
 DEBIAN_PACKAGE = "libaravis-0.8-0"
 # Built by a third party for x86-64; GLib, libxml2 and libusb have to be there.
 WHEEL = "aravis-python==0.8.31.post1"
 
 
-def install_aravis(*, target: Path | None = None, report: Report = lambda line: None) -> str:
-    """Name of the library that is used; where there is none it is obtained.
+def install_aravis(report: Report = lambda line: None) -> str:
+    """Name of the library that is used; where there is none it is obtained, into `.aravis` or the user's cache folder.
 
-    Parameters
-    ----------
-    target
-        Folder to unpack into; without it `.aravis` in the source tree, or the user's cache folder.
-    report
-        Called with a line of text for each step.
+    ``report`` is called with a line of text for each step.
 
     Raises
     ------
@@ -34,13 +28,12 @@ def install_aravis(*, target: Path | None = None, report: Report = lambda line: 
         None of the ways led to a library; the message gives the reason of each.
     """
     return obtain(
-        lambda unpacked: load_aravis()._name,
+        lambda: load_aravis()._name,
         what="Aravis",
         choose=lambda options: [DEBIAN_PACKAGE],
         wheel=WHEEL,
-        target=target,
-        folders=own_folders(),
-        choice=VARIABLE,
+        folders=own_folders("aravis"),
+        choice=ARAVIS_VARIABLE,
         report=report,
     )
 
@@ -48,7 +41,7 @@ def install_aravis(*, target: Path | None = None, report: Report = lambda line: 
 def main() -> int:
     """Command line of this module; returns the exit status."""
     try:
-        print(f"Aravis: {install_aravis(report=partial(print, flush=True))}")
+        print(f"Aravis: {install_aravis(partial(print, flush=True))}")
     except SetupError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

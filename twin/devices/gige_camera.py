@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from uwlts.model.errors import HardwareError, ImageError
-from uwlts.runtime.aravis_library import load_aravis
+from uwlts.runtime.shared_library import load_aravis
 
 # What 1 Gbit/s carries, and how many packets go out together, as sleeps are not exact.
 _BYTES_PER_S, _TOGETHER = 125e6, 8

@@ -22,7 +22,7 @@ from types import TracebackType
 
 from twin.devices.grbl_firmware import GrblFirmware
 
-# The thesis's bench, as docs/hardware-stage.md sets it up.
+# The thesis's bench, as docs/how-to/hardware-stage.md sets it up.
 BENCH_SETTINGS: dict[int, float] = {
     0: 10,
     1: 255,

@@ -26,7 +26,7 @@ _USUAL_GROUP = "dialout"
 def examine_cameras() -> list[Finding]:
     """The library of Aravis, and the cameras that it finds within 2.5 s."""
     from uwlts.hardware.aravis import list_aravis_cameras
-    from uwlts.runtime.aravis_library import load_aravis
+    from uwlts.runtime.shared_library import load_aravis
 
     try:
         library = load_aravis()
@@ -154,10 +154,10 @@ BEHAVIOUR = {
     31: (0, "S0 is none"),
     32: (1, "laser mode fails to the dark side"),
 }
-"""Settings of docs/hardware-stage.md on which the laser, the limits and the reports depend, and their reasons."""
+"""Settings of docs/how-to/hardware-stage.md on which laser, limits and reports depend, with their reasons."""
 
 MECHANICS = {0: 10, 24: 60, 25: 600, 26: 25, 27: 2, 100: 80, 110: 900, 120: 50, 130: 750}
-"""Settings of docs/hardware-stage.md that follow from the thesis's bench; another stage has others."""
+"""Settings of docs/how-to/hardware-stage.md that follow from the thesis's bench; another stage has others."""
 
 
 def try_camera(address: str) -> list[Finding]:
@@ -212,7 +212,7 @@ def try_stage(port: str) -> list[Finding]:
             raise
         line.close()
     except HardwareError as failed:
-        advice = "see 'In case of trouble' in docs/hardware-stage.md"
+        advice = "see 'In case of trouble' in docs/how-to/hardware-stage.md"
         if "no permission" in str(failed):
             advice = "sudo usermod -aG dialout $USER\nthen log out and in again"
         return [Finding("stage", "missing", str(failed), advice)]
@@ -231,13 +231,13 @@ def _judge_build(who: str, built: list[str]) -> Finding:
             "stage",
             "missing",
             f"{found}, without V: it cannot switch the laser",
-            "flash a Grbl with VARIABLE_SPINDLE, see docs/hardware-stage.md",
+            "flash a Grbl with VARIABLE_SPINDLE, see docs/how-to/hardware-stage.md",
         )
     return Finding("stage", "ok", found)
 
 
 def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
-    """What differs from docs/hardware-stage.md in the answer to ``$$``, given by number."""
+    """What differs from docs/how-to/hardware-stage.md in the answer to ``$$``, given by number."""
     unsafe = {number: wanted for number, (wanted, _) in BEHAVIOUR.items() if settings.get(number) != wanted}
     other = {number: wanted for number, wanted in MECHANICS.items() if settings.get(number) != wanted}
     findings = []
@@ -245,7 +245,7 @@ def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
         found = "; ".join(
             f"{_is(settings, number)}, not {unsafe[number]} ({BEHAVIOUR[number][1]})" for number in unsafe
         )
-        advice = f"send, one line each, what docs/hardware-stage.md asks for: {_lines(unsafe)}"
+        advice = f"send, one line each, what docs/how-to/hardware-stage.md asks for: {_lines(unsafe)}"
         if {20, 22} & unsafe.keys():
             advice += "\n$20=0 and $22=0 are right for a stage without a limit switch"
         findings.append(Finding("stage settings", "warning", found, advice))
@@ -253,7 +253,7 @@ def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
         found = f"other than the thesis's bench: {', '.join(_is(settings, number) for number in other)}"
         advice = f"right if your mechanics are other ones; for the thesis's bench send {_lines(other)}"
         findings.append(Finding("stage mechanics", "warning", found, advice))
-    return findings or [Finding("stage settings", "ok", "as docs/hardware-stage.md asks for")]
+    return findings or [Finding("stage settings", "ok", "as docs/how-to/hardware-stage.md asks for")]
 
 
 def _is(settings: Mapping[int, float], number: int) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
 from uwlts.model.errors import HardwareError
-from uwlts.runtime.aravis_library import load_aravis
+from uwlts.runtime.shared_library import load_aravis
 
 BUFFER_COMPLETE = 0
 

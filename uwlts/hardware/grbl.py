@@ -19,8 +19,8 @@ When the laser goes off:
   the Ctrl-X;
 - the cable is pulled out: the Uno, fed by it, loses its power and the pull-down at the laser's transistor does the
   rest. Grbl has no watchdog and no setting replaces one; an Uno with a supply of its own keeps the laser lit;
-- the computer freezes or loses power while USB stays powered: only hardware helps, docs/hardware-stage.md shows it. The
-  Uno's reset through DTR does not: it comes when the port is *opened*, not when it is closed;
+- the computer freezes or loses power while USB stays powered: only hardware helps, see
+  docs/how-to/hardware-stage.md. The Uno's reset through DTR does not: it comes when the port is *opened*, not closed;
 - the controller restarts for any reason, the next opening of the port included: Grbl starts with the pin off.
 """
 

@@ -581,7 +581,7 @@ def _open(port: str, baud: int) -> serial.Serial:
 
 
 def _hang_up_on_close(descriptor: int) -> None:
-    """Have DTR drop when the port is closed by any process; docs/hardware-stage.md explains why."""
+    """Have DTR drop when the port is closed by any process; docs/how-to/hardware-stage.md explains why."""
     try:
         attributes = termios.tcgetattr(descriptor)
         attributes[2] |= termios.HUPCL

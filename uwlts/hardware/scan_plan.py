@@ -115,7 +115,7 @@ def load_plan(path: Path) -> ScanPlan:
     DescriptionError
         The file is missing, no TOML, or holds an unknown or wrong key.
     """
-    return validated(ScanPlan, plan_table(path, wanted="sensor, medium and stage (docs/scan.md)"), path)
+    return validated(ScanPlan, plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path)
 
 
 def plan_table(path: Path, *, wanted: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ library it needs is overwritten with one of the same length that no system has.
 
 import ctypes
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -15,18 +16,9 @@ from pathlib import Path
 import pytest
 
 from twin.backend import llvm, packages
-from twin.backend.llvm import (
-    LlvmLibrary,
-    Unsuitable,
-    examine,
-    find_llvm,
-    install_llvm,
-    judge,
-    list_candidates,
-    main,
-    named_version,
-)
+from twin.backend.llvm import LlvmLibrary, examine, find_llvm, install_llvm, list_candidates, main, named_version
 from uwlts.model.errors import SetupError
+from uwlts.runtime.shared_library import own_folders
 
 NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"
 
@@ -93,21 +85,37 @@ def test_candidates_are_shared_libraries_named_llvm_each_once(tmp_path):
     assert sorted(path.name for path in found) == ["libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1-custom"]
 
 
+@pytest.fixture
+def loaded(monkeypatch):
+    """A function that has a library of a version, None for one without LLVMGetVersion, loaded instead of a file."""
+
+    class Handle:
+        LLVMContextCreate = None
+
+        def __init__(self, version):
+            if version is not None:
+                self.LLVMGetVersion = lambda *numbers: [
+                    setattr(number._obj, "value", value) for number, value in zip(numbers, version, strict=True)
+                ]
+
+    return lambda version: monkeypatch.setattr(llvm, "load_with_companions", lambda library: (Handle(version), []))
+
+
 @pytest.mark.parametrize("major", [14, 15, 16])
-def test_versions_that_abort_are_refused(major):
-    refused = judge(Path("libLLVM.so"), version=[major, 0, 6])
-    assert isinstance(refused, Unsuitable)
-    assert f"{major}.0.6" in str(refused) and "17 or newer" in str(refused)
+def test_versions_that_abort_are_refused(loaded, major):
+    loaded((major, 0, 6))
+    assert llvm.describe("libLLVM.so") == {"fault": f"version {major}.0.6; version 17 or newer is needed"}
 
 
-def test_library_without_version_function_is_refused_as_too_old():
-    refused = judge(Path("libLLVM.so"), version=None)
-    assert isinstance(refused, Unsuitable) and "too old" in refused.fault
+def test_library_without_version_function_is_refused_as_too_old(loaded):
+    loaded(None)
+    assert "too old" in llvm.describe("libLLVM.so")["fault"]
 
 
 @pytest.mark.parametrize("major", [17, 19, 22, 23])
-def test_newer_versions_are_accepted(major):
-    assert judge(Path("libLLVM.so"), version=[major, 1, 2]) == LlvmLibrary(Path("libLLVM.so"), (major, 1, 2))
+def test_newer_versions_are_accepted(loaded, major):
+    loaded((major, 1, 2))
+    assert llvm.describe("libLLVM.so") == {"version": [major, 1, 2], "companions": []}
 
 
 def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypatch):
@@ -124,7 +132,10 @@ def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypat
 
     def state(path):
         looked_at.append(path.name)
-        return judge(path, version=list(true_versions[path.name]))
+        version = true_versions[path.name]
+        if version[0] < 17:
+            raise SetupError(f"{path}: too old")
+        return LlvmLibrary(path, version)
 
     monkeypatch.setattr(llvm, "examine", state)
     assert find_llvm([tmp_path]).path.name == "libLLVM.so.20.1"
@@ -135,7 +146,8 @@ def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypat
 def test_message_lists_what_was_found_and_how_to_install(tmp_path, monkeypatch):
     (tmp_path / "libLLVM-15.so.1").touch()
     (tmp_path / "libLLVM-14.so.1").touch()
-    monkeypatch.setattr(llvm, "examine", lambda path: judge(path, version=[15, 0, 7]))
+    fault = {"fault": "version 15.0.7; version 17 or newer is needed"}
+    monkeypatch.setattr(llvm, "run_command", lambda command, **options: json.dumps(fault))
     with pytest.raises(SetupError) as caught:
         find_llvm([tmp_path])
     message = str(caught.value)
@@ -169,10 +181,12 @@ def test_version_comes_from_the_library_not_from_its_name(tmp_path, machine_libr
 
 
 def test_foreign_library_and_text_file_are_refused(tmp_path, foreign_library):
-    assert "no libLLVM" in examine(foreign_library).fault
+    with pytest.raises(SetupError, match="no libLLVM"):
+        examine(foreign_library)
     script = tmp_path / "libLLVM.so"
     script.write_text("INPUT(libLLVM.so.19.1)\n")
-    assert "does not load" in examine(script).fault
+    with pytest.raises(SetupError, match="does not load"):
+        examine(script)
 
 
 def test_missing_dependency_is_reported_by_name(tmp_path, foreign_library):
@@ -189,8 +203,8 @@ def test_dependency_is_taken_from_the_same_folder(tmp_path, foreign_library):
     lacking = overwrite_name(foreign_library, tmp_path / "liblacking.so")
     supplied = overwrite_name(original, tmp_path / "libQ.so.6.1")
     script = (
-        "import sys; sys.path.insert(0, 'twin'); import llvm_probe; companions = []\n"
-        f"llvm_probe.load_with_companions({str(lacking)!r}, companions); print(companions)"
+        "from uwlts.runtime.shared_library import load_with_companions\n"
+        f"print(load_with_companions({str(lacking)!r})[1])"
     )
     child = run_child(script)
     assert child.stdout.strip() == str([str(supplied)]), child.stderr
@@ -201,7 +215,8 @@ def test_library_that_ends_its_process_is_refused(tmp_path, machine_library):
     truncated = tmp_path / "libLLVM.so.19.1"
     with machine_library.path.open("rb") as whole:
         truncated.write_bytes(whole.read(4096))
-    assert isinstance(examine(truncated), Unsuitable)
+    with pytest.raises(SetupError, match="libLLVM.so.19.1: "):
+        examine(truncated)
 
 
 def test_users_unsuitable_choice_is_refused_and_not_replaced(monkeypatch, foreign_library):
@@ -227,16 +242,19 @@ def test_missing_runtime_library_of_drjit_is_reported(monkeypatch, machine_libra
 
 def test_install_leaves_a_suitable_library_alone(machine_library, tmp_path, monkeypatch):
     monkeypatch.setattr(packages, "run_command", lambda command, folder=None: pytest.fail(f"ran {command}"))
+    monkeypatch.setattr(llvm, "own_folders", lambda name: [*own_folders(name), tmp_path / "unused"])
     steps = []
-    assert install_llvm(target=tmp_path / "unused", report=steps.append) == machine_library
+    assert install_llvm(steps.append) == machine_library
     assert steps == [] and not (tmp_path / "unused").exists()
 
 
 def test_install_gives_the_reason_of_every_way_that_failed(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(llvm, "WHEEL", "")
+    monkeypatch.setattr(llvm, "own_folders", lambda name: [tmp_path / "unpacked"])
+    monkeypatch.setattr(llvm, "search_folders", lambda: [tmp_path])
     with pytest.raises(SetupError) as caught:
-        install_llvm(folders=[tmp_path], target=tmp_path / "unpacked")
+        install_llvm()
     message = str(caught.value)
     expected = ("Tried without success", "apt-get install: ", "apt-get download: ", " -m pip ", "Found:\n  none")
     assert [part for part in expected if part not in message] == []
@@ -248,9 +266,9 @@ def test_debian_package_offered_by_the_lists_is_taken(monkeypatch):
         "libllvm18:\n  Installed: (none)\n  Candidate: 1:18.1.8-1\n  Version table:\n"
         "libllvm17:\n  Installed: 1:17.0.6-1\n  Candidate: 1:17.0.6-1\n  Version table:\n"
     )
-    monkeypatch.setattr(packages, "run_command", lambda command: policy)
+    monkeypatch.setattr(llvm, "run_command", lambda command: policy)
     assert llvm._offered([]) == ["libllvm18", "libatomic1"]
-    monkeypatch.setattr(packages, "run_command", lambda command: "")
+    monkeypatch.setattr(llvm, "run_command", lambda command: "")
     with pytest.raises(SetupError, match="there is none of libllvm19"):
         llvm._offered([])
 

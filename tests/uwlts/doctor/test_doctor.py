@@ -342,7 +342,7 @@ def unmoved(**options: object) -> Iterator[GrblController]:
 
 
 def test_the_settings_are_those_of_the_documentation():
-    text = (ROOT / "docs" / "hardware-stage.md").read_text()
+    text = (ROOT / "docs" / "how-to" / "hardware-stage.md").read_text()
     rows = [line for line in text.splitlines() if line.startswith("| `$")]
     documented = {int(number): float(value) for row in rows for number, value in re.findall(r"`\$(\d+)=(\d+)`", row)}
     assert len(documented) > 15
@@ -382,7 +382,7 @@ def test_an_alarm_silence_and_a_firmware_that_cannot_switch_the_laser_are_missin
         controller.mute()
         (silent,) = devices.try_stage(controller.port)
     assert silent.status == "missing" and "nothing answers" in silent.found
-    assert "docs/hardware-stage.md" in silent.advice
+    assert "docs/how-to/hardware-stage.md" in silent.advice
 
 
 def test_a_pressed_switch_is_a_warning():

@@ -19,7 +19,7 @@ from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.errors import HardwareError, ImageError, SetupError
 from uwlts.model.sensor import Sensor
-from uwlts.runtime import aravis_library
+from uwlts.runtime import shared_library
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
 
 PRODUCER = Path(genicam.__file__).with_name("viky.cti")
@@ -274,15 +274,15 @@ def test_missing_libraries_are_said_with_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "harvesters", None)
     with pytest.raises(SetupError, match="pip install harvesters genicam"):
         open_camera(f"genicam:{PRODUCER}")
-    aravis_library.load_aravis.cache_clear()
-    monkeypatch.setenv(aravis_library.VARIABLE, str(tmp_path / "libaravis.so"))
+    shared_library.load_aravis.cache_clear()
+    monkeypatch.setenv(shared_library.ARAVIS_VARIABLE, str(tmp_path / "libaravis.so"))
     with pytest.raises(SetupError, match=r"UWLTS_LIBARAVIS names .*libaravis.so"):
         open_camera("gige:1")
-    monkeypatch.setenv(aravis_library.VARIABLE, "libc.so.6")
+    monkeypatch.setenv(shared_library.ARAVIS_VARIABLE, "libc.so.6")
     with pytest.raises(SetupError, match="lacks arv_camera_new"):
         open_camera("gige:1")
-    monkeypatch.delenv(aravis_library.VARIABLE)
-    monkeypatch.setattr(aravis_library, "LIBRARY", "libaravis-0.0.so.0")
+    monkeypatch.delenv(shared_library.ARAVIS_VARIABLE)
+    monkeypatch.setattr(shared_library, "ARAVIS", "libaravis-0.0.so.0")
     with pytest.raises(SetupError, match=r"(?s)cannot be used.*apt-get install libaravis-0.8-0"):
         open_camera("gige:1")
-    aravis_library.load_aravis.cache_clear()
+    shared_library.load_aravis.cache_clear()

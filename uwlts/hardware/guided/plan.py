@@ -220,7 +220,7 @@ def load_guided_plan(path: Path) -> GuidedPlan:
     DescriptionError
         The file is missing, no TOML, or holds an unknown or wrong key; sensor, medium or target are not valid.
     """
-    plan = validated(GuidedPlan, plan_table(path, wanted="sensor and target (docs/calibrate-live.md)"), path)
+    plan = validated(GuidedPlan, plan_table(path, wanted="sensor and target (docs/how-to/calibrate-live.md)"), path)
     plan.setting()
     if plan.step is not None:
         plan.described_sensor().medium(plan.step.medium)
