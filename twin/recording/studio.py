@@ -13,8 +13,8 @@ from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
 from twin.recording.truth import FrameTruth, depth_map, no_stripe, true_stripe
-from twin.scene.description import CirclePlate, Scene, Shot
-from twin.scene.pattern import shift_circles
+from twin.scene.description import Printed, Scene, Shot
+from twin.scene.pattern import shift_points
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
@@ -169,7 +169,7 @@ class Studio:
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
-        self._shift_circles(shot, index)
+        self._shift_points(shot, index)
         rng = np.random.default_rng([self.options.seed, index]) if self.options.effects.noise else None
         exposure = self.exposure_ms[shot.light]
         light = exposure * self.electrons_per_ms(
@@ -183,13 +183,13 @@ class Studio:
             return no_stripe(self.sensor.camera.lines())
         return true_stripe(self.renderer, self.pose(shot), travel=self.travel("laser"))
 
-    def _shift_circles(self, shot: Shot, index: int) -> None:
-        """Move the circles of plates with errors of detection to where this image shows them."""
+    def _shift_points(self, shot: Shot, index: int) -> None:
+        """Move the points of a target with errors of detection to where this image shows them."""
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
-            if isinstance(plate, CirclePlate) and plate.detection_std_px > 0:
+            if isinstance(plate, Printed) and plate.detection_std_px > 0:
                 seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
                 mm_per_px = self._apparent_depth_mm(seen[2, 3]) / self.sensor.camera.focal_length_px()
-                shift_circles(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
+                shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
 
     def _apparent_depth_mm(self, depth_mm: float) -> float:
         """Depth at which a point on the axis seems to be: a layer of index n looks n times thinner."""

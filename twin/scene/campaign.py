@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
-from twin.scene.description import AnyObject, Block, CirclePlate, Motion, Scene, load_scene
+from twin.scene.description import AnyObject, Block, Motion, Printed, Scene, load_scene
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, load_sensor, names, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor
@@ -20,11 +20,11 @@ class Imperfections(Description):
     """How far real things lie from their descriptions: standard deviations if normal, half widths if evenly spread.
 
     ``circle_centre_std_mm``
-        every printed circle of the target, along x and y.
+        every printed circle or corner of the target, along x and y.
     ``target_bow_std_mm``
         how far the target's middle stands before or behind its corners.
     ``circle_detection_std_px``
-        every circle in every image, beyond what the image's noise does.
+        every circle or corner in every image, beyond what the image's noise does.
     ``target_tilt_std_deg``
         the target about X and about Y, against the stage's travel.
     ``stage_position_std_mm``, ``stage_lead_std``
@@ -67,7 +67,7 @@ class Recording(Description):
     name: str | None = None
     media: tuple[str, ...] = ()
     placements: tuple[str, ...] = ()
-    motion: dict[str, Any] = {}
+    motion: dict[str, object] = {}
     stripe_along: Literal["width", "height"] | None = None
     as_described: bool = False
 
@@ -165,7 +165,7 @@ def _turned(sensor: Sensor, stripe_along: str) -> Sensor:
     return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"stripe_along": stripe_along})})
 
 
-def _with_motion(scene: Scene, **changes: Any) -> Scene:
+def _with_motion(scene: Scene, **changes: object) -> Scene:
     motion = validated(Motion, scene.motion.model_dump() | changes, scene.title)
     return scene.model_copy(update={"motion": motion})
 
@@ -230,7 +230,7 @@ class _Drawn:
         return _with_motion(scene.model_copy(update={"objects": tuple(objects)}), **changes)
 
     def _real(self, thing: AnyObject, rng: np.random.Generator) -> AnyObject:
-        if not isinstance(thing, CirclePlate):
+        if not isinstance(thing, Printed):
             return thing
         tilt = self._size.target_tilt_std_deg * rng.standard_normal(2)
         turned = np.array(thing.rotation_deg) + (*tilt, 0.0)

@@ -4,10 +4,11 @@ Scene coordinates are the sensor's object coordinate system (OCS) at stage posit
 direction of a scan; Y along the stripe; Z along the laser's axis away from the sensor; the origin is the stand-off.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self, cast
 
 import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, names, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Positive, Vector
-from uwlts.targets import Target, parse_target
+from uwlts.targets import CircleTarget, Target, parse_target
 
 Reflectance = Annotated[float, Field(ge=0, le=1)]
 Finish = Literal["diffuse", "painted", "pvc", "metal"]
@@ -213,8 +214,19 @@ class Weld(FreeForm):
         return self
 
 
-class Printed(Placed):
-    """Base of flat plates, facing -z, with a printed pattern, which takes the place of a ``texture``."""
+class Printed(Placed, ABC):
+    """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
+
+    A real target differs from its description: every point of it (circle or corner) is off by ``centre_std_mm`` along x
+    and y, and the middle of the plate stands ``bow_mm`` before its corners. ``detection_std_px`` shifts every point in
+    every image anew, as errors of detection beyond those that the image itself leads to. ``errors_seed`` chooses these
+    errors.
+    """
+
+    centre_std_mm: NotNegative = 0.0
+    bow_mm: Annotated[float, Field(gt=-10, lt=10)] = 0.0
+    detection_std_px: NotNegative = 0.0
+    errors_seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
     def _has_one_pattern(self) -> Self:
@@ -224,6 +236,18 @@ class Printed(Placed):
             )
         return self
 
+    @abstractmethod
+    def described_target(self) -> Target:
+        """The target without errors."""
+
+    @abstractmethod
+    def bounds_mm(self) -> np.ndarray:
+        """Corners (2, 2) of the plate in its own x-y plane: the one with the smallest x and y, and the opposite one."""
+
+    @abstractmethod
+    def ink_and_gap_reflectance(self) -> tuple[float, float]:
+        """Reflectance of the print's patches with ink and of those without."""
+
     def dimmed(self, scale: float) -> Self:
         """The same plate with every reflectance multiplied by ``scale``."""
         names = [name for name in type(self).model_fields if name.endswith("reflectance")]
@@ -231,15 +255,11 @@ class Printed(Placed):
 
 
 class CirclePlate(Printed):
-    """Flat plate, facing -z, with a lattice of circles; three of them carry a dot and mark origin, X and Y.
+    """A lattice of circles; three of them carry a dot and mark origin, X and Y.
 
     The lattice has ``columns`` along x and ``rows`` along y; ``origin`` is the marked origin's column and row, and
-    ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two. The origin circle lies at the
-    plate's own origin. ``reflectance`` is the ground's; the lattice takes the place of a ``texture``.
-
-    A real plate differs from its description: every circle is off by ``centre_std_mm`` along x and y, and the middle
-    of the plate stands ``bow_mm`` before its corners. ``detection_std_px`` shifts every circle in every image anew, as
-    errors of detection beyond those that the image itself leads to. ``errors_seed`` chooses these errors.
+    ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two. The origin circle lies in the
+    plate's middle. ``reflectance`` is the ground's.
     """
 
     kind: Literal["circle_plate"]
@@ -251,23 +271,38 @@ class CirclePlate(Printed):
     spacing_y_mm: Positive
     diameter_mm: Positive
     marker_diameter_mm: Positive
-    origin: tuple[NotNegative, NotNegative]
+    origin: tuple[int, int]
     marker_x: tuple[int, int] = (2, 0)
     marker_y: tuple[int, int] = (0, 2)
     circle_reflectance: Reflectance = 0.85
     marker_reflectance: Reflectance = 0.05
-    centre_std_mm: NotNegative = 0.0
-    bow_mm: Annotated[float, Field(gt=-10, lt=10)] = 0.0
-    detection_std_px: NotNegative = 0.0
-    errors_seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _shows_a_target(self) -> Self:
+        self.described_target()
+        return self
+
+    def described_target(self) -> Target:
+        """The target without errors; its spacing has the 32 bits of the renderer."""
+        lattice = self.model_dump(include=set(CircleTarget.model_fields) - {"kind"})
+        spacing = {key: float(np.float32(lattice[key])) for key in ("spacing_x_mm", "spacing_y_mm")}
+        return parse_target({"kind": "circles"} | lattice | spacing)
+
+    def bounds_mm(self) -> np.ndarray:
+        """Corners (2, 2) of the plate, whose middle is its own origin."""
+        return np.array([(-0.5, -0.5), (0.5, 0.5)]) * (self.width_mm, self.height_mm)
+
+    def ink_and_gap_reflectance(self) -> tuple[float, float]:
+        """Reflectance of circles and of dots."""
+        return self.circle_reflectance, self.marker_reflectance
 
 
-def _described_target(value: Any) -> Target:
-    return value if isinstance(value, Target) else parse_target(value)
+def _described_target(value: object) -> Target:
+    return value if isinstance(value, Target) else parse_target(cast(Mapping[str, object], value))
 
 
 class TargetPlate(Printed):
-    """A calibration target of any kind, exactly as described; its own frame is the target's, so it faces -z.
+    """A calibration target of any kind.
 
     ``target`` is a description as in a scene's ``[target]``, which is used if it is left out. ``reflectance`` is the
     ground's, ``ink_reflectance`` that of what is printed on it: dark squares, or circles, which may be brighter than
@@ -279,10 +314,18 @@ class TargetPlate(Printed):
     ink_reflectance: Reflectance = 0.05
     rim_mm: NotNegative = 10.0
 
+    def described_target(self) -> Target:
+        """The target without errors."""
+        return self.target
+
     def bounds_mm(self) -> np.ndarray:
-        """Corners (2, 2) of the plate in its own x-y plane: the one with the smallest x and y, and the opposite one."""
+        """Corners (2, 2) of the plate: those of the print with the rim around it."""
         boxes = np.array([(p.x_min_mm, p.y_min_mm, p.x_max_mm, p.y_max_mm) for p in self.target.patches()])
         return np.array([boxes[:, :2].min(axis=0) - self.rim_mm, boxes[:, 2:].max(axis=0) + self.rim_mm])
+
+    def ink_and_gap_reflectance(self) -> tuple[float, float]:
+        """Reflectance of the ink; without it the ground is seen."""
+        return self.ink_reflectance, self.reflectance
 
 
 AnyObject = Annotated[
@@ -367,12 +410,12 @@ class Scene(Description):
     placements: dict[str, Pose] = {"standoff": Pose()}
     placement: str = "standoff"
     window_mounted: bool = True
-    artefact: dict[str, Any] | None = None
-    target: dict[str, Any] | None = None
+    artefact: dict[str, object] | None = None
+    target: dict[str, object] | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _targets_described(cls, table: Any) -> Any:
+    def _targets_described(cls, table: object) -> object:
         """A target_plate without a description of its own shows the scene's target."""
         if not isinstance(table, dict) or table.get("target") is None or not isinstance(table.get("objects"), list):
             return table
@@ -391,10 +434,10 @@ class Scene(Description):
         return self
 
     @model_validator(mode="after")
-    def _one_circle_plate(self) -> "Scene":
-        plates = [thing for thing in self.objects if isinstance(thing, CirclePlate)]
+    def _one_target_with_detection_errors(self) -> "Scene":
+        plates = [thing for thing in self.objects if isinstance(thing, Printed)]
         if len(plates) > 1 and any(plate.detection_std_px > 0 for plate in plates):
-            raise ValueError("detection_std_px is for scenes with one circle_plate: leave it out, or the other plates")
+            raise ValueError("detection_std_px is for scenes with one target: leave it out, or the other targets")
         return self
 
     def object_poses(self) -> list[np.ndarray]:
@@ -430,6 +473,7 @@ def load_scene(
     return validated(Scene, table, path)
 
 
-def _with_paths_from(folder: Path, thing: dict[str, Any]) -> dict[str, Any]:
+def _with_paths_from(folder: Path, thing: dict[str, object]) -> dict[str, object]:
     """An object's table with relative paths of mesh and texture starting at a folder."""
-    return thing | {key: str(folder / thing[key]) for key in ("path", "texture") if isinstance(thing.get(key), str)}
+    paths = {key: thing.get(key) for key in ("path", "texture")}
+    return thing | {key: str(folder / path) for key, path in paths.items() if isinstance(path, str)}

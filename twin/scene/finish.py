@@ -1,15 +1,14 @@
-"""How surfaces reflect laser light under water: a finish as Mitsuba's BSDF of all but the mirror image."""
+"""Finishes of surfaces under water as Mitsuba's BSDFs of all but the mirror image."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.scene.description import CirclePlate, Flat, Placed, TargetPlate
+from twin.scene.description import Flat, Placed, Printed
 from twin.scene.pattern import pattern_texture
 from uwlts.model.errors import DescriptionError
 from uwlts.model.media import check_range
@@ -35,8 +34,6 @@ _IRON = np.array(
     ]
 ).T
 
-_ALBEDO_SAMPLES = 4096
-
 
 def iron_index(*, wavelength_nm: float) -> complex:
     """Refractive index n + i k of iron, for steel, relative to air; linear between the table's wavelengths.
@@ -58,8 +55,8 @@ def normal_reflectance(relative_index: complex) -> float:
     return abs((relative_index - 1) / (relative_index + 1)) ** 2
 
 
-def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> dict[str, Any]:
-    """Mitsuba's description of how an object scatters light in a medium, without its mirror share.
+def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
+    """How an object scatters light in a medium, without its mirror share.
 
     Without ``gloss`` everything is diffuse: a body without its coat, and a metal with the reflectance of its smooth
     face at normal incidence.
@@ -75,37 +72,31 @@ def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, glo
         return _glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
     metal = thing.finish == "metal"
     scale = normal_reflectance(iron_index(wavelength_nm=wavelength_nm) / medium_index) if metal else 1.0
-    return {"type": "diffuse", "reflectance": _reflectance(thing, scale)}
+    return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale)})
 
 
-def _glossy(
-    thing: Placed, reflectance: float | dict[str, Any], *, medium_index: float, wavelength_nm: float
-) -> dict[str, Any]:
+def _glossy(thing: Placed, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float) -> mi.BSDF:
     """A metal or coated body of a given reflectance; indices are those relative to the medium around it."""
     rough = {"distribution": "ggx", "alpha": thing.gloss_alpha()}
     if thing.finish == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
         metal = {"type": "roughconductor", "eta": index.real, "k": index.imag, "sample_visible": True}
-        return metal | rough | {"specular_reflectance": reflectance}
+        return mi.load_dict(metal | rough | {"specular_reflectance": reflectance})
     coat = {"type": "roughplastic", "int_ior": COAT_INDEX[thing.finish], "ext_ior": medium_index, "nonlinear": False}
-    return coat | rough | {"diffuse_reflectance": reflectance}
+    return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
 
 
-def _reflectance(thing: Placed, scale: float = 1.0) -> float | dict[str, Any]:
-    """Mitsuba's description of an object's reflectance, a number or a texture, times ``scale``."""
-    if isinstance(thing, CirclePlate | TargetPlate):
+def _reflectance(thing: Placed, scale: float = 1.0) -> float | mi.Texture:
+    """Reflectance of an object, a number or a texture, times ``scale``."""
+    if isinstance(thing, Printed):
         return pattern_texture(thing.dimmed(scale))
     if thing.texture is None:
         return scale * thing.reflectance
     # Texture coordinates count v upwards from a picture's last row; Mitsuba counts its rows from the first.
     grey = scale * thing.reflectance * read_grey(thing.texture)[::-1]
     picture = mi.Bitmap(np.ascontiguousarray(grey[..., None], dtype=np.float32))
-    return {
-        "type": "bitmap",
-        "bitmap": picture,
-        "raw": True,
-        "wrap_mode": "clamp" if isinstance(thing, Flat) else "repeat",
-    }
+    wrap_mode = "clamp" if isinstance(thing, Flat) else "repeat"
+    return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": wrap_mode})
 
 
 def read_grey(path: str | Path) -> np.ndarray:
@@ -133,7 +124,7 @@ def read_grey(path: str | Path) -> np.ndarray:
     return grey
 
 
-def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = _ALBEDO_SAMPLES) -> np.ndarray:
+def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 4096) -> np.ndarray:
     """Share (N,) of light from a direction that a surface scatters into its hemisphere, for cosines (N,) to the normal.
 
     As BSDFs are reciprocal, it is also the radiance towards that direction under a sky of radiance 1 all around. The
@@ -145,14 +136,10 @@ def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = _AL
     si = dr.zeros(mi.SurfaceInteraction3f, len(cosines) * samples)
     cosine = dr.gather(mi.Float, mi.Float(np.asarray(cosines, np.float32)), index // samples)
     si.wi = mi.Vector3f(dr.safe_sqrt(1 - dr.square(cosine)), 0, cosine)
-    lattice = _fraction(sample, 0.7548776662), _fraction(sample, 0.5698402910)
-    _, weight = bsdf.sample(mi.BSDFContext(), si, (sample + 0.5) / samples, mi.Point2f(*lattice))
+    scaled = [sample * step for step in (0.7548776662, 0.5698402910)]
+    lattice = mi.Point2f(*(place - dr.floor(place) for place in scaled))
+    _, weight = bsdf.sample(mi.BSDFContext(), si, (sample + 0.5) / samples, lattice)
     return dr.block_sum(weight[0], samples).numpy().astype(float) / samples
-
-
-def _fraction(index: mi.Float, step: float) -> mi.Float:
-    scaled = index * step
-    return scaled - dr.floor(scaled)
 
 
 def albedo_parts(
@@ -162,18 +149,15 @@ def albedo_parts(
 
     The albedo of coated bodies and of metals is linear in ``reflectance``, so the two give it for textures too.
     """
-    black, white = (
-        mi.load_dict(_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm))
-        for grey in (0.0, 1.0)
-    )
-    # Of a metal, Mitsuba tells pi times the BSDF square on instead of a diffuse reflectance, which it has not.
+    black, white = (_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm) for grey in (0.0, 1.0))
+    # A metal does not have a diffuse reflectance; Mitsuba returns pi times its BSDF at normal incidence instead.
     unit = float(white.eval_diffuse_reflectance(square_on(dr.zeros(mi.SurfaceInteraction3f)))[0][0])
     without = directional_albedo(black, cosines)
     return without, (directional_albedo(white, cosines) - without) / unit
 
 
 def square_on(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-    """The same places, looked at along their normals from outside."""
+    """The same places seen along their normals from outside."""
     straight = mi.SurfaceInteraction3f(si)
     straight.wi = mi.Vector3f(0.0, 0.0, 1.0)
     return straight

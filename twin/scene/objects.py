@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, assert_never, cast
@@ -28,7 +28,7 @@ from twin.scene.description import (
     Weld,
 )
 from twin.scene.finish import albedo_parts, finish_bsdf, square_on
-from twin.scene.pattern import register_patterns
+from twin.scene.pattern import register_pattern
 from twin.scene.shapes import bowed_plate, head_surface, weld_surface
 from uwlts.model.errors import DescriptionError
 
@@ -55,7 +55,7 @@ class MirrorFace:
 
 @dataclass(frozen=True)
 class Objects:
-    """All objects in scene coordinates, and what Mitsuba's shapes do not tell of a place that a ray hits.
+    """All objects in scene coordinates, with properties of the places hit that Mitsuba's shapes do not provide.
 
     ``scene`` holds what scatters light; ``mirrors`` are the faces that reflect beside that. Tables give a fact of each
     shape at its number in Dr.Jit's registry, which counts through all scenes of the process.
@@ -113,7 +113,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     RangeError
         The wavelength lies outside the table of a metal.
     """
-    register_patterns()
+    register_pattern()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
     things, poses = scene.objects, scene.object_poses()
     shapes = [
@@ -161,7 +161,7 @@ def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
     return flat
 
 
-def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape:
+def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
     """An object at its pose (4, 4) in the scene."""
     match thing:
         case Sphere():
@@ -178,16 +178,16 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
             along[0, 3] = -thing.length_mm / 2
             matrix = pose @ along
             kind = "cylinder"
-        case CirclePlate() if thing.bow_mm != 0:
+        case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
             return _mesh(thing, pose, bsdf)
-        case TargetPlate():
+        case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
             matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
         case Mesh() | Head() | Weld():
-            return _mesh(thing, pose, {"type": "twosided", "bsdf": bsdf})
-        case Plate() | CirclePlate():
+            return _mesh(thing, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
+        case Plate():
             matrix = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1)
             kind = "rectangle"
         case _:
@@ -195,12 +195,12 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Shape
     return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
 
 
-def _mesh(thing: Mesh | Head | Weld | CirclePlate, pose: np.ndarray, bsdf: dict[str, Any]) -> mi.Mesh:
+def _mesh(thing: Mesh | Head | Weld | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
     """A surface of triangles with its vertices already in scene coordinates."""
     vertices, faces, uv = _surface(thing)
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
+    properties["bsdf"] = bsdf
     mesh = mi.Mesh(thing.kind, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
@@ -211,15 +211,20 @@ def _mesh(thing: Mesh | Head | Weld | CirclePlate, pose: np.ndarray, bsdf: dict[
     return mesh
 
 
-def _surface(thing: Mesh | Head | Weld | CirclePlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface(thing: Mesh | Head | Weld | CirclePlate | TargetPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (V, 3) in the object's own frame, faces (F, 3) and, if it has them, texture coordinates (V, 2)."""
-    if isinstance(thing, FreeForm):
-        # Frozen models are hashable, which type checkers do not see.
-        weld = cast(Any, thing)
-        vertices, faces = head_surface(height_mm=thing.height_mm) if isinstance(thing, Head) else weld_surface(weld)
-        return vertices, faces, None
-    if isinstance(thing, CirclePlate):
-        return bowed_plate(width_mm=thing.width_mm, height_mm=thing.height_mm, bow_mm=thing.bow_mm)
+    match thing:
+        case Head():
+            return *head_surface(height_mm=thing.height_mm), None
+        case Weld():
+            # Frozen models are hashable, which type checkers do not see.
+            return *weld_surface(cast(Hashable, thing)), None
+        case CirclePlate() | TargetPlate():
+            return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
+        case Mesh():
+            pass
+        case _:
+            assert_never(thing)
     vertices, faces, uv = _surface_from_file(thing.path)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         raise DescriptionError(f"{thing.path} holds no usable surface: {len(faces)} faces")

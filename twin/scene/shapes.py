@@ -191,13 +191,18 @@ def _locked(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def bowed_plate(
-    *, width_mm: float, height_mm: float, bow_mm: float, cells: int = 64
+    first_mm: np.ndarray, last_mm: np.ndarray, *, bow_mm: float, cells: int = 64
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), faces (F, 3) and uv (V, 2) of a plate about its own origin that faces -z.
+    """Vertices (V, 3), faces (F, 3) and uv (V, 2) of a plate between two opposite corners (2,) that faces -z.
 
     Its middle stands ``bow_mm`` before its corners, as on a sphere. uv run from 0 to 1 along x and against y.
     """
+    (width, height), middle = last_mm - first_mm, (first_mm + last_mm) / 2
     u, v = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1))
-    x, y = (u - 0.5) * width_mm, (0.5 - v) * height_mm
-    z = bow_mm * (x**2 + y**2) / (0.25 * (width_mm**2 + height_mm**2))
-    return np.stack([x, y, z], -1).reshape(-1, 3), _grid_faces(x.shape), np.stack([u, v], -1).reshape(-1, 2)
+    x, y = (u - 0.5) * width, (0.5 - v) * height
+    z = bow_mm * (x**2 + y**2) / (0.25 * (width**2 + height**2))
+    return (
+        np.stack([middle[0] + x, middle[1] + y, z], -1).reshape(-1, 3),
+        _grid_faces(x.shape),
+        np.stack([u, v], -1).reshape(-1, 2),
+    )

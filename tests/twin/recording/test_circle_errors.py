@@ -27,6 +27,8 @@ PLATE = {
     "columns": COLUMNS,
     "rows": ROWS,
     "origin": ORIGIN,
+    "marker_x": (1, 0),
+    "marker_y": (0, 1),
     "spacing_x_mm": 9.375,
     "spacing_y_mm": 9.372,
     "diameter_mm": 5.0,
@@ -180,7 +182,7 @@ def test_detection_errors_come_on_top_of_printed_ones(small):
 
 def test_detection_errors_are_for_one_plate():
     plates = [CirclePlate.model_validate(PLATE | {"detection_std_px": std}) for std in (0.1, 0.0)]
-    with pytest.raises(ValueError, match="detection_std_px is for scenes with one circle_plate"):
+    with pytest.raises(ValueError, match="detection_std_px is for scenes with one target"):
         Scene(title="two", objects=tuple(plates))
     assert Scene(title="one", objects=plates[:1])
     assert Scene(title="two", objects=plates[1:] * 2)

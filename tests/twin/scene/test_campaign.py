@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin.scene.campaign import Campaign, Imperfections, Take, campaign_names, load_campaign, takes
+from tests.virtual_sensors import scene_of
+from twin.scene.campaign import Campaign, Imperfections, Take, _Drawn, campaign_names, load_campaign, takes
 from twin.scene.description import load_scene
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import load_sensor
@@ -160,6 +161,15 @@ def test_an_imperfection_alone_changes_what_it_is_about_and_nothing_else(name: s
         assert without[take].seed == alone[take].seed
         left = set() if name in ("stage_position_std_mm", "stage_lead_std") else expected
         assert not left & differing(dumped(without[take]), dumped(others[take])), f"{take}: the others leave it alone"
+
+
+def test_any_printed_target_has_a_targets_imperfections():
+    board = {"kind": "chessboard", "columns": 7, "rows": 6, "square_mm": 10.0}
+    scene = scene_of({"kind": "target_plate"}, target=board)
+    found = _Drawn(campaign(**SIZES), 1).as_it_really_is(scene, np.random.default_rng(1)).objects[0]
+    assert (found.centre_std_mm, found.detection_std_px, found.errors_seed) == (0.002, 0.03, 1)
+    assert found.bow_mm != 0
+    assert np.count_nonzero(found.rotation_deg) == 2
 
 
 def test_without_imperfections_everything_is_as_built():

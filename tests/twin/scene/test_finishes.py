@@ -35,7 +35,7 @@ def words(finish: dict[str, object]) -> str:
 
 def bsdf_of(finish: dict[str, object], **optics: float) -> mi.BSDF:
     thing = Plate.model_validate({"kind": "plate", "width_mm": 1.0, "height_mm": 1.0} | finish)
-    return mi.load_dict(finish_bsdf(thing, **OPTICS | optics))
+    return finish_bsdf(thing, **OPTICS | optics)
 
 
 def evaluated(bsdf: mi.BSDF, towards: np.ndarray, light: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from twin.light.renderer import Renderer
 from twin.options import NONE
 from twin.recording.studio import with_window
 from twin.scene.description import TargetPlate
-from twin.scene.pattern import pattern_texture, register_patterns
+from twin.scene.pattern import pattern_texture, printed_shifts, register_pattern
 from uwlts.model.sensor import Sensor
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
 
@@ -62,7 +62,7 @@ def test_the_first_square_of_a_chessboard_is_dark():
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
 def test_the_texture_is_the_print(target):
-    register_patterns()
+    register_pattern()
     scene = scene_of(
         {"kind": "target_plate", "reflectance": GROUND, "ink_reflectance": INK}, target=target.model_dump()
     )
@@ -72,7 +72,7 @@ def test_the_texture_is_the_print(target):
     uv = np.random.default_rng(0).random((20000, 2)).astype(np.float32)
     si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
     si.uv = mi.Point2f(mi.Float(uv[:, 0].copy()), mi.Float(uv[:, 1].copy()))
-    seen = mi.load_dict(pattern_texture(thing)).eval_1(si).numpy()
+    seen = pattern_texture(thing).eval_1(si).numpy()
     first, last = thing.bounds_mm()
     points = first + np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype(float) * (last - first)
     expected = np.where(covered(target, points), INK, GROUND)
@@ -104,6 +104,29 @@ def test_rendered_boards_are_found_where_a_pinhole_sees_them(bare, target):
     errors = refined - expected
     assert np.sqrt((errors**2).mean()) < 0.05
     assert np.abs(errors.mean(axis=0)).max() < 4 * 0.03 / np.sqrt(len(errors))
+
+
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.kind)
+def test_the_print_about_each_point_is_off_by_its_error(target):
+    register_pattern()
+    thing = TargetPlate(
+        kind="target_plate", target=target, reflectance=GROUND, ink_reflectance=INK, centre_std_mm=0.3, errors_seed=2
+    )
+    rng = np.random.default_rng(1)
+    shifts = printed_shifts(thing).reshape(-1, 2)
+    assert len(shifts) == len(target.points_mm)
+    # Within a third of the spacing no other point is nearer, and with the shift the print is that about the same point.
+    beside = target.spacing_mm / 3 * (2 * rng.random((200, len(shifts), 2)) - 1)
+    points = (target.points_mm[:, :2] + beside).reshape(-1, 2)
+    first, last = thing.bounds_mm()
+    uv = ((points - first) / (last - first)).astype(np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
+    si.uv = mi.Point2f(mi.Float(uv[:, 0].copy()), mi.Float(1 - uv[:, 1]))
+    seen = pattern_texture(thing).eval_1(si).numpy()
+    expected = np.where(covered(target, points - np.tile(shifts, (200, 1))), INK, GROUND)
+    # Without the shifts some percent would differ; rounding to 32 bits (1e-5 mm) moves a place or two over an edge.
+    assert np.count_nonzero(np.abs(seen - expected) > 1e-6) <= 2
+    assert np.count_nonzero(expected != np.where(covered(target, points), INK, GROUND)) > 0.01 * len(points)
 
 
 def test_descriptions_need_no_detector():
