@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uwlts.model.calibration import CameraModel
+from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.sensor import Distortion
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
@@ -55,6 +56,11 @@ class Intrinsics:
         object.__setattr__(self, "names", tuple(names))
         object.__setattr__(self, "map", np.array(rows))
         object.__setattr__(self, "fixed", np.array([0, 0, *(centre or (0, 0)), 0, 0, 0, 0, 0], dtype=np.float64))
+
+    @property
+    def keys(self) -> tuple[LensParameter, ...]:
+        """The estimated parameters."""
+        return tuple(key for name in self.names for key in LensParameter if key.text == name)
 
     def _all(self, estimated: np.ndarray) -> np.ndarray:
         return self.fixed + self.map @ estimated

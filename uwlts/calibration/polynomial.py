@@ -168,14 +168,6 @@ class PolynomialResult:
     along: LinePolynomials
     warnings: list[str]
 
-    def depth_rms_mm(self) -> float:
-        """Root mean square residual of Z(position); 0.06 mm in the thesis."""
-        return self.depth.rms()
-
-    def along_rms_mm(self) -> float:
-        """Root mean square residual of Y(Z)."""
-        return self.along.rms()
-
 
 def calibrate_polynomials(
     captures: Sequence[Capture], *, degree: int = 6, stripe: StripeOptions = _STRIPE, progress: Progress | None = None

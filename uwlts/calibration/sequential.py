@@ -8,12 +8,11 @@ from typing import Any, Literal
 import numpy as np
 
 import uwlts
-from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
-from uwlts.calibration.circle_bias import UnbiasedSolution, solve_without_bias
+from uwlts.calibration.camera import CameraSolution, Poses
+from uwlts.calibration.circle_bias import UnbiasedSolution, solve_target
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
-from uwlts.calibration.target_images import TargetImage
 from uwlts.calibration.window import StepImage, WindowSolution, label_step, solve_window
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError
@@ -223,7 +222,15 @@ def gather(
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
     """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
     sensor, found = evidence.sensor, evidence.air
-    camera, unbiased = _camera(evidence, options, start)
+    camera, unbiased = solve_target(
+        found.images,
+        sensor.camera,
+        circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
+        poses=options.poses,
+        approaching=evidence.approaching is not False,
+        options=options.camera,
+        start=start,
+    )
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
     margin = found.target.spacing_mm / 2 if options.margin_mm is None else options.margin_mm
@@ -291,29 +298,6 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
     return sensor
 
 
-def _camera(
-    evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None
-) -> tuple[CameraSolution, UnbiasedSolution | None]:
-    image = evidence.sensor.camera
-
-    def solved(images: Sequence[TargetImage], better: CameraSolution | None) -> CameraSolution:
-        return solve_camera(
-            images,
-            width_px=image.width_px,
-            height_px=image.height_px,
-            poses=options.poses,
-            approaching=evidence.approaching is not False,
-            options=options.camera,
-            start=better or start,
-        )
-
-    diameter_mm = evidence.air.target.circle_diameter_mm
-    if not options.correct_circles or diameter_mm is None:
-        return solved(evidence.air.images, None), None
-    unbiased = solve_without_bias(evidence.air.images, solved, diameter_mm=diameter_mm)
-    return unbiased.solution, unbiased
-
-
 def _approaching(air: Sequence[Capture]) -> bool:
     """Whether the stage moves the sensor towards the target, which stands square to the OCS's Z before the sensor."""
     along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
@@ -327,9 +311,10 @@ def _approaching(air: Sequence[Capture]) -> bool:
 
 
 def _window(
-    calibration: Calibration, evidence: Evidence, plate: Window, options: CalibrationOptions
+    calibration: Calibration, evidence: Evidence, described: Window, options: CalibrationOptions
 ) -> tuple[list[StepEvidence], WindowSolution, list[str]]:
-    window = nominal_window(plate, evidence.sensor, refractions=options.refractions)
+    wavelength = evidence.sensor.laser.wavelength_nm
+    window = WindowModel.described(described, wavelength, refractions=options.refractions)
     used, images, warnings = [], [], []
     for step in evidence.steps:
         try:
@@ -355,20 +340,6 @@ def step_image(calibration: Calibration, window: WindowModel | None, step: StepE
         medium_index=step.medium_index,
         edge_mm=standard.edge_mm,
         reference=standard.reference,
-    )
-
-
-def nominal_window(plate: Window, sensor: Sensor, *, refractions: Literal[1, 2]) -> WindowModel:
-    """A window as described, as the reconstruction sees it: a glass plate, or one interface."""
-    normal = tuple(plate.normal().tolist())
-    if refractions == 1:
-        return WindowModel(refractions=1, distance_mm=plate.distance_mm, normal=normal)
-    return WindowModel(
-        refractions=2,
-        distance_mm=plate.distance_mm,
-        normal=normal,
-        thickness_mm=plate.thickness_mm,
-        glass_index=plate.index(sensor.laser.wavelength_nm),
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts.model.joint_estimate import JointEstimate, Origin, joint_estimate_in
-from uwlts.model.sensor import Description, Distortion, Medium, Positive, Vector
+from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Vector, Window
 
 Matrix4 = tuple[tuple[float, float, float, float], ...]
 
@@ -22,6 +22,20 @@ class CameraModel(Description):
     cx_px: float
     cy_px: float
     distortion: Distortion = Distortion()
+
+    @classmethod
+    def described(cls, camera: Camera, *, magnified: float = 1.0) -> "CameraModel":
+        """A camera as described; with a focal length ``magnified`` by refraction the distortion is not known: zero."""
+        f, (cx, cy) = camera.focal_length_px() * magnified, camera.principal_point()
+        return cls(
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            fx_px=f,
+            fy_px=f,
+            cx_px=cx,
+            cy_px=cy,
+            distortion=camera.distortion if magnified == 1.0 else Distortion(),
+        )
 
     def matrix(self) -> np.ndarray:
         """Camera matrix K (3, 3)."""
@@ -46,6 +60,20 @@ class WindowModel(Description):
     normal: Vector = (0.0, 0.0, 1.0)
     thickness_mm: Annotated[float, Field(ge=0)] = 0.0
     glass_index: Annotated[float, Field(ge=1, lt=4)] = 1.0
+
+    @classmethod
+    def described(cls, window: Window, wavelength_nm: float, *, refractions: Literal[1, 2] = 2) -> "WindowModel":
+        """A window as described, for light of a wavelength: a pane of glass, or one interface."""
+        normal = tuple(window.normal().tolist())
+        if refractions == 1:
+            return cls(refractions=1, distance_mm=window.distance_mm, normal=normal)
+        return cls(
+            refractions=2,
+            distance_mm=window.distance_mm,
+            normal=normal,
+            thickness_mm=window.thickness_mm,
+            glass_index=window.index(wavelength_nm),
+        )
 
 
 class FanModel(Description):

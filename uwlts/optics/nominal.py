@@ -19,30 +19,13 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
     plane that fits the fan's rays best where the camera sees them, after they have passed the laser's window: a window
     turned about the sheet's normal leaves the sheet as it is, one turned about the fan's direction turns and bends it.
     """
-    camera, plate = sensor.camera, sensor.camera.window
-    f, (cx, cy) = camera.focal_length_px(), camera.principal_point()
+    camera = sensor.camera
     return Calibration(
         sensor_name=sensor.name,
         stripe_along=camera.stripe_along,
         wavelength_nm=sensor.laser.wavelength_nm,
-        camera=CameraModel(
-            width_px=camera.width_px,
-            height_px=camera.height_px,
-            fx_px=f,
-            fy_px=f,
-            cx_px=cx,
-            cy_px=cy,
-            distortion=camera.distortion,
-        ),
-        window=WindowModel(
-            refractions=2,
-            distance_mm=plate.distance_mm,
-            normal=tuple(plate.normal()),
-            thickness_mm=plate.thickness_mm,
-            glass_index=plate.index(sensor.laser.wavelength_nm),
-        )
-        if plate.mounted
-        else None,
+        camera=CameraModel.described(camera),
+        window=WindowModel.described(camera.window, sensor.laser.wavelength_nm) if camera.window.mounted else None,
         sheet=_fan_plane(sensor) if medium is None else _sheet(sensor, medium),
         camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
         provenance={"source": f"description of the sensor '{sensor.name}'"},
@@ -60,18 +43,7 @@ def _sheet(sensor: Sensor, medium: Medium) -> SheetModel:
     half = math.radians(laser.fan_angle_deg / 2)
     angle = np.linspace(-half, half, _RAYS)
     fan = np.stack([np.zeros(_RAYS), np.sin(angle), np.cos(angle)], axis=1)
-    plate = laser.window
-    window = (
-        WindowModel(
-            refractions=2,
-            distance_mm=plate.distance_mm,
-            normal=tuple(plate.normal()),
-            thickness_mm=plate.thickness_mm,
-            glass_index=plate.index(laser.wavelength_nm),
-        )
-        if plate.mounted
-        else None
-    )
+    window = WindowModel.described(laser.window, laser.wavelength_nm) if laser.window.mounted else None
     rays = trace_window(fan, window, medium_index=medium.refractive_index(laser.wavelength_nm))
     # Module frame of the laser: x along the sheet's normal, y along the fan, z along the axis.
     module = np.stack([pose.normal, pose.fan, pose.axis])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.evidence import step_evidence
-from uwlts.calibration.sequential import nominal_window, step_image
+from uwlts.calibration.sequential import step_image
 from uwlts.calibration.window import StepImage, solve_window, step_profile
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.round_fits import fit_sphere
@@ -14,7 +14,7 @@ from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import SphereStandard
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.sensor import Medium
 from uwlts.optics.reconstruction import reconstruct_pixels
@@ -158,9 +158,8 @@ def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, 
     for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
         with Capture(path) as capture:
             evidence, _ = step_evidence([capture])
-            described = nominal_window(
-                capture.header.sensor.camera.window, capture.header.sensor, refractions=calibration.window.refractions
-            )
+            sensor, refractions = capture.header.sensor, calibration.window.refractions
+            described = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
         found[place] = [step_image(calibration, described, step) for step in evidence]
     return found
 

@@ -159,8 +159,8 @@ def test_unseen_depths(sensor, result):
     errors = errors_between(result.calibration, sensor)
     assert np.abs(errors).max() < CLOSE_MM
     assert result.warnings == []
-    assert result.depth_rms_mm() < CLOSE_MM / 2
-    assert result.along_rms_mm() < CLOSE_MM / 2
+    assert result.depth.rms() < CLOSE_MM / 2
+    assert result.along.rms() < CLOSE_MM / 2
 
 
 def test_origin_is_where_the_described_sensor_has_it(sensor, result):
@@ -206,7 +206,7 @@ def test_missing_lines_borrow(sensor):
 def test_noise_is_averaged_over_the_lines(sensor):
     """Fitting P coefficients to N points of noise s leaves s sqrt(P / N), several times that at the range's ends."""
     noisy = fit_polynomials(evidence_of(sensor, noise_px=0.2, seed=4), header_of(sensor), degree=6)
-    rms, count = noisy.depth_rms_mm(), np.count_nonzero(noisy.depth.used)
+    rms, count = noisy.depth.rms(), np.count_nonzero(noisy.depth.used)
     assert 0.2 * 0.15 < rms < 0.2 * 0.35, "0.2 px are 0.03 mm near and 0.07 mm far"
     expected = rms * np.sqrt(7 * (MOST_SMOOTH + 1) / count)
     errors = errors_between(noisy.calibration, sensor)[:, 1]

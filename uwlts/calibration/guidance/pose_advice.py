@@ -9,12 +9,10 @@ from uwlts.calibration.camera import CameraSolution
 from uwlts.calibration.guidance.coverage import (
     Candidate,
     Coverage,
-    Spread,
     candidates,
     coverage_of,
     information_of,
     place_words,
-    spread_of,
     target_middle,
     tilts_rad,
     working_range_mm,
@@ -23,6 +21,7 @@ from uwlts.calibration.guidance.solution import RecordedPose, Setting, nominal_c
 from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import LensParameter
 from uwlts.optics.camera import project
 from uwlts.targets import TargetView
 
@@ -30,8 +29,15 @@ from uwlts.targets import TargetView
 _USUAL_SIGMA_PX, _LEAST_SIGMA_PX = 0.1, 0.02
 # What is known of a described lens before anything is seen, as standard deviations: shares of f and of the image's
 # side, and plain coefficients.
-_PRIOR = {"f": 0.05, "fx": 0.05, "fy": 0.05, "cx": 0.05, "cy": 0.05, "k1": 0.3, "k2": 3.0, "p1": 0.02, "p2": 0.02}
-_PRIOR_K3 = 10.0
+_FOCAL = (LensParameter.F, LensParameter.FX, LensParameter.FY)
+_CENTRE = (LensParameter.CX, LensParameter.CY)
+_PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
+    LensParameter.K1: 0.3,
+    LensParameter.K2: 3.0,
+    LensParameter.P1: 0.02,
+    LensParameter.P2: 0.02,
+    LensParameter.K3: 10.0,
+}
 _COVERAGE_WEIGHT = 4.0
 _SPREAD_WEIGHT = 0.5
 _SIDES = ("right side", "left side", "lower side", "upper side")
@@ -58,6 +64,10 @@ class Wanted:
     tilt_rad: float = float(np.radians(12))
     fewest_images: int = 8
 
+    def std_px(self) -> dict[LensParameter, float]:
+        """Wanted standard deviation of every parameter of which one is wanted."""
+        return dict.fromkeys(_FOCAL, self.focal_std_px) | dict.fromkeys(_CENTRE, self.centre_std_px)
+
 
 @dataclass(frozen=True, eq=False)
 class State:
@@ -80,19 +90,18 @@ class State:
     undetermined: str
     poses: np.ndarray
     coverage: Coverage
-    spread: Spread | None
     information: np.ndarray
 
-    def std(self) -> dict[str, float]:
+    def std(self) -> dict[LensParameter, float]:
         """Standard deviation of every camera parameter: the solution's, or what is expected without one."""
-        if self.solution is not None:
-            return self.solution.std()
-        return self.expected_std(self.information)
+        if self.solution is None:
+            return self.expected_std(self.information)
+        return dict(zip(_intrinsics(self.setting).keys, self.solution.std().values(), strict=True))
 
-    def expected_std(self, information: np.ndarray) -> dict[str, float]:
+    def expected_std(self, information: np.ndarray) -> dict[LensParameter, float]:
         """Standard deviations that belong to information (P, P)."""
-        names = _intrinsics(self.setting).names
-        return dict(zip(names, np.sqrt(np.diag(np.linalg.inv(information))).tolist(), strict=True))
+        std = np.sqrt(np.diag(np.linalg.inv(information))).tolist()
+        return dict(zip(_intrinsics(self.setting).keys, std, strict=True))
 
     @property
     def enough(self) -> bool:
@@ -128,11 +137,10 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
         except CalibrationError as error:
             undetermined = str(error)
     poses = np.array([pose_of(pose.view, camera) for pose in recorded]) if solution is None else solution.target_poses
-    sigma = _USUAL_SIGMA_PX if solution is None else max(solution.sigma_px, _LEAST_SIGMA_PX)
+    sigma = _sigma(solution)
     information = _prior(setting, camera)
     for pose, where in zip(recorded, poses, strict=True):
-        view = pose.view
-        information = information + _scaled(view, where, camera, setting, sigma)
+        information = information + _scaled(pose.view, where, camera, setting, sigma)
     image = setting.sensor.camera
     return State(
         setting=setting,
@@ -143,7 +151,6 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
         undetermined=undetermined,
         poses=poses.reshape(-1, 4, 4),
         coverage=coverage_of([p.view.pixels for p in recorded], width_px=image.width_px, height_px=image.height_px),
-        spread=spread_of(list(poses), [pose.view.points_mm.mean(axis=0) for pose in recorded]),
         information=information,
     )
 
@@ -151,7 +158,7 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
 def lack(state: State, information: np.ndarray, coverage: Coverage, poses: Iterable[np.ndarray]) -> float:
     """How much is missing: 0 once all that is wanted is reached, else logarithms of ratios and weighted shares."""
     std = state.expected_std(information)
-    ratios = np.log([value / _wanted_std(state.wanted, name) for name, value in std.items() if _is_wanted(name)])
+    ratios = np.log([std[key] / limit for key, limit in state.wanted.std_px().items() if key in std])
     short = state.wanted.coverage - coverage.share
     tilts = _untilted(state, poses).sum()
     beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - coverage.share))
@@ -175,7 +182,7 @@ def best_pose(state: State, *, spin_rad: float = 0.0) -> PoseAdvice | None:
     )
     if not options:
         return None
-    sigma = _sigma(state)
+    sigma = _sigma(state.solution)
     before = lack(state, state.information, state.coverage, state.poses)
     after = [
         lack(
@@ -193,7 +200,7 @@ def best_pose(state: State, *, spin_rad: float = 0.0) -> PoseAdvice | None:
 
 def gain_of(state: State, view: TargetView, pose: np.ndarray) -> float:
     """By how much an image, seen at a pose ``T_camera_target`` (4, 4), would lessen what is missing."""
-    information = state.information + _scaled(view, pose, state.camera, state.setting, _sigma(state))
+    information = state.information + _scaled(view, pose, state.camera, state.setting, _sigma(state.solution))
     before = lack(state, state.information, state.coverage, state.poses)
     return before - lack(state, information, state.coverage.with_points(view.pixels), [*state.poses, pose])
 
@@ -230,9 +237,12 @@ def missing(state: State) -> list[str]:
         said.append(f"{len(state.recorded)} images, at least {wanted.fewest_images} are wanted")
     if state.solution is None:
         said.append(state.undetermined)
-    for name, value in state.std().items():
-        if _is_wanted(name) and value > _wanted_std(wanted, name):
-            said.append(f"{name} is known to {value:.2g} px, {_wanted_std(wanted, name):g} px are wanted")
+    std = state.std()
+    said += [
+        f"{key.text} is known to {std[key]:.2g} px, {limit:g} px are wanted"
+        for key, limit in wanted.std_px().items()
+        if key in std and std[key] > limit
+    ]
     if state.coverage.share < wanted.coverage:
         said.append(
             f"{100 * state.coverage.share:.0f} % of the image is covered, {100 * wanted.coverage:.0f} % are wanted: "
@@ -248,8 +258,8 @@ def _scaled(view: TargetView, pose: np.ndarray, camera: CameraModel, setting: Se
     return information_of(view.points_mm, view.pixels, pose, camera, setting.camera) / sigma**2
 
 
-def _sigma(state: State) -> float:
-    return _USUAL_SIGMA_PX if state.solution is None else max(state.solution.sigma_px, _LEAST_SIGMA_PX)
+def _sigma(solution: CameraSolution | None) -> float:
+    return _USUAL_SIGMA_PX if solution is None else max(solution.sigma_px, _LEAST_SIGMA_PX)
 
 
 def _intrinsics(setting: Setting) -> Intrinsics:
@@ -259,17 +269,10 @@ def _intrinsics(setting: Setting) -> Intrinsics:
 
 def _prior(setting: Setting, camera: CameraModel) -> np.ndarray:
     """What the description tells (P, P)."""
-    size = {"f": camera.fx_px, "fx": camera.fx_px, "fy": camera.fy_px, "cx": camera.width_px, "cy": camera.height_px}
-    stds = [_PRIOR.get(name, _PRIOR_K3) * size.get(name, 1.0) for name in _intrinsics(setting).names]
+    size = dict.fromkeys(_FOCAL, camera.fx_px) | {LensParameter.FY: camera.fy_px}
+    size |= {LensParameter.CX: camera.width_px, LensParameter.CY: camera.height_px}
+    stds = [_PRIOR[key] * size.get(key, 1.0) for key in _intrinsics(setting).keys]
     return np.diag(np.array(stds) ** -2.0)
-
-
-def _is_wanted(name: str) -> bool:
-    return name[0] in "fc"
-
-
-def _wanted_std(wanted: Wanted, name: str) -> float:
-    return wanted.focal_std_px if name.startswith("f") else wanted.centre_std_px
 
 
 def _angle(one: np.ndarray, other: np.ndarray) -> float:

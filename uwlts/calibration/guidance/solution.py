@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
-from uwlts.calibration.circle_bias import solve_without_bias
+from uwlts.calibration.camera import CameraSolution, Poses
+from uwlts.calibration.circle_bias import solve_target
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sheet import SheetSolution, fit_sheet, points_on_target
 from uwlts.calibration.target_images import TargetImage
@@ -50,17 +50,7 @@ def nominal_camera(setting: Setting) -> CameraModel:
     """The described camera; through a window into a medium its focal length grows by the medium's index."""
     camera = setting.sensor.camera
     index = setting.medium.refractive_index(setting.sensor.laser.wavelength_nm) if camera.window.mounted else 1.0
-    f, (cx, cy) = camera.focal_length_px() * index, camera.principal_point()
-    distortion = camera.distortion if index == 1.0 else type(camera.distortion)()
-    return CameraModel(
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        fx_px=f,
-        fy_px=f,
-        cx_px=cx,
-        cy_px=cy,
-        distortion=distortion,
-    )
+    return CameraModel.described(camera, magnified=index)
 
 
 def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
@@ -78,24 +68,15 @@ def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
 
 def solve_recorded(recorded: Sequence[RecordedPose], setting: Setting) -> CameraSolution:
     """Camera and poses from what is recorded; CalibrationError where that does not determine them yet."""
-    camera = setting.sensor.camera
-
-    def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
-        return solve_camera(
-            images,
-            width_px=camera.width_px,
-            height_px=camera.height_px,
+    try:
+        return solve_target(
+            [pose.image() for pose in recorded],
+            setting.sensor.camera,
+            circle_diameter_mm=setting.target.circle_diameter_mm,
             poses=setting.poses,
             approaching=setting.approaching,
             options=setting.camera,
-            start=start,
-        )
-
-    images = [pose.image() for pose in recorded]
-    try:
-        if (diameter_mm := setting.target.circle_diameter_mm) is not None:
-            return solve_without_bias(images, solved, diameter_mm=diameter_mm).solution
-        return solved(images, None)
+        )[0]
     except RangeError as error:
         raise CalibrationError(str(error)) from error
 

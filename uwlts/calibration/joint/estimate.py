@@ -1,7 +1,7 @@
 """The joint least squares: all evidence and all prior knowledge, weighted by the scatter that the evidence shows."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,8 +27,7 @@ _SETTLED_PX = 1e-3
 # uncertainty, and what is left after it is far less. What the first round finds is but a start for the next.
 _SMALLEST_GAIN, _FIRST_GAIN = 1e-7, 1e-3
 _DAMPING, _FIRST_DAMPING = 1e-9, 1e-4
-_FIRST_EVERY = 4
-"""Of the stripe's lines on targets, in the first round."""
+_FIRST_LINES = slice(None, None, 4)  # of the stripes on targets in the first round: good enough for a start, and fast
 _FIRST_ROUNDS = 30
 
 
@@ -92,7 +91,8 @@ def estimate(
     moved = np.inf
     for number in range(_ROUNDS):
         first, last = number == 0, number == _ROUNDS - 1
-        fit = problem.fit([_thinned(e) for e in evidence] if first else evidence, global_values, local, known, left_out)
+        thinned = [e.with_stripes(_FIRST_LINES) if isinstance(e, TargetEvidence) else e for e in evidence]
+        fit = problem.fit(thinned if first else evidence, global_values, local, known, left_out)
         global_values, local, rounds = fit.global_values, fit.local[:-1], rounds + fit.rounds
         residuals = problem.residuals(evidence, global_values, local)
         before, known = known, problem.noise(evidence, residuals)
@@ -209,18 +209,6 @@ class _Problem:
                 each = sum(len(r.values) for r in of_kind) / bodies
                 result[kind] = with_slope_bias(result[kind], points_per_body=each)
         return result
-
-
-def _thinned(evidence: Evidence) -> Evidence:
-    """Evidence with some of the stripe's lines only: good enough for a start, and much sooner done."""
-    if not isinstance(evidence, TargetEvidence):
-        return evidence
-    return replace(
-        evidence,
-        stripe_pixels=evidence.stripe_pixels[::_FIRST_EVERY],
-        stripe_image=evidence.stripe_image[::_FIRST_EVERY],
-        stripe_shifts_mm=evidence.stripe_shifts_mm[::_FIRST_EVERY],
-    )
 
 
 def _of_local(off: np.ndarray, by_local: np.ndarray, local: np.ndarray, global_values: int) -> Observation:

@@ -73,6 +73,15 @@ class TargetEvidence:
         """Numbers of the images whose stage positions have errors of their own."""
         return np.unique(self.placement.image)[1:] if self.staged else np.empty(0, dtype=int)
 
+    def with_stripes(self, chosen: np.ndarray | slice) -> "TargetEvidence":
+        """The same with some of the stripe pixels only."""
+        return replace(
+            self,
+            stripe_pixels=self.stripe_pixels[chosen],
+            stripe_image=self.stripe_image[chosen],
+            stripe_shifts_mm=self.stripe_shifts_mm[chosen],
+        )
+
     def pose(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int) -> np.ndarray:
         """``T_camera_target`` (4, 4) of one of the images."""
         pose = _Pose.of(self, parameters, global_values, local, image)

@@ -89,11 +89,11 @@ def series_start(
         lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
     camera, evidence, local = intrinsics.model(lens), [], []
     for part in series:
-        index, through = _index(part.view, indices), window if part.view.window else None
+        seen_by = _Viewpoint.of(camera, part.view, window, indices)
         alone = free or part.approaching is None
         for placement in part.placements(free=free):
-            pose = _pose(camera, placement, through, index)
-            piece = _evidence(part, placement, camera, through, pose, sensor, index, margin_mm, staged=not alone)
+            pose = seen_by.pose(placement)
+            piece = _evidence(part, placement, seen_by, pose, sensor, margin_mm, staged=not alone)
             evidence.append(piece)
             local.append(pose if alone else np.concatenate([pose, np.zeros(2 + len(piece.images()))]))
     return SeriesStart(intrinsics, lens, evidence, local)
@@ -112,24 +112,13 @@ def sheet_start(
     if not views:
         return None
     view = min(views, key=lambda v: (v.medium is not None, v.window))
-    camera, through = start.intrinsics.model(start.lens), window if view.window else None
+    seen_by = _Viewpoint.of(start.intrinsics.model(start.lens), view, window, indices)
     points = []
     for piece, local in zip(start.evidence, start.local, strict=True):
         if piece.view == view and len(piece.stripe_pixels):
-            at = _on_target(
-                camera,
-                through,
-                _index(view, indices),
-                piece.stripe_pixels,
-                local,
-                piece.stripe_shifts_mm,
-                piece.placement.direction(np.empty(0)),
-            )
-            rotation = cv2.Rodrigues(local[:3])[0]
-            points.append(
-                (at - piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))) @ rotation.T
-                + local[3:6]
-            )
+            moved = piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))
+            at = seen_by.on_target(piece.stripe_pixels, local, moved)
+            points.append((at - moved) @ cv2.Rodrigues(local[:3])[0].T + local[3:6])
     pose, plate = laser_pose(sensor), sensor.laser.window
     sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
     normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
@@ -158,27 +147,46 @@ def _index(view: View, indices: Sequence[float]) -> float:
     return indices[view.medium] if view.window and view.medium is not None else 1.0
 
 
-def _pose(camera: CameraModel, placement: Placement, window: WindowModel | None, index: float) -> np.ndarray:
-    """Rotation vector and shift (6,) of a placement, seen through the window as if from a single viewpoint."""
-    rays = directions(camera, placement.pixels)
-    if not np.isfinite(rays).all():
-        raise CalibrationError("the distortion found first has no inverse where the target is seen: fix some of it")
-    seen = replace(placement, pixels=rays[:, :2] / rays[:, 2:])
-    pose = placement_pose(seen, np.diag([index, index, 1.0]))
-    if window is not None:
-        outer = window.distance_mm + window.thickness_mm
-        pose[5] += outer - index * (window.distance_mm + window.thickness_mm / window.glass_index)
-    return pose
+@dataclass(frozen=True, eq=False)
+class _Viewpoint:
+    """A camera with the window in its view and the index behind it."""
+
+    camera: CameraModel
+    window: WindowModel | None
+    index: float
+
+    @classmethod
+    def of(cls, camera: CameraModel, view: View, window: WindowModel | None, indices: Sequence[float]) -> "_Viewpoint":
+        return cls(camera, window if view.window else None, _index(view, indices))
+
+    def pose(self, placement: Placement) -> np.ndarray:
+        """Rotation vector and shift (6,) of a placement, seen through the window as if from a single viewpoint."""
+        rays = directions(self.camera, placement.pixels)
+        if not np.isfinite(rays).all():
+            raise CalibrationError("the distortion found first has no inverse where the target is seen: fix some of it")
+        seen = replace(placement, pixels=rays[:, :2] / rays[:, 2:])
+        pose, window = placement_pose(seen, np.diag([self.index, self.index, 1.0])), self.window
+        if window is not None:
+            outer = window.distance_mm + window.thickness_mm
+            pose[5] += outer - self.index * (window.distance_mm + window.thickness_mm / window.glass_index)
+        return pose
+
+    def on_target(self, pixels: np.ndarray, pose: np.ndarray, moved_mm: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the moved target where rays meet it, in its frame; NaN where one does not."""
+        rays = trace_window(directions(self.camera, pixels), self.window, medium_index=self.index)
+        rotation = cv2.Rodrigues(pose[:3])[0]
+        start = (rays.origins - pose[3:6]) @ rotation + moved_mm
+        along = rays.directions @ rotation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return start - (start[:, 2] / along[:, 2])[:, None] * along
 
 
 def _evidence(
     series: Series,
     placement: Placement,
-    camera: CameraModel,
-    window: WindowModel | None,
+    seen_by: _Viewpoint,
     pose: np.ndarray,
     sensor: Sensor,
-    index: float,
     margin_mm: float | None,
     *,
     staged: bool,
@@ -191,7 +199,7 @@ def _evidence(
     shifts = stage_mm[image] - stage_mm[placement.image[0]] if staged else np.zeros(len(image))
     extent = found.target.extent_mm
     margin = found.target.spacing_mm / 2 if margin_mm is None else margin_mm
-    at = _on_target(camera, window, index, pixels, pose, shifts, placement.direction(np.empty(0)))
+    at = seen_by.on_target(pixels, pose, shifts[:, None] * placement.direction(np.empty(0)))
     hull = ConvexHull(extent).equations
     with np.errstate(invalid="ignore"):
         on_target = (at[:, :2] @ hull[:, :2].T + hull[:, 2] <= margin).all(axis=1)
@@ -207,24 +215,6 @@ def _evidence(
         radius_mm=float(np.linalg.norm(extent - middle, axis=1).max()),
         middle_mm=middle,
     )
-
-
-def _on_target(
-    camera: CameraModel,
-    window: WindowModel | None,
-    index: float,
-    pixels: np.ndarray,
-    pose: np.ndarray,
-    shifts_mm: np.ndarray,
-    direction: np.ndarray,
-) -> np.ndarray:
-    """Where rays meet the target: (N, 3) in its frame; NaN where one does not."""
-    rays = trace_window(directions(camera, pixels), window, medium_index=index)
-    rotation = cv2.Rodrigues(pose[:3])[0]
-    start = (rays.origins - pose[3:6]) @ rotation + shifts_mm[:, None] * direction
-    along = rays.directions @ rotation
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return start - (start[:, 2] / along[:, 2])[:, None] * along
 
 
 def step_profiles(

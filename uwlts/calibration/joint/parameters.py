@@ -18,7 +18,7 @@ from uwlts.calibration.joint.derivatives import (
 from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
 from uwlts.model.calibration import CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import CalibrationError
-from uwlts.model.parameter_keys import MediumIndex, ParameterKey, parameter_of
+from uwlts.model.parameter_keys import MediumIndex, ParameterKey
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +109,8 @@ class Parameters:
     keys: tuple[ParameterKey, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        lens = (parameter_of(name) for name in self.intrinsics.names)
         known = (key for key, prior in self.priors.items() if prior.std > 0)
-        object.__setattr__(self, "keys", (*lens, *known))
+        object.__setattr__(self, "keys", (*self.intrinsics.keys, *known))
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from uwlts.calibration.circle_bias import centre_offsets
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.joint.consistency import findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
@@ -17,16 +18,15 @@ from uwlts.calibration.joint.initial import line_start, series_start, sheet_star
 from uwlts.calibration.joint.initial_scans import surface_scans
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
-from uwlts.calibration.sequential import CalibrationOptions, nominal_window
+from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.calibration.sheet import object_frame
-from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
+from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.camera import project_through_window
 from uwlts.storage.capture import Capture
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     refuse_two_lenses(gathered)
     window = None
     if any(view.window for view in gathered.views()):
-        window = nominal_window(sensor.camera.window, sensor, refractions=2)
+        window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm)
     wavelength, free = sensor.laser.wavelength_nm, options.poses == "free"
     indices = [options.medium_index or medium.refractive_index(wavelength) for medium in gathered.media.values()]
     start = series_start(
@@ -222,15 +222,9 @@ def _with_centres(
     view, placement = evidence.view, evidence.placement
     camera, index = parameters.camera(global_values), parameters.medium_index(global_values, view)
     window = parameters.window_model(global_values) if view.window else None
+    seen_by = partial(project_through_window, camera, window, medium_index=index)
     pixels = placement.pixels.copy()
     for image in np.unique(placement.image):
         pose, here = evidence.pose(parameters, global_values, local, image), placement.image == image
-
-        def project(points: np.ndarray, pose: np.ndarray = pose) -> np.ndarray:
-            seen = points @ pose[:3, :3].T + pose[:3, 3]
-            return project_through_window(camera, window, seen, medium_index=index)
-
-        pixels[here] -= circle_centre_bias(
-            project, placement.points_mm[here], diameter_mm=diameter_mm, axis_u=np.eye(3)[0], axis_v=np.eye(3)[1]
-        )
+        pixels[here] -= centre_offsets(seen_by, pose, placement.points_mm[here], diameter_mm=diameter_mm)
     return replace(evidence, placement=replace(placement, pixels=pixels))

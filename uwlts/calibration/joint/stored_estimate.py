@@ -79,7 +79,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         )
         view = View(window, len(media) - 1)
     lens = len(intrinsics.names)
-    if tuple(key.text for key in keys[:lens]) != intrinsics.names:
+    if tuple(keys[:lens]) != intrinsics.keys:
         raise _damaged("its parameters do not fit together")
     priors = {key: Prior(value, np.inf) for key, value in zip(keys[lens:], values[lens:], strict=True)}
     priors |= {key: Prior(value, 0.0) for key, value in _held(calibration).items() if key not in priors}

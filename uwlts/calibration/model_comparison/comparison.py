@@ -55,10 +55,13 @@ class Choice:
 
     def simplest(self) -> Candidate:
         """Of these that with the fewest parameters."""
-        return min(self.good_among(self._able())[1], key=lambda each: each.parameters).candidate
+        return min(self.good_among(self._able())[1], key=self._size).candidate
 
     def _able(self) -> list[Judged]:
         return [each for each in self.judged if each.scores]
+
+    def _size(self, judged: Judged) -> int:
+        return len(self.predictions[judged.candidate][INSIDE].parameters.keys)
 
     def number(self, candidate: Candidate) -> int:
         """Number of a model among those that have scores."""
@@ -84,7 +87,7 @@ class Choice:
         """Of the ways in which one thing can be modelled, the simplest that is as good as the best of them."""
         alternatives = [replace(Candidate(), **{name: value}) for value in levels]
         _, good = self.good_among([e for e in self.judged if e.scores and e.candidate in alternatives])
-        return getattr(min(good, key=lambda each: each.parameters).candidate, name)
+        return getattr(min(good, key=self._size).candidate, name)
 
 
 def choose(
@@ -134,7 +137,8 @@ def _predicted(
     for place, candidate in enumerate(candidates):
         own = results[place * len(ways) : (place + 1) * len(ways)]
         reasons = [each for each in own if isinstance(each, str)]
-        found[candidate] = reasons[0] if reasons else {way.where: p for way, p in zip(ways, own, strict=True)}
+        predicted = {way.where: each for way, each in zip(ways, own, strict=True) if not isinstance(each, str)}
+        found[candidate] = reasons[0] if reasons else predicted
     return found
 
 

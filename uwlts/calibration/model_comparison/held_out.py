@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import assert_never
 
 import cv2
 import numpy as np
@@ -13,8 +14,8 @@ from uwlts.calibration.joint.evidence import STEP, TARGET, Residuals, StepProfil
 from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.procedure import JointProblem, centred
+from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.model_comparison.candidates import Candidate, recast
-from uwlts.calibration.target_images import Placement
 from uwlts.model.errors import CalibrationError
 
 INSIDE, OUTSIDE = "inside", "outside"
@@ -100,20 +101,10 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
 def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
     """The evidence of some of the images; stage positions still count from the first of all."""
     placement, wanted = evidence.placement, list(images)
-    here, lit = np.isin(placement.image, wanted), np.isin(evidence.stripe_image, wanted)
-    return replace(
-        evidence,
-        placement=Placement(
-            placement.points_mm[here],
-            placement.shifts_mm[here],
-            placement.pixels[here],
-            placement.image[here],
-            placement.along_z,
-        ),
-        stripe_pixels=evidence.stripe_pixels[lit],
-        stripe_image=evidence.stripe_image[lit],
-        stripe_shifts_mm=evidence.stripe_shifts_mm[lit],
-    )
+    here = np.isin(placement.image, wanted)
+    kept = {name: getattr(placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
+    some = replace(evidence, placement=replace(placement, **kept))
+    return some.with_stripes(np.isin(evidence.stripe_image, wanted))
 
 
 _ROUNDS, _SETTLED_PX = 20, 1e-4
@@ -172,31 +163,32 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
         kind, share = next(iter(misfits.items()))
         raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
     local = dict(zip(numbers, estimate.local, strict=True))
-    kept = dict(zip(numbers, training.evidence, strict=True))
     found = []
     for number in sorted({number for number, _ in split.held}):
         piece, images = whole.evidence[number], sorted(image for held, image in split.held if held == number)
-        for evidence, pose, fitted in _posed(
-            whole, estimate, piece, number, images, kept.get(number), local.get(number)
-        ):
+        match piece:
+            case TargetEvidence():
+                posed = _posed(whole, piece, number, images, local.get(number))
+            case StepProfileEvidence():
+                posed = [(piece, whole.local[number], (STEP,))]
+            case SurfaceScanEvidence():
+                continue  # scans are never held out
+            case _:
+                assert_never(piece)
+        for evidence, pose, fitted in posed:
             parts = _residuals(whole, estimate, evidence, pose, fitted=fitted)
             found += [_misses(number, part) for part in parts if part.image in images]
     return Prediction(found, estimate.parameters, estimate.values, estimate.covariance)
 
 
 def _posed(
-    problem: JointProblem,
-    estimate: Estimate,
-    piece: Evidence,
-    number: int,
-    images: list[int],
-    kept: TargetEvidence | None,
-    local: np.ndarray | None,
+    problem: JointProblem, piece: TargetEvidence, number: int, images: list[int], local: np.ndarray | None
 ) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:
-    """Evidence held out with its local parameters, and the kinds of residuals to which these are yet to be fitted."""
-    if isinstance(piece, StepProfileEvidence):
-        return [(piece, problem.local[number], (STEP,))]
-    if kept is not None and piece.staged and len(kept.images()):
+    """Images held out with their local parameters, and the kinds of residuals to which these are yet to be fitted.
+
+    ``local`` are those of the other images, None without any; beyond the first eight they are errors of positions.
+    """
+    if local is not None and piece.staged and len(local) > 8:
         rotation, direction = cv2.Rodrigues(local[:3])[0], piece.placement.direction(local[6:8])
         held = of_images(piece, images)
         shift = local[3:6] - rotation @ direction * np.append(local[8:], 0.0).mean()

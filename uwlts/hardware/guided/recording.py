@@ -18,7 +18,7 @@ from uwlts.calibration.guidance.pose_advice import State
 from uwlts.calibration.guidance.solution import RecordedPose, Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially, nominal_window
+from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.attempt import Attempts, GuidedImages, PoseJudge
@@ -28,6 +28,7 @@ from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep, check_positions
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light
 from uwlts.hardware.scanning import check_camera
+from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import DescriptionError, RangeError
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, part_path
 
@@ -101,7 +102,7 @@ def record_guided(
     with Capture(target_path(out)) as capture:
         in_air = calibrate_sequentially([capture], (), options=options).calibration
     sensor = plan.described_sensor()
-    window = nominal_window(sensor.camera.window, sensor, refractions=refractions)
+    window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
     unseen = phase.step(step_path(out), plan.step, StepJudge(plan.step, sensor, in_air, window))
     return GuidedRecording(target_path(out), step_path(out), (*still_missing(state), *unseen))
 
