@@ -14,7 +14,7 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
 
 # Coordinates of size one: a direction in which points extend less than this share of the widest one, or a null vector
-# of the equations that is not alone by this share, cannot be told from rounding and lens distortion.
+# of the equations that is not alone by this share, cannot be separated from rounding and lens distortion.
 _FLAT = 1e-4
 _AMBIGUOUS = 1e-9
 

@@ -16,7 +16,7 @@ from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 Solve = Callable[[Sequence[TargetImage], CameraSolution | None], CameraSolution]
 
-_ROUNDS = 10
+_ROUNDS = 10  # a few settle, unless the diameter is wrong
 _X, _Y = np.eye(3)[:2]
 
 

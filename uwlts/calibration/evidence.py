@@ -1,4 +1,4 @@
-"""From captures to what a calibration needs: target points, stripes on the target, stripes on the step standard."""
+"""Evidence of captures for a calibration: target points, stripes on the target, stripes on the step standard."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -19,10 +19,9 @@ from uwlts.targets import Target, parse_target
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the number of images done and the number of all."""
 
-_SAME_POSITION_MM = 1e-6
-_FEWEST_LINES = 20
-# So many images of a capture tell why there is no stripe in it.
-_LOOKED_AT = 15
+_SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
+_FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
+_LOOKED_AT = 15  # images of a capture in which the reason for a missing stripe is sought
 _STRIPE = StripeOptions()
 
 
@@ -65,13 +64,13 @@ def air_evidence(
     Raises
     ------
     CalibrationError
-        The captures tell no target, or different ones, or it was found in none of their images.
+        The captures describe no target, or different ones, or it was found in none of their images.
     DescriptionError
         A target's description cannot be read.
     """
     targets = [parse_target(capture.header.target) for capture in captures if capture.header.target is not None]
     if len(targets) < len(captures) or not captures:
-        raise CalibrationError("a capture for the calibration in air must tell its target: its header has none")
+        raise CalibrationError("a capture for the calibration in air must describe its target: its header has none")
     if any(target != targets[0] for target in targets):
         raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
     total, done = sum(map(len, captures)), 0
@@ -132,7 +131,7 @@ def step_evidence(
             standard = StepStandard.model_validate(capture.header.artefact)
         except ValidationError as error:
             details = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'artefact'}: {p['msg']}" for p in error.errors())
-            raise DescriptionError(f"{capture.path.name} does not tell its step standard: {details}") from error
+            raise DescriptionError(f"{capture.path.name} does not describe its step standard: {details}") from error
         wavelength = capture.header.sensor.laser.wavelength_nm
         index = capture.header.medium.refractive_index(wavelength) if medium_index is None else medium_index
         for frame, image in capture.frames(laser_on=True):

@@ -1,4 +1,4 @@
-"""Whether an image of the target, or of the laser line on it, is good enough to be recorded, and if not why."""
+"""Quality of images of the target and of the laser line on it, and the reasons for refusing one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +12,8 @@ from uwlts.targets import Target, TargetView
 
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast.
 _SLOPE_TIMES_BLUR = 0.4
-# So many points tell how sharp an image is.
-_JUDGED_POINTS = 80
-# Points with fewer neighbours on the plate than this are too far apart to compare two images by them.
+_JUDGED_POINTS = 80  # enough for a median of the sharpness
+# Points with fewer neighbours on the target than this are too far apart to compare two images by them.
 _FEWEST_COMMON = 4
 _STRIPE = StripeOptions()
 
@@ -141,7 +140,7 @@ def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
 def way_px(one: TargetView, other: TargetView) -> float:
     """Distance in px that nine tenths of the points keep to which both views show; infinite where these are few.
 
-    A target that is turned about its middle moves its outer points only, so the median would not tell.
+    A target that is turned about its middle moves its outer points only, so the median would not show it.
     """
     places = {tuple(place): k for k, place in enumerate(one.indices.tolist())}
     pairs = [(places[tuple(p)], k) for k, p in enumerate(other.indices.tolist()) if tuple(p) in places]

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
+from pydantic import JsonValue
 
 from uwlts.calibration.evidence import AirEvidence, Progress, air_evidence
 from uwlts.calibration.polynomial_evidence import (
@@ -27,9 +27,9 @@ MOST_SMOOTH = 8
 _LINES_PER_DEGREE = 10
 # Smallest singular value over the largest one: a full view has 0.1, one cut to a triangle some thousandths.
 _DETERMINED = 1e-6
-_STRAYS = 5.0
-_ROUNDS = 20
-_RETURNING_ROUNDS = 10
+_OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
+# Outliers may return for so many rounds, then they stay out, so that the rounds end.
+_ROUNDS, _RETURNING_ROUNDS = 20, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         residuals = y - design @ solution
         spread = MAD_TO_STD * np.median(np.abs(residuals[used]))
         # Rounding alone must not make outliers of exact data.
-        within = np.abs(residuals) <= max(_STRAYS * spread, 1e-9 * float(np.ptp(y)))
+        within = np.abs(residuals) <= max(_OUTLIER * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:
             within &= used
         rounds += 1
@@ -142,12 +142,12 @@ def _scaled(x: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 _STRIPE = StripeOptions()
-_LARGEST_REJECTED = 0.2
+_LARGEST_REJECTED = 0.2  # outliers are few; more contradict the positions or the target
 # Share of the lines that may lack a centre in succession and still borrow their range from both sides.
 _LARGEST_GAP = 0.1
-# The plate map should be good to two thousandths of the circles' spacing; twice that is worth a word.
+# The map should be good to two thousandths of the circles' spacing; twice that is reported.
 _LARGEST_MAP_SHARE = 0.004
-_LARGEST_LINE_EXCESS = 1.5
+_LARGEST_LINE_EXCESS = 1.5  # 1 by chance, within a few percent for thousands of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,39 +244,41 @@ def fit_polynomials(
         depth_coefficients=tuple(map(tuple, depth.coefficients[rows[0]].tolist())),
         along_coefficients=tuple(map(tuple, along.coefficients[rows[1]].tolist())),
     )
+    map_rms_mm = float(np.sqrt(np.mean(np.concatenate([m.to_plate.residuals for m in maps]) ** 2) * 2))
+    excess = _line_excess(depth, stripes.lines)
     figures = {
         "poses": {
             "stage_mm": [evidence.images[pose].stage_mm for pose in np.unique(stripes.pose).tolist()],
             "stripe_points": np.unique(stripes.pose, return_counts=True)[1].tolist(),
         },
         "map": {
-            "rms_mm": float(np.sqrt(np.mean(np.concatenate([m.to_plate.residuals for m in maps]) ** 2) * 2)),
+            "rms_mm": map_rms_mm,
             "largest_image_rms_mm": max(m.rms_mm() for m in maps),
             "points": sum(len(m.to_plate.residuals) for m in maps),
         },
-        "depth": _fit_figures(depth, stripes.lines, stripes.pose),
-        "along": _fit_figures(along, stripes.lines[depth.used], stripes.pose[depth.used]),
+        "depth": _fit_figures(depth, excess, stripes.pose),
+        "along": _fit_figures(along, _line_excess(along, stripes.lines[depth.used]), stripes.pose[depth.used]),
     }
-    warnings += _fit_warnings(figures, evidence)
+    warnings += _fit_warnings(map_rms_mm, excess, evidence)
     provenance = {"source": "polynomials from captures", "captures": list(sources), "warnings": warnings}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
     return PolynomialResult(calibration, stripes, maps, depth, along, warnings)
 
 
-def _fit_figures(fit: LinePolynomials, lines: np.ndarray, pose: np.ndarray) -> dict[str, Any]:
-    """Residuals of a fit. ``line_excess`` is how much more the means of the lines scatter than chance would have it.
+def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
+    """How much more the means of the lines scatter than by chance: by the standard deviation over sqrt(n)."""
+    _, line, count = np.unique(lines[fit.used], return_inverse=True, return_counts=True)
+    means, several, rms = np.bincount(line, fit.residuals[fit.used]) / count, count > 1, fit.rms()
+    if not (several.any() and rms > 0):
+        return 1.0
+    return float(np.sqrt(np.mean(count[several] * means[several] ** 2)) / rms)
 
-    The mean of n independent residuals scatters by their standard deviation over sqrt(n).
-    """
+
+def _fit_figures(fit: LinePolynomials, excess: float, pose: np.ndarray) -> dict[str, JsonValue]:
     left, used = fit.residuals, fit.used
-    _, line, count = np.unique(lines[used], return_inverse=True, return_counts=True)
-    means = np.bincount(line, left[used]) / count
-    several = count > 1
-    rms = fit.rms()
-    excess = float(np.sqrt(np.mean(count[several] * means[several] ** 2)) / rms) if several.any() and rms > 0 else 1.0
     _, image, points = np.unique(pose[used], return_inverse=True, return_counts=True)
     return {
-        "rms_mm": rms,
+        "rms_mm": fit.rms(),
         "mean_absolute_mm": float(np.mean(np.abs(left[used]))),
         "max_mm": float(np.max(np.abs(left[used]))),
         "points": int(np.count_nonzero(used)),
@@ -286,15 +288,14 @@ def _fit_figures(fit: LinePolynomials, lines: np.ndarray, pose: np.ndarray) -> d
     }
 
 
-def _fit_warnings(figures: dict[str, Any], evidence: AirEvidence) -> list[str]:
+def _fit_warnings(map_rms_mm: float, excess: float, evidence: AirEvidence) -> list[str]:
     warnings = []
     largest = _LARGEST_MAP_SHARE * evidence.target.spacing_mm
-    if figures["map"]["rms_mm"] > largest:
+    if map_rms_mm > largest:
         warnings.append(
-            f"the target's points scatter by {figures['map']['rms_mm']:.3f} mm about a smooth map of the plate; "
+            f"the target's points scatter by {map_rms_mm:.3f} mm about a smooth map of its plane; "
             f"expected less than {largest:.3f} mm: is the target flat, sharp and described rightly?"
         )
-    excess = figures["depth"]["line_excess"]
     if excess > _LARGEST_LINE_EXCESS:
         warnings.append(
             f"residuals of the same line go together, {excess:.1f} times as much as chance would have it: the laser "

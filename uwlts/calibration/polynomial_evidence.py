@@ -1,4 +1,4 @@
-"""Where on the target's plate a pixel looks, learnt from the target's points in the same image and nothing else."""
+"""Maps from pixels to the target's plane by the target's points in the same image, and the stripe points on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class SmoothMap:
 
 @dataclass(frozen=True, eq=False)
 class PlateMap:
-    """Where on the plate pixels look.
+    """Map from pixels to the plane of the target (plate).
 
     Attributes
     ----------
@@ -116,11 +116,11 @@ def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
     if not degrees:
         raise CalibrationError(
             f"only {len(start)} points of the target are seen; at least {_POINTS_PER_TERM * _count(_LOWEST_DEGREE)} "
-            "are needed to tell where on the plate the stripe lies"
+            "are needed to find where on the target the stripe lies"
         )
     found = cv2.findHomography(np.ascontiguousarray(start), np.ascontiguousarray(end), method=0)[0]
     if found is None or not np.isfinite(found).all():
-        raise CalibrationError(f"the {len(start)} points of the target determine no homography of image and plate")
+        raise CalibrationError(f"the {len(start)} points of the target determine no homography of image and target")
     low, high, degree = start.min(axis=0), start.max(axis=0), degrees[-1]
     left, terms = end - _project(found, start), _terms(start, low, high, degree)
     coefficients = np.linalg.lstsq(terms, left, rcond=None)[0]
@@ -145,7 +145,7 @@ def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -
     return products[:, powers <= degree]
 
 
-_SAME_POSITION_MM = 1e-6
+_SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 # Cosine of the angle between the stage's direction and the laser's axis.
 _ALONG_Z = 0.9
 # Stripe points about the camera's axis on which the origin of the OCS rests.
@@ -198,7 +198,7 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
 
     for capture in captures:
         if capture.header.target is None:
-            raise CalibrationError(f"{capture.path.name} does not tell its target: its header has none")
+            raise CalibrationError(f"{capture.path.name} does not describe its target: its header has none")
         for (name, own), other in zip(arrangement(capture).items(), arrangement(first).values(), strict=True):
             if own != other:
                 raise CalibrationError(

@@ -7,8 +7,8 @@ import numpy as np
 
 from uwlts.model.errors import CalibrationError
 
-_ROUNDS = 60
-_SMALLEST_STEP = 1e-11
+_ROUNDS = 60  # several times what usual problems take
+_SMALLEST_STEP = 1e-11  # in the residuals' unit: rounding of sums over all of them
 # Columns are scaled to length one: a smaller eigenvalue of the global parameters' normal matrix is rounding.
 _SINGULAR = 1e-13
 

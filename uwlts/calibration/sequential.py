@@ -1,11 +1,12 @@
 """Sequential calibration: camera and sheet from captures in air, then the window's distance from a step."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+from pydantic import JsonValue
 
 import uwlts
 from uwlts.calibration.camera import CameraSolution, Poses
@@ -23,62 +24,109 @@ from uwlts.storage.capture_sources import source_of
 from uwlts.stripe import StripeOptions
 
 
-def camera_figures(solution: CameraSolution, unbiased: UnbiasedSolution | None) -> dict[str, Any]:
-    """Residuals, standard deviations and covariance of the camera; the stage's direction in the camera frame."""
-    direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
-    return {
-        "images": len(solution.residuals_px),
-        "points": sum(map(len, solution.residuals_px)),
-        "rms_px": solution.rms_px(),
-        "sigma_px": solution.sigma_px,
-        "image_rms_px": solution.image_rms_px().tolist(),
-        "std": solution.std(),
-        "parameters": list(solution.parameters),
-        "covariance": solution.covariance.tolist(),
-        "stage_direction": None if direction is None else direction.tolist(),
-        "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
-        "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
-        "largest_circle_bias_px": None if unbiased is None else unbiased.largest_bias_px(),
-        "rounds": solution.rounds,
-        "stopped": solution.stopped,
-    }
+@dataclass(frozen=True)
+class CameraFigures:
+    """Residuals, standard deviations and covariance of the camera, as files hold them; None for what is missing."""
+
+    images: int
+    points: int
+    rms_px: float
+    sigma_px: float
+    image_rms_px: list[float]
+    std: dict[str, float]
+    parameters: list[str]
+    covariance: list[list[float]]
+    stage_direction: list[float] | None
+    stage_tilt_deg: float | None
+    stage_tilt_std_deg: float | None
+    largest_circle_bias_px: float | None
+    rounds: int
+    stopped: str
+
+    @classmethod
+    def of(cls, solution: CameraSolution, unbiased: UnbiasedSolution | None) -> "CameraFigures":
+        direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
+        return cls(
+            images=len(solution.residuals_px),
+            points=sum(map(len, solution.residuals_px)),
+            rms_px=solution.rms_px(),
+            sigma_px=solution.sigma_px,
+            image_rms_px=solution.image_rms_px().tolist(),
+            std=solution.std(),
+            parameters=list(solution.parameters),
+            covariance=solution.covariance.tolist(),
+            stage_direction=None if direction is None else direction.tolist(),
+            stage_tilt_deg=None if tilt is None else float(np.degrees(tilt)),
+            stage_tilt_std_deg=None if tilt_std is None else float(np.degrees(tilt_std)),
+            largest_circle_bias_px=None if unbiased is None else unbiased.largest_bias_px(),
+            rounds=solution.rounds,
+            stopped=solution.stopped,
+        )
 
 
-def sheet_figures(solution: SheetSolution, points: StripePoints) -> dict[str, Any]:
-    """Distances of the stripe points from the sheet."""
-    return {
-        "images": len(np.unique(points.image)),
-        "points": len(points.points_mm),
-        "rms_mm": solution.rms_mm,
-        "max_mm": solution.max_mm,
-        "rejected_share": solution.rejected_share,
-        "normal_std_deg": float(np.degrees(solution.normal_std_rad)),
-        "turn_from_nominal_deg": float(np.degrees(solution.turn_rad)),
-    }
+@dataclass(frozen=True)
+class SheetFigures:
+    """Distances of the stripe points from the sheet, as files hold them."""
+
+    images: int
+    points: int
+    rms_mm: float
+    max_mm: float
+    rejected_share: float
+    normal_std_deg: float
+    turn_from_nominal_deg: float
+
+    @classmethod
+    def of(cls, solution: SheetSolution, points: StripePoints) -> "SheetFigures":
+        return cls(
+            images=len(np.unique(points.image)),
+            points=len(points.points_mm),
+            rms_mm=solution.rms_mm,
+            max_mm=solution.max_mm,
+            rejected_share=solution.rejected_share,
+            normal_std_deg=float(np.degrees(solution.normal_std_rad)),
+            turn_from_nominal_deg=float(np.degrees(solution.turn_rad)),
+        )
 
 
-def window_figures(solution: WindowSolution, sources: list[str]) -> dict[str, Any]:
-    """Step heights and their errors, the distance's standard deviations, the curve; what is missing is None."""
-    return {
-        "images": sources,
-        "distance_mm": solution.model.distance_mm,
-        "std_mm": solution.std_mm,
-        "scatter_std_mm": solution.scatter_std_mm,
-        "per_height": solution.per_height,
-        "heights_mm": solution.heights_mm.tolist(),
-        "errors_mm": solution.errors_mm.tolist(),
-        "height_std_mm": solution.height_std_mm.tolist(),
-        "image_distances_mm": _none_for_nan(solution.image_distances_mm),
-        "curve_mm": [_none_for_nan(row) for row in solution.curve_mm],
-        "bounds_mm": list(solution.bounds_mm),
-    }
+@dataclass(frozen=True)
+class WindowFigures:
+    """Step heights and their errors, the distance's standard deviations, the curve, as files hold them."""
+
+    images: list[str]
+    distance_mm: float
+    std_mm: float | None
+    scatter_std_mm: float
+    per_height: float
+    heights_mm: list[float]
+    errors_mm: list[float]
+    height_std_mm: list[float]
+    image_distances_mm: list[float | None]
+    curve_mm: list[list[float | None]]
+    bounds_mm: list[float]
+
+    @classmethod
+    def of(cls, solution: WindowSolution, sources: list[str]) -> "WindowFigures":
+        return cls(
+            images=sources,
+            distance_mm=solution.model.distance_mm,
+            std_mm=solution.std_mm,
+            scatter_std_mm=solution.scatter_std_mm,
+            per_height=solution.per_height,
+            heights_mm=solution.heights_mm.tolist(),
+            errors_mm=solution.errors_mm.tolist(),
+            height_std_mm=solution.height_std_mm.tolist(),
+            image_distances_mm=_none_for_nan(solution.image_distances_mm),
+            curve_mm=[_none_for_nan(row) for row in solution.curve_mm],
+            bounds_mm=list(solution.bounds_mm),
+        )
 
 
 def _none_for_nan(values: np.ndarray) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
-_LARGEST_USUAL_TURN = np.radians(5)
+_LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger deviations are reported
 
 
 @dataclass(frozen=True)
@@ -87,11 +135,11 @@ class CalibrationOptions:
 
     Attributes
     ----------
-    refractions : 2: a glass plate of known thickness and index; the images in air are taken without the window. 1: a
+    refractions : 2: a pane of glass of known thickness and index; the images in air are taken without the window. 1: a
         single interface; the images in air are taken with the window in place, whose effect goes into the distortion
     poses : as for `solve_camera`
     correct_circles : take out the offset between a circle's image and the image of its centre
-    margin_mm : how far the plate reaches beyond its outermost points; half their spacing unless given
+    margin_mm : how far the target reaches beyond its outermost points; half their spacing unless given
     medium_index : replaces the index of the medium of the step images
     same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
     sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
@@ -142,7 +190,7 @@ class Evidence:
     medium_kind : kind of the medium in which the target was seen
     stage_direction : (3,); nominal direction of the stage before the target, in the OCS
     approaching : whether the stage moves the sensor towards the target; None where that does not matter
-    plate : description of the camera's window before the step standard; None without step captures
+    window : description of the camera's window before the step standard; None without step captures
     sources : what the captures say of themselves, for the calibration's provenance
     """
 
@@ -151,9 +199,9 @@ class Evidence:
     stage_direction: np.ndarray
     approaching: bool | None
     air: AirEvidence
-    plate: Window | None
+    window: Window | None
     steps: list[StepEvidence]
-    sources: dict[str, Any]
+    sources: dict[str, JsonValue]
     warnings: list[str]
 
 
@@ -212,7 +260,7 @@ def gather(
         stage_direction=np.array(air[0].header.stage_direction),
         approaching=None if options.poses == "free" else _approaching(air),
         air=found,
-        plate=steps[0].header.sensor.camera.window if steps else None,
+        window=steps[0].header.sensor.camera.window if steps else None,
         steps=on_steps,
         sources=sources_of(air, steps),
         warnings=warnings,
@@ -251,17 +299,17 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
     )
     used, window = [], None
-    if evidence.plate is not None:
-        used, window, left_out = _window(calibration, evidence, evidence.plate, options)
+    if evidence.window is not None:
+        used, window, left_out = _window(calibration, evidence, evidence.window, options)
         warnings += left_out
-    figures: dict[str, Any] = {"camera": camera_figures(camera, unbiased), "sheet": sheet_figures(sheet, stripe_points)}
+    figures = {"camera": CameraFigures.of(camera, unbiased), "sheet": SheetFigures.of(sheet, stripe_points)}
     if window is not None:
-        figures["window"] = window_figures(window, [step.source for step in used])
+        figures["window"] = WindowFigures.of(window, [step.source for step in used])
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
         update={
             "window": None if window is None else window.model,
-            "residuals": figures,
+            "residuals": {name: asdict(each) for name, each in figures.items()},
             "provenance": evidence.sources | how | {"warnings": warnings},
         }
     )
@@ -372,7 +420,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
     return warnings
 
 
-def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, Any]:
+def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, JsonValue]:
     """What a calibration was made from, by what and when, for its provenance."""
     return {
         "source": "calibration from captures",

@@ -17,9 +17,8 @@ from uwlts.optics.camera import directions
 # would pass for the sheet.
 _LEAST_SPREAD = 20.0
 _LEAST_SHAPE = 0.01
-# Strays are few; where more points leave the plane, there is none.
-_LARGEST_REJECTED = 0.2
-_LARGEST_TURN = np.radians(60)
+_LARGEST_REJECTED = 0.2  # outliers are few; where more points leave the plane, there is none
+_LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this axes are exchanged or signs wrong
 # From here on a normal that lies much closer to where turned images would put it is taken for that.
 _TURNED_IMAGES = np.radians(20)
 _HALF_TURN = np.array([-1.0, -1.0, 1.0])
@@ -71,14 +70,14 @@ def points_on_target(
     ----------
     stripes : sequence of (N, 2); stripe pixels (u, v) of each image
     target_poses : (F, 4, 4); ``T_camera_target`` of each image
-    extent_mm : (V, 2); points of the target's plane (x, y) whose convex hull is known to be plate: a stripe outside
-        lies elsewhere
+    extent_mm : (V, 2); points of the target's plane (x, y) whose convex hull is known to be the target: a stripe
+        outside lies elsewhere
     margin_mm : widens the hull by so much
 
     Raises
     ------
     CalibrationError
-        No stripe pixel falls on the plate, or a pose is not finite.
+        No stripe pixel falls on the target, or a pose is not finite.
     RangeError
         A pixel is not finite.
     """

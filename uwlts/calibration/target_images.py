@@ -10,8 +10,8 @@ from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.schur_least_squares import Observation
 from uwlts.model.errors import CalibrationError
 
-_FEWEST = 6
-_COLLINEAR = 1e-3
+_FEWEST = 6  # points; a pose has six parameters, a point gives two of them
+_COLLINEAR = 1e-3  # extent across over extent along, of points that lie on a line but for their noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class TargetImage:
 
 
 def z_away(image: TargetImage) -> bool:
-    """Whether the target's z axis points away from the camera, told from the sense in which x turns into y."""
+    """Whether the target's z axis points away from the camera, by the sense in which x turns into y."""
     flat = np.column_stack([image.points_mm[:, :2], np.ones(len(image.points_mm))])
     linear = np.linalg.lstsq(flat, image.pixels, rcond=None)[0][:2]
     return bool(np.linalg.det(linear) > 0)

@@ -12,12 +12,12 @@ from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.optics.reconstruction import points_on_sheet
 
-_CURVE_POINTS = 31
-_SEARCHED = (0.2, 2.5)
+_CURVE_POINTS = 31  # the curve has one valley, several points wide
+_SEARCHED = (0.2, 2.5)  # shares of the described distance, which is measured to better than half
 # Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
 _LEAST_CHANGE = 10.0
 _ROUNDING_MM = 1e-6
-_AT_BOUND = 1e-3
+_AT_BOUND = 1e-3  # share of the range; least squares within bounds stop as close to them
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ import json
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, JsonValue, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts.model.joint_estimate import JointEstimate, Origin, joint_estimate_in
 from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Vector, Window
@@ -50,7 +50,7 @@ class CameraModel(Description):
 class WindowModel(Description):
     """The camera's window as the reconstruction sees it, in the camera frame.
 
-    ``refractions`` is 2 for a glass plate (air, glass, medium) and 1 for a single interface between air and medium, as
+    ``refractions`` is 2 for a pane of glass (air, glass, medium), 1 for a single interface between air and medium, as
     in the thesis's first model; then thickness and glass index are not used. ``distance_mm`` runs along the camera's
     axis from the entrance pupil to the inner face (or to the single interface).
     """
@@ -139,8 +139,8 @@ class Calibration(Description):
     camera_from_object: Matrix4
     media: tuple[KnownMedium, ...] = ()
     stages: tuple[KnownStage, ...] = ()
-    residuals: dict[str, Any] = {}
-    provenance: dict[str, Any] = {}
+    residuals: dict[str, JsonValue] = {}
+    provenance: dict[str, JsonValue] = {}
     joint: JointEstimate | None = None
 
     @model_validator(mode="before")
@@ -153,7 +153,7 @@ class Calibration(Description):
         return content | {"residuals": {key: each for key, each in residuals.items() if key != "joint"}, "joint": joint}
 
     @model_serializer(mode="wrap")
-    def _into_file(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _into_file(self, handler: SerializerFunctionWrapHandler) -> dict[str, JsonValue]:
         content = handler(self) | {"residuals": self.residuals_in_file()}
         del content["joint"]
         return content
@@ -170,7 +170,7 @@ class Calibration(Description):
         require_plain_json(self.residuals, self.provenance)
         return self
 
-    def residuals_in_file(self) -> dict[str, Any]:
+    def residuals_in_file(self) -> dict[str, JsonValue]:
         """The residuals as files have them, the joint estimate among them as plain JSON."""
         if self.joint is None:
             return self.residuals
@@ -178,6 +178,10 @@ class Calibration(Description):
         figures = list(self.residuals.items())
         place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
         return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
+
+    def figures(self, step: str) -> dict[str, JsonValue]:
+        """Figures of a step among the residuals; none where there are none of it."""
+        return figures_of(self.residuals, step)
 
     def origin(self) -> Origin:
         """What the calibration was made from, by its provenance."""
@@ -209,7 +213,13 @@ class Calibration(Description):
         return np.array(self.camera_from_object)
 
 
-def require_plain_json(residuals: dict[str, Any], provenance: dict[str, Any]) -> None:
+def figures_of(residuals: dict[str, JsonValue], step: str) -> dict[str, JsonValue]:
+    """Figures of a step among residuals; none where there are none of it."""
+    figures = residuals.get(step)
+    return figures if isinstance(figures, dict) else {}
+
+
+def require_plain_json(residuals: dict[str, JsonValue], provenance: dict[str, JsonValue]) -> None:
     """Refuse what a calibration's file cannot hold; ValueError."""
     try:
         json.dumps([residuals, provenance], allow_nan=False)

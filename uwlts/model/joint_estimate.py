@@ -1,9 +1,9 @@
 """The joint estimate that a calibration holds: parameters, values, covariance, and a summary of its evidence."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, JsonValue, ValidationError, model_validator
 
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Uncertainty, Vector
@@ -106,7 +106,7 @@ class JointEstimate(_Stored):
         """The covariance as an array (P, P)."""
         return np.array(self.covariance, dtype=np.float64).reshape(len(self.parameters), -1)
 
-    def in_file(self) -> dict[str, Any]:
+    def in_file(self) -> dict[str, JsonValue]:
         """The estimate as plain JSON with the keys of files."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
@@ -125,7 +125,7 @@ class Origin(BaseModel):
     air_captures: tuple[CaptureSource, ...] = ()
     step_captures: tuple[CaptureSource, ...] = ()
     scan_captures: tuple[CaptureSource, ...] = ()
-    target: dict[str, Any] | None = None
+    target: dict[str, JsonValue] | None = None
     warnings: tuple[str, ...] = ()
 
     def captures(self) -> tuple[CaptureSource, ...]:
@@ -133,7 +133,7 @@ class Origin(BaseModel):
         return self.air_captures + self.step_captures + self.scan_captures
 
 
-def joint_estimate_in(figures: Any, provenance: Any) -> JointEstimate:
+def joint_estimate_in(figures: JsonValue, provenance: JsonValue) -> JointEstimate:
     """The joint estimate of a file's figures; ValueError where it or its provenance is damaged."""
     try:
         joint = JointEstimate.model_validate(figures)

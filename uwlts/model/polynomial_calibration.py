@@ -1,11 +1,11 @@
 """The polynomial reference method's calibration: two polynomials for each profile line, stored as JSON."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, JsonValue, model_validator
 
-from uwlts.model.calibration import require_plain_json
+from uwlts.model.calibration import figures_of, require_plain_json
 from uwlts.model.sensor import Description, Medium, Positive
 
 Pair = tuple[float, float]
@@ -47,8 +47,8 @@ class PolynomialCalibration(Description):
     domains_px: tuple[Pair | None, ...]
     depth_coefficients: Rows
     along_coefficients: Rows
-    residuals: dict[str, Any] = {}
-    provenance: dict[str, Any] = {}
+    residuals: dict[str, JsonValue] = {}
+    provenance: dict[str, JsonValue] = {}
 
     @property
     def joint(self) -> None:
@@ -75,6 +75,10 @@ class PolynomialCalibration(Description):
             raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
         require_plain_json(self.residuals, self.provenance)
         return self
+
+    def figures(self, step: str) -> dict[str, JsonValue]:
+        """Figures of a step among the residuals; none where there are none of it."""
+        return figures_of(self.residuals, step)
 
     def index_of(self, medium: Medium) -> float:
         """Refractive index of a medium at the laser's wavelength, relative to air; RangeError where it has none."""

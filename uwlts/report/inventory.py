@@ -262,8 +262,8 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         "window": ("std_mm", "mm standard uncertainty of d"),
     }
     for step, (name, unit) in figures.items():
-        value = calibration.residuals.get(step, {}).get(name)
-        if value is not None:
+        value = calibration.figures(step).get(name)
+        if isinstance(value, (int, float)):
             lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
     return lines + _joint_lines(calibration.joint)
 
@@ -292,8 +292,8 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
         f"to {high:.1f} mm",
     ]
     for name, what in (("depth", "Z(position)"), ("along", "Y(Z)"), ("map", "target's points on the plate")):
-        value = calibration.residuals.get(name, {}).get("rms_mm")
-        if value is not None:
+        value = calibration.figures(name).get("rms_mm")
+        if isinstance(value, (int, float)):
             lines.append(f"{what}: residual {value:.4f} mm (rms)")
     return lines
 

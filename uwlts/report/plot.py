@@ -428,8 +428,7 @@ def residual_lists(calibration: Calibration) -> list[ResidualList]:
     found = []
     for group, name, values in _lists(calibration.residuals_in_file(), ""):
         if len(values) > SHORT_LIST and any(is_number(value) for value in values):
-            table = calibration.residuals.get(group)
-            images = table.get("images") if isinstance(table, dict) else None
+            images = calibration.figures(group).get("images")
             named = isinstance(images, list) and len(images) == len(values) and all(isinstance(i, str) for i in images)
             numbers = tuple(value if is_number(value) else None for value in values)
             found.append(ResidualList(group, name, numbers, tuple(images) if named and images else ()))
@@ -494,7 +493,7 @@ def window_curves(
         if curve is None:
             continue
         colour, label, least = COLOURS[number % len(COLOURS)], plain_text(name), None
-        errors = calibration.residuals["window"].get("errors_mm")
+        errors = calibration.figures("window").get("errors_mm")
         if calibration.window is not None and isinstance(errors, list) and errors and all(map(is_number, errors)):
             # The tried distances are too coarse to meet the bottom of the valley.
             least = calibration.window.distance_mm, float(np.sqrt(np.mean(np.square(errors))))
@@ -518,8 +517,7 @@ def has_window_curve(calibrations: Mapping[str, Calibration]) -> bool:
 
 def _window_curve(calibration: Calibration) -> np.ndarray | None:
     """Tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not store them."""
-    window = calibration.residuals.get("window")
-    rows = window.get("curve_mm") if isinstance(window, dict) else None
+    rows = calibration.figures("window").get("curve_mm")
     if not isinstance(rows, list) or not rows or not all(isinstance(row, list) and len(row) == 2 for row in rows):
         return None
     if not all(value is None or is_number(value) for row in rows for value in row):

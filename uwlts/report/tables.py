@@ -186,8 +186,7 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     table["sheet's distance from the camera", "mm"] = fixed(sheet.offset_mm)
     if window is not None:
         table["refractions", ""] = str(window.refractions)
-        residuals = calibration.residuals.get("window")
-        known = residuals.get("std_mm") if isinstance(residuals, dict) else None
+        known = calibration.figures("window").get("std_mm")
         table["window distance d", "mm"] = _with_std(window.distance_mm, known if is_number(known) else None, 3)
         cosine = float(window.normal[2] / np.linalg.norm(window.normal))
         table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
@@ -198,8 +197,7 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
 
 
 def _camera_std(calibration: Calibration) -> dict[str, float]:
-    camera = calibration.residuals.get("camera")
-    std = camera.get("std") if isinstance(camera, dict) else None
+    std = calibration.figures("camera").get("std")
     return {name: value for name, value in std.items() if is_number(value)} if isinstance(std, dict) else {}
 
 

@@ -137,7 +137,7 @@ def _curves(calibration: PolynomialCalibration) -> dict[str, Any]:
             "y_mm": np.round(points[:, 1], 4).tolist(),
             "z_mm": np.round(points[:, 2], 4).tolist(),
         }
-    return {"lines": lines, "residual_mm": calibration.residuals["depth"]["rms_mm"]}
+    return {"lines": lines, "residual_mm": calibration.figures("depth")["rms_mm"]}
 
 
 def _budget(

@@ -183,12 +183,12 @@ class _Draw:
     def evidence(self, rng: np.random.Generator) -> Evidence:
         """The calibration's evidence with all of its inputs drawn."""
         air, steps = self._air(self._evidence.air, rng), self._steps(rng)
-        plate = self._evidence.plate
+        window = self._evidence.window
         tilt = self._std("window_tilt_std_deg") * rng.standard_normal(2)
-        turned = plate.model_copy(
-            update={"tilt_x_deg": plate.tilt_x_deg + float(tilt[0]), "tilt_y_deg": plate.tilt_y_deg + float(tilt[1])}
+        turned = window.model_copy(
+            update={"tilt_x_deg": window.tilt_x_deg + float(tilt[0]), "tilt_y_deg": window.tilt_y_deg + float(tilt[1])}
         )
-        return replace(self._evidence, air=air, steps=steps, plate=turned)
+        return replace(self._evidence, air=air, steps=steps, window=turned)
 
     def _air(self, air: AirEvidence, rng: np.random.Generator) -> AirEvidence:
         # The target may be turned against the stage's travel, and the travel against the laser's axis.

@@ -595,7 +595,7 @@ def test_captures_that_are_refused(files, tmp_path):
     empty = write(tmp_path / "empty.h5", sensor, blank, target=target)
     with Capture(sideways) as a, pytest.raises(CalibrationError, match="along the laser's axis"):
         calibrate_polynomials([a])
-    with Capture(files["scan"]) as a, pytest.raises(CalibrationError, match="does not tell its target"):
+    with Capture(files["scan"]) as a, pytest.raises(CalibrationError, match="does not describe its target"):
         calibrate_polynomials([a])
     with (
         Capture(files["target"]) as a,

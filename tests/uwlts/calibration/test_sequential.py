@@ -185,7 +185,7 @@ def test_contradictory_captures_are_refused(files, air_frames, tmp_path):
 
     with pytest.raises(CalibrationError, match="no capture"):
         calibrate_sequentially([])
-    with pytest.raises(CalibrationError, match="tell its target"):
+    with pytest.raises(CalibrationError, match="describe its target"):
         run(write(tmp_path / "untold.h5", frames=air_frames[:1]))
     with pytest.raises(CalibrationError, match="found in no image"):
         run(write(tmp_path / "dark.h5", frames=[(np.zeros(SHAPE, np.uint8), 0.0, False)], target=PLATE))

@@ -210,7 +210,7 @@ def test_the_medium_of_the_targets_images_is_kept(tmp_path):
         stage_direction=np.array([0.0, 0.0, 1.0]),
         approaching=True,
         air=AirEvidence(board, images, [(0, n) for n in range(4)], stripes_on_target(sensor, poses, count=200), []),
-        plate=None,
+        window=None,
         steps=[],
         sources={},
         warnings=[],

@@ -101,7 +101,7 @@ def seen(
         stage_direction=np.array([0.0, 0.0, 1.0]),
         approaching=True,
         air=AirEvidence(TARGET, images, [(0, number) for number in range(len(images))], stripes, []),
-        plate=window.model_copy(update=taken_for),
+        window=window.model_copy(update=taken_for),
         steps=[StepEvidence(pixels, StepStandard(height_mm=STEP_MM), INDEX, "step")],
         sources={},
         warnings=[],

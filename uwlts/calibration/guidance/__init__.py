@@ -1,1 +1,1 @@
-"""What a calibration still lacks, whether an image is good enough for it, and what to do next; without hardware."""
+"""Guidance during a calibration: quality of images, what is still missing and what to do next; without hardware."""

@@ -17,9 +17,8 @@ from uwlts.targets import Target
 TILT_RAD = np.radians(25.0)
 _PLACES = (0.2, 0.5, 0.8)
 _DEPTHS = (0.1, 0.5, 0.9)
-_MARGIN_PX = 10.0
-# So many of a candidate's points stand for all of them: the others repeat what these tell.
-_SAMPLE = 100
+_MARGIN_PX = 10.0  # of the image, in which circles would be cut
+_SAMPLE = 100  # points of a candidate that stand for all: more repeat what these say
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ def working_range_mm(sensor: Sensor) -> tuple[float, float]:
 def information_of(
     points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, options: CameraOptions
 ) -> np.ndarray:
-    """What the points of one image, each found to 1 px, tell of the camera's parameters (P, P), its pose being unknown.
+    """What the points of one image, each found to 1 px, say of the camera's parameters (P, P), its pose being unknown.
 
     The pose's part is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
     """
@@ -89,8 +88,8 @@ def candidates(
         if not target.findable(inside):
             continue
         sample = np.flatnonzero(inside)[::step]
-        tells = information_of(points[sample], pixels[sample], pose, camera, options)
-        found.append(Candidate(pose, pixels[inside], tells * inside.sum() / len(sample)))
+        added = information_of(points[sample], pixels[sample], pose, camera, options)
+        found.append(Candidate(pose, pixels[inside], added * inside.sum() / len(sample)))
     return found
 
 
@@ -110,8 +109,8 @@ def _seen(points: np.ndarray, pose: np.ndarray, camera: CameraModel) -> np.ndarr
     return np.where(behind[:, None], -1e6, pixels)
 
 
-_LONG_SIDE_CELLS = 8
-_POINTS_IN_CELL = 3
+_LONG_SIDE_CELLS = 8  # fine enough for distortion, coarse enough to be filled by some ten images
+_POINTS_IN_CELL = 3  # one or two may be a corner of the target that touches the cell
 
 
 @dataclass(frozen=True, eq=False)

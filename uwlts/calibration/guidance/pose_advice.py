@@ -1,4 +1,4 @@
-"""What a camera calibration still lacks, and which pose of the target would help most, in words for its holder."""
+"""Advice during a camera calibration: what is still missing, and the pose of the target that would help most."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from uwlts.model.parameter_keys import LensParameter
 from uwlts.optics.camera import project
 from uwlts.targets import TargetView
 
-# Until the residuals tell: how well points are usually found. Sharp circles do better, in reality too.
+# How well points are usually found, used until residuals are known. Sharp circles do better, in reality too.
 _USUAL_SIGMA_PX, _LEAST_SIGMA_PX = 0.1, 0.02
 # What is known of a described lens before anything is seen, as standard deviations: shares of f and of the image's
 # side, and plain coefficients.
@@ -55,7 +55,7 @@ class Wanted:
     focal_std_px, centre_std_px : standard deviations of the focal length and of the principal point
     coverage : share of the image's cells in which points were seen
     tilt_rad : free poses: each of the target's four sides was once farther by as much. A scatter of pixels does not
-        need that, but a plate that is not quite flat, or not quite as described, then shows.
+        need that, but a target that is not quite flat, or not quite as described, then shows.
     """
 
     focal_std_px: float = 0.5
@@ -268,7 +268,7 @@ def _intrinsics(setting: Setting) -> Intrinsics:
 
 
 def _prior(setting: Setting, camera: CameraModel) -> np.ndarray:
-    """What the description tells (P, P)."""
+    """Information (P, P) of the description."""
     size = dict.fromkeys(_FOCAL, camera.fx_px) | {LensParameter.FY: camera.fy_px}
     size |= {LensParameter.CX: camera.width_px, LensParameter.CY: camera.height_px}
     stds = [_PRIOR[key] * size.get(key, 1.0) for key in _intrinsics(setting).keys]

@@ -1,4 +1,4 @@
-"""Whether a laser image of the step standard is good enough to find the window by, and how far away the standard is."""
+"""Quality of laser images of the step standard, and the depths at which the standard is still wanted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 
 PLACES = 3
 """At so many depths the standard is wanted: near, in the middle and far."""
-_APART = 1 / 7
-_FEWEST_LINES = 20
-_MOST_SATURATED = 0.05
+_APART = 1 / 7  # of the volume's depth
+_FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
+_MOST_SATURATED = 0.05  # share of the lines; outlier tests bear so many wrong centres
 _STRIPE = StripeOptions()
 
 

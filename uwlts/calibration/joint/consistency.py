@@ -64,19 +64,18 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
 
 _LARGEST_TARGET_PX, _LARGEST_STRIPE_PX = 0.5, 1.0
 """Scatter beyond which target points or stripes were misdetected or contradict each other, whatever the image."""
-_FEWEST_VALUES = 20
-_OVER_OTHERS, _OVER_OTHERS_PX = 3.0, 0.15
-_OVER_NOISE = 2.5
+_FEWEST_VALUES = 20  # a median of fewer is no scatter
+_OVER_OTHERS, _OVER_OTHERS_PX = 3.0, 0.15  # sharpness and light differ from image to image, but not so much
+_OVER_NOISE = 2.5  # fine structure underestimates noise that neighbours share, by up to two
 _WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
 """Lines that err together; the filter that finds the stripe, and speckle, join two to four."""
-_OUTLIER_SHARE = 0.2
+_OUTLIER_SHARE = 0.2  # outliers are few; more are another structure in the images
 _DOUBTFUL, _WRONG = 4.0, 6.0
-"""Standard uncertainties from what was known before. Those of drawings are guesses, so few are but doubtful."""
+"""Standard uncertainties from what was known before. Design values are rough, so small deviations are only doubts."""
 _FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
 """Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
-_POSITIONS_WRONG = 3.0
-_FEWEST_POSITIONS = 4
-_MOST_NAMED, _MOST_SAID = 4, 6
+_POSITIONS_WRONG, _FEWEST_POSITIONS = 3.0, 4  # the rms of four positions exceeds three sigma once in a million
+_MOST_NAMED, _MOST_SAID = 4, 6  # for a message that can be read
 
 
 @dataclass(frozen=True)

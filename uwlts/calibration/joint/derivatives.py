@@ -14,8 +14,7 @@ LENS = tuple(key for key in LensParameter if key is not LensParameter.F)
 WINDOW = tuple(WindowParameter)
 COLUMNS = ("u", "v", *LENS, *WINDOW, "medium_index")
 """By what rays are differentiated."""
-_INNER = 8
-"""Ideal image coordinates x and y, five numbers of the window, the medium's index."""
+_INNER = 8  # ideal image coordinates x and y, five numbers of the window, the medium's index
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,17 +18,17 @@ Evidence = TargetEvidence | StepProfileEvidence | SurfaceScanEvidence
 Correct = Callable[[Sequence[Evidence], np.ndarray, Sequence[np.ndarray]], list[Evidence]]
 
 _FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3), **dict.fromkeys(SCANNED, Noise(0.3))}
-_SOFT_LIMIT = 3.0
-_ROUNDS = 10
-_SETTLED = 0.02
+_SOFT_LIMIT = 3.0  # standard deviations; outliers of the first round, not known yet, count linearly
+_ROUNDS = 10  # of weights and corrections; a few settle, unless parts of the evidence contradict each other
+_SETTLED = 0.02  # relative change of a scatter: as the standard uncertainty of that of a thousand values
 UNSETTLED = "the residuals' scatter changes from round to round"
-_SETTLED_PX = 1e-3
+_SETTLED_PX = 1e-3  # of a corrected centre, as `_FINEST_PX` of the noise
 # Of a cost that is the number of residuals: a step that gains so little moves the parameters by a tenth of their
 # uncertainty, and what is left after it is far less. What the first round finds is but a start for the next.
 _SMALLEST_GAIN, _FIRST_GAIN = 1e-7, 1e-3
 _DAMPING, _FIRST_DAMPING = 1e-9, 1e-4
 _FIRST_LINES = slice(None, None, 4)  # of the stripes on targets in the first round: good enough for a start, and fast
-_FIRST_ROUNDS = 30
+_FIRST_ROUNDS = 30  # then outliers are left out and the rest is solved to its end
 
 
 @dataclass(frozen=True, eq=False)

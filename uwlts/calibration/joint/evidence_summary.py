@@ -1,9 +1,9 @@
 """The joint estimate as a calibration holds it, with a summary of its evidence: fit of each image, covered regions."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
+from pydantic import JsonValue
 from scipy.spatial import ConvexHull, QhullError
 
 from uwlts.calibration.joint.estimate import Estimate, Evidence
@@ -62,13 +62,13 @@ def joint_estimate(
     )
 
 
-def lens_and_window_figures(result: Estimate) -> dict[str, Any]:
+def lens_and_window_figures(result: Estimate) -> dict[str, dict[str, JsonValue]]:
     """Standard uncertainties of lens and window, by the names that sequential calibrations give them in files."""
-    std = result.std()
-    camera: dict[str, Any] = {"std": {key.text: value for key, value in std.items() if isinstance(key, LensParameter)}}
+    std, camera = result.std(), dict[str, JsonValue]()
+    camera["std"] = {key.text: value for key, value in std.items() if isinstance(key, LensParameter)}
     if TARGET in result.noise:
         camera["sigma_px"] = result.noise[TARGET].sigma_px
-    figures: dict[str, Any] = {"camera": camera}
+    figures = {"camera": camera}
     if WindowParameter.DISTANCE in std:
         figures["window"] = {"std_mm": std[WindowParameter.DISTANCE]}
     return figures

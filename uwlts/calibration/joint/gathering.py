@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
@@ -68,7 +68,7 @@ class Gathered:
     series: list[Series]
     steps: list[tuple[StepEvidence, View]]
     scans: list[ScanStripes]
-    provenance: dict[str, Any]
+    provenance: dict[str, JsonValue]
     warnings: list[str]
 
     def views(self) -> list[View]:
@@ -157,7 +157,7 @@ def refuse_two_lenses(gathered: Gathered) -> None:
         )
 
 
-def _refuse_twice(provenance: Mapping[str, Any]) -> None:
+def _refuse_twice(provenance: Mapping[str, JsonValue]) -> None:
     """CalibrationError where two captures are the same, as their noise would count as two independent ones."""
     names: dict[str, str] = {}
     for source in captures_in(provenance):

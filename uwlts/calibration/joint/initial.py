@@ -66,8 +66,8 @@ def series_start(
 ) -> SeriesStart:
     """Camera from the series that the window disturbs least, poses of all series, stripes that fall on the target.
 
-    Seen paraxially through the window, a plate d away from the pupil, t thick, of the index g, the medium of the index
-    n looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
+    Seen paraxially through the window, a pane d away from the pupil, t thick, of the index g, the medium of the index n
+    looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
     """
     image = sensor.camera
     intrinsics = Intrinsics(options, width_px=image.width_px, height_px=image.height_px)
@@ -119,11 +119,11 @@ def sheet_start(
             moved = piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))
             at = seen_by.on_target(piece.stripe_pixels, local, moved)
             points.append((at - moved) @ cv2.Rodrigues(local[:3])[0].T + local[3:6])
-    pose, plate = laser_pose(sensor), sensor.laser.window
+    pose, glass = laser_pose(sensor), sensor.laser.window
     sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
     normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
     middle = camera_from_object(sensor)[:3, 3]
-    outer = plate.distance_mm + plate.thickness_mm if plate.mounted else 0.0
+    outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
     described = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
     turns = (normal @ pose.axis / along, normal @ pose.fan / along)
     return described, np.array([*turns, sheet.offset_mm - normal @ middle])

@@ -21,12 +21,10 @@ from uwlts.stripe import StripeOptions, find_stripes
 
 Scanned = SphereStandard | PlaneStandard | Pipe
 
-# More points of a scan tell hardly more: neighbours err together.
-_MOST_POINTS = 2000
-_FEWEST_POINTS = 100
-"""Of an image, before thinning."""
+_MOST_POINTS = 2000  # more points of a scan add little: neighbours err together
+_FEWEST_POINTS = 100  # of an image, before thinning
 _STEEPEST = 0.3
-"""Slope of the brightness, per mm of the stage, beyond which it is not told well where the light comes from."""
+"""Slope of the brightness, per mm of the stage, beyond which the place that the light comes from is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)

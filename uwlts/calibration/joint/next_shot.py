@@ -29,8 +29,8 @@ from uwlts.optics.camera import project_through_window
 from uwlts.optics.sheet import sheet_surface
 from uwlts.targets import Target, parse_target
 
-_FEWEST_POINTS, _FEWEST_LINES = 20, 20
-_SAMPLES = 400
+_FEWEST_POINTS, _FEWEST_LINES = 20, 20  # an image with less determines its own pose poorly
+_SAMPLES = 400  # of a curve; more than the image of one needs for a point on each of its lines to be interpolated
 STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
 SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
 _SEEN = np.radians(60)
@@ -167,7 +167,7 @@ def sphere_shot(
 
 
 def extended(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
-    """The estimate with those of these parameters that it has not and that are not known exactly, behind its own."""
+    """The estimate with those of these parameters that it lacks and that are not known exactly, behind its own."""
     added = {key: prior for key, prior in priors.items() if key not in known.parameters.keys and prior.std > 0}
     count = len(known.values)
     covariance = np.zeros((count + len(added),) * 2)
@@ -237,7 +237,7 @@ def _across(calibration: Calibration) -> int:
     return 1 if calibration.stripe_along == "width" else 0
 
 
-_TILT_DEG = 20.0
+_TILT_DEG = 20.0  # easily reached by hand, and printed circles stay detectable
 _PLACES = {"near": 0.05, "in the middle": 0.5, "far": 0.95}
 _TILTS = {
     "square": (0.0, 0.0),
@@ -247,7 +247,7 @@ _TILTS = {
     "lower edge nearer": (-1.0, 0.0),
 }
 """Turns about the camera's x and y axes."""
-_WORTH = 0.95
+_HELPFUL = 0.95  # of the uncertainty before: less than a twentieth is not an improvement
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +270,7 @@ class Outlook:
 
     def advice(self) -> str:
         """The shot as advice, without a full stop."""
-        if self.after_mm > _WORTH * self.before_mm:
+        if self.after_mm > _HELPFUL * self.before_mm:
             return "no further shot alone would lower the uncertainty of lengths by a twentieth"
         return (
             f"{self.words} would lower the standard uncertainty of lengths over the volume from {self.before_mm:.4f} "
@@ -365,7 +365,7 @@ def _candidates(calibration: Calibration, known: StoredEstimate, region: Region)
     target = None if origin.target is None else parse_target(origin.target)
     if target is not None:
         yield from _targets(calibration, known, region.name, target, depths)
-        # One image in air is of use beside others taken so, whose series tells the camera.
+        # One image in air is of use beside others taken so, whose series determines the camera.
         in_air = [other.view for other in regions(calibration) if other.view.medium is None]
         if region.view.medium is not None and in_air:
             yield from _targets(calibration, replace(known, view=in_air[0]), "air", target, depths)
@@ -406,7 +406,7 @@ def advice_lines(calibration: Calibration) -> list[str]:
     """Weak directions and the shot that would help most; CalibrationError where the estimate is missing or damaged."""
     region = next(iter(regions(calibration)), None)
     if region is None or not region.has_area():
-        return ["the stripes of the evidence cover no area: what lengths measured by it are worth is not known"]
+        return ["the stripes of the evidence cover no area: the uncertainty of lengths measured by it is not known"]
     known = estimate_in(calibration, region)
     lengths = lengths_over(calibration, known, region)
     lines = format_weaknesses(weaknesses(lengths, known.parameters.keys, known.covariance))

@@ -1,4 +1,4 @@
-"""How much the residuals scatter, which of them are outliers, and how much of the scatter they share."""
+"""Scatter of residuals, outliers among them, and the share of the scatter that they have in common."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,15 +8,14 @@ import numpy as np
 from uwlts.calibration.joint.evidence import TARGET, Residuals
 from uwlts.metrology.least_squares import MAD_TO_STD
 
-_OUTLIER = 5.0
-_LAGS = 100
-_SHARED_LAG = 0.05
+_OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
+_LAGS = 100  # lines; filters and speckle join a few, wrong models some tens
+_SHARED_LAG = 0.05  # correlation that some thousand pairs no longer separate from none, by three standard errors
 _SLOPE_BIAS_PX = 0.01
 """Size of the error of a stripe's centre that goes with the slope of the surface, of which
 `uwlts.optics.brightness` takes out two thirds where rendered spheres show it."""
 
-_FINEST_PX = 1e-3
-"""No point of an image counts as better known, lest what is known before counts for nothing."""
+_FINEST_PX = 1e-3  # no point of an image counts as better known, lest what is known before counts for nothing
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Noise:
     besides: float = 0.0
 
     def effective_px(self) -> float:
-        """Standard deviation of independent residuals that would tell as little."""
+        """Standard deviation of independent residuals that would say as little."""
         return self.sigma_px * float(np.sqrt(self.together + self.besides))
 
 

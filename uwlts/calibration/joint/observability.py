@@ -15,10 +15,9 @@ from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project_through_window
 
-_ROWS, _COLUMNS = 7, 9
-_INSET = 0.02
-"""Share of the depth left out at either end, where an outline may come to a point."""
-_LEAST_MM = 1.0
+_ROWS, _COLUMNS = 7, 9  # of a mesh: 1953 lengths, between ends in all parts of a region
+_INSET = 0.02  # share of the depth left out at either end, where an outline may come to a point
+_LEAST_MM = 1.0  # extent of a region over which lengths mean something
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,15 +179,14 @@ def lengths_over(calibration: Calibration, known: StoredEstimate, region: Region
     return lengths_between(points_at(calibration, known, at), *np.triu_indices(len(at), k=1))
 
 
-_MOST = 3
-_LEAST_SHARE = 0.1
-"""Of the variance of all lengths; a direction that adds less is not worth a word."""
-_NAMED_SHARE = 0.4
-_CAUSE_SHARE = 0.3
+_MOST = 3  # more than a reader keeps in mind are not named
+_LEAST_SHARE = 0.1  # of the variance of all lengths; a direction that adds less is not named
+_NAMED_SHARE = 0.4  # of the most important parameter's; others are not named with it
+_CAUSE_SHARE = 0.3  # of a direction that knowing one parameter must close to count as its cause
 _CONFUSED = 0.3
-"""Smallest eigenvalue of the correlation of two parameters or more that can no longer be told apart: 0.7 for two."""
-_NEGLIGIBLE_MM = 1e-3
-_AXIS_COSINE = 0.9
+"""Smallest eigenvalue of the correlation of two parameters or more that cannot be separated: 0.7 for two."""
+_NEGLIGIBLE_MM = 1e-3  # far below the noise of a scanned point
+_AXIS_COSINE = 0.9  # within 26 deg a length runs along an axis
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,7 @@ class Weakness:
     Attributes
     ----------
     parameters : those that make it up, the most important first
-    confused : whether the evidence cannot tell them apart, rather than knows each too little
+    confused : whether the evidence cannot separate them, rather than knows each too little
     cost_mm : standard uncertainty that it adds to the length that it changes most
     length_mm : that length
     along : which way it runs: "Y", "Z" or "Y and Z"
@@ -220,7 +218,7 @@ class Weakness:
         if len(names) == 1:
             return f"{listed} is known too little; it costs {what}"
         if self.confused:
-            return f"{listed} cannot be told apart by these images; together they cost {what}"
+            return f"{listed} cannot be separated by these images; together they cost {what}"
         return f"{listed} are known too little; together they cost {what}"
 
 

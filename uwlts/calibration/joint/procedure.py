@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.calibration.circle_bias import centre_offsets
 from uwlts.calibration.evidence import Progress
@@ -177,7 +177,7 @@ def _calibration(
     frame: np.ndarray,
     stages: list[KnownStage],
     joint: JointEstimate,
-    provenance: dict[str, Any],
+    provenance: dict[str, JsonValue],
 ) -> Calibration:
     sensor, parameters, values = gathered.sensor, result.parameters, result.values
     sheet = parameters.sheet_model(values)

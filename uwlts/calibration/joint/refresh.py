@@ -1,10 +1,10 @@
-"""What images in new water changed: its index, and how well lengths in it are known."""
+"""Refresh of a joint calibration by images in new water: its index, and the uncertainty of lengths in it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.joint.consistency import Findings, findings
@@ -135,7 +135,7 @@ def refreshed_calibration(
 ) -> Calibration:
     """The calibration of an estimate to which an earlier one was known.
 
-    Its figures tell of all evidence, earlier and new, the scatter of steps of the new ones alone, and its
+    Its figures are those of all evidence, earlier and new, the scatter of steps that of the new ones alone, and its
     ``std_before`` of what was known before any. Where the camera's pixels were calibrated in earlier water they are in
     the new as well, so that the volume is the same. Directions of stages stay as they were found.
     """
@@ -159,10 +159,7 @@ def refreshed_calibration(
                 for number, medium in enumerate(media)
             ),
             "residuals": earlier.residuals
-            | {
-                name: {**earlier.residuals.get(name, {}), **figures}
-                for name, figures in lens_and_window_figures(result).items()
-            },
+            | {name: earlier.figures(name) | figures for name, figures in lens_and_window_figures(result).items()},
             "joint": _joint(require_joint(earlier), joint_estimate(result, evidence, sources, frame)),
             "provenance": _provenance(earlier, gathered, warnings),
         }
@@ -202,7 +199,7 @@ def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> Co
     )
 
 
-def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, Any]:
+def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, JsonValue]:
     old, new = earlier.provenance, sources_of([], []) | gathered.provenance
     refreshed = {
         "digest": calibration_digest(earlier),
@@ -220,10 +217,8 @@ def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -
 
 
 _AIR = Medium(kind="air")
-_ANY_INDEX = 0.02
-"""Standard uncertainty of the index of a liquid of which nothing is known."""
-_TELLING = 4.0
-"""Standard uncertainties by which steps must contradict an index to be told as doing so."""
+_ANY_INDEX = 0.02  # standard uncertainty of the index of a liquid of which nothing is known
+_TELLING = 4.0  # standard uncertainties by which steps contradict an index
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,7 +352,7 @@ def _other_water(
             f"from the {known.mean:.5f} +- {known.std:.2g} described"
         )
     advice = (
-        ": check the step's height and the water's temperature and salinity in the captures, or tell with --index and "
+        ": check the step's height and the water's temperature and salinity in the captures, or give with --index and "
         "--index-std what is known of it; if they are right, the sensor has changed: calibrate again"
     )
     return "; ".join(words) + advice if words else ""

@@ -27,7 +27,7 @@ class StoredEstimate:
 def require_joint(calibration: Calibration) -> JointEstimate:
     """The joint estimate of a calibration; CalibrationError where it holds none."""
     if calibration.joint is None:
-        raise CalibrationError("the calibration tells no uncertainty: calibrate jointly (--water or --joint)")
+        raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
     return calibration.joint
 
 

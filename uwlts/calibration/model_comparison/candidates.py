@@ -25,7 +25,7 @@ class Candidate:
 
     Attributes
     ----------
-    refractions : by the camera's window: one interface, or a glass plate
+    refractions : by the camera's window: one interface, or a pane of glass
     window_tilt : whether the tilt of the camera's window is free
     bow : whether the sheet's bow is free
     window_turn : whether the turn of the laser's window is free
@@ -83,7 +83,7 @@ def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
 def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
     """The problem with the candidate's parameters, starting where it started.
 
-    The distance of a single interface is only known to lie near the described one, as it stands for a glass plate.
+    The distance of a single interface is only known to lie near the described one, as it stands for a pane of glass.
     """
     known = problem.parameters
     options = replace(known.intrinsics.options, distortion=candidate.distortion)

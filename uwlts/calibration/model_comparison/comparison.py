@@ -71,11 +71,11 @@ class Choice:
         """Whether a model predicts as well as another in one way of holding out.
 
         Where images held out differ by more than chance, all may yet share errors of the stage and of poses that favour
-        one model. So a model that holds parameters of the other also counts as good if the other's estimate cannot tell
-        these from what is held.
+        one model. So a model that holds parameters of the other also counts as good if the other's estimate cannot
+        separate these from what is held.
         """
-        told = self.predictions[other][INSIDE].told_from(self.predictions[candidate][INSIDE])
-        return not told or self.tallies[where].as_good(self.number(candidate), self.number(other))
+        separate = self.predictions[other][INSIDE].separates_from(self.predictions[candidate][INSIDE])
+        return not separate or self.tallies[where].as_good(self.number(candidate), self.number(other))
 
     def good_among(self, judged: Sequence[Judged]) -> tuple[Judged, list[Judged]]:
         """Of some models the best, and those that are as good in both ways."""
@@ -170,7 +170,7 @@ def choice_of(found: dict[Candidate, dict[str, Prediction] | str], ways: Sequenc
 class Comparison:
     """What models miss in images held out, of which sensor and which captures.
 
-    ``polynomials`` is None without a target in a medium on the stage; ``why_none`` tells why there is no score of them.
+    ``polynomials`` is None without a target in a medium on the stage; ``why_none`` is why they have no score.
     """
 
     sensor: str
@@ -197,7 +197,7 @@ def compare_models(
     targets, steps : as `calibrate_jointly`
     options : its distortion and its refractions do not count: the models are compared in them
     workers : processes; as many as there are processors unless given
-    searched, progress : callable, optional; told of images searched, and of models calibrated
+    searched, progress : callable, optional; called for images searched, and for models calibrated
 
     Raises
     ------

@@ -22,9 +22,9 @@ INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
 
-_EVERY = 4
+_EVERY = 4  # of the images inside one in so many is held out: enough remain, enough are judged
 _OUTER = 1 / 6
-_FEWEST_KEPT, _FEWEST_HELD = 4, 4
+_FEWEST_KEPT, _FEWEST_HELD = 4, 4  # images; fewer give neither a calibration nor a standard error
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,8 @@ def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence
     return some.with_stripes(np.isin(evidence.stripe_image, wanted))
 
 
-_ROUNDS, _SETTLED_PX = 20, 1e-4
-_BY_CHANCE = 0.0027
-"""Probability of three standard deviations or more."""
+_ROUNDS, _SETTLED_PX = 20, 1e-4  # steps of the pose, far below the noise of a centre
+_BY_CHANCE = 0.0027  # probability of three standard deviations or more
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +130,8 @@ class Prediction:
     values: np.ndarray
     covariance: np.ndarray
 
-    def told_from(self, smaller: "Prediction") -> bool:
-        """Whether the estimate tells this model from one that holds some of its parameters, by three sigma.
+    def separates_from(self, smaller: "Prediction") -> bool:
+        """Whether the estimate separates this model from one that holds some of its parameters, by three sigma.
 
         True of models of which neither holds the other's.
         """

@@ -321,7 +321,7 @@ def renamed(sensor, **changes):
     ("header", "error", "said"),
     [
         (lambda s: {"medium": Medium(kind="air")}, CalibrationError, "was taken in air"),
-        (lambda s: {"artefact": None}, DescriptionError, "does not tell its step standard"),
+        (lambda s: {"artefact": None}, DescriptionError, "does not describe its step standard"),
         (lambda s: {"sensor": renamed(s, name="other")}, CalibrationError, "taken by the sensor 'other'"),
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=520.0))},
