@@ -12,7 +12,7 @@ from uwlts.calibration.joint.parameters import View
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError
-from uwlts.model.parameter_keys import parameter_of
+from uwlts.model.parameter_keys import LensParameter, parameter_of
 from uwlts.model.sensor import Medium, Uncertainty
 
 BUILT = built_sensor()
@@ -166,7 +166,7 @@ def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
     assert result.calibration.window is None
     assert result.calibration.medium_kind == "custom"
     focal = result.estimate.values[0] - BUILT.camera.focal_length_px()
-    assert abs(focal) < 4.5 * result.estimate.std()["f"]
+    assert abs(focal) < 4.5 * result.estimate.std()[LensParameter.F]
 
 
 @pytest.mark.parametrize(
