@@ -23,6 +23,7 @@ from uwlts.thesis.campaign import CampaignFolder
 from uwlts.thesis.evaluation import evaluate_campaign
 from uwlts.thesis.joint_comparison import compare_campaigns, joint_summary, summary_lines
 from uwlts.thesis.measurements import TWO, calibrations, measure_scan
+from uwlts.thesis.results import CampaignResults, Measurement
 
 SPHERES, PLANE = ("spheres", "standoff"), ("plane", "standoff")
 GATES_MM = {
@@ -63,14 +64,13 @@ def edition(tmp_path_factory: pytest.TempPathFactory) -> CampaignFolder:
     return CampaignFolder(campaign)
 
 
-def violated(measurements: list[dict]) -> set[tuple[str, ...]]:
+def violated(measurements: list[Measurement]) -> set[tuple[str, ...]]:
     """Gates that measurements do not keep."""
-    keys = ("thing", "placement", "method", "processing")
     found = {
-        (*(m[key] for key in keys), name): value
+        (m.thing, m.placement, m.method, m.processing, name): value
         for m in measurements
-        if m["medium"] == "water"
-        for name, value in m["figures_mm"].items()
+        if m.medium == "water"
+        for name, value in m.figures_mm.items()
     }
     for gate, (low, high) in GATES_MM.items():
         print(*gate, f"{low:+.4f} <= {found[gate]:+.4f} <= {high:+.4f}")
@@ -78,36 +78,36 @@ def violated(measurements: list[dict]) -> set[tuple[str, ...]]:
 
 
 @pytest.fixture(scope="module")
-def results(edition: CampaignFolder) -> dict:
+def results(edition: CampaignFolder) -> CampaignResults:
     return evaluate_campaign(edition, trials=0)
 
 
-def test_the_small_edition_keeps_its_gates(results: dict):
-    assert not violated(results["measurements"])
-    assert {m["method"] for m in results["measurements"]} >= {"proposed", "two refractions", "polynomials"}
-    assert not [m["failure"] for m in results["measurements"] if m["failure"]]
+def test_the_small_edition_keeps_its_gates(results: CampaignResults):
+    assert not violated(results.measurements)
+    assert {m.method for m in results.measurements} >= {"proposed", "two refractions", "polynomials"}
+    assert not [m.failure for m in results.measurements if m.failure]
 
 
-def test_the_calibrations_find_the_window(results: dict):
+def test_the_calibrations_find_the_window(results: CampaignResults):
     # Two refractions know the glass; single step images scatter by speckle.
-    assert results["two_refractions_distance_mm"] == pytest.approx(47.3, abs=1.0)
-    distances = [choice["distance_mm"] for choice in results["window"].values()]
+    assert results.two_refractions_distance_mm == pytest.approx(47.3, abs=1.0)
+    distances = [choice.distance_mm for choice in results.window.values()]
     assert np.ptp(distances) < 6.0
-    assert results["polynomials"]["water"]["residual_mm"] < 0.06
+    assert results.polynomials["water"].residual_mm < 0.06
 
 
 def spheres(edition: CampaignFolder):
     return next(scan for scan in edition.scans() if (scan.thing, scan.placement) == ("spheres", "standoff"))
 
 
-def remeasured(results: dict, again: list) -> list[dict]:
+def remeasured(results: CampaignResults, again: list) -> list[Measurement]:
     """The results' measurements with those of one scan replaced."""
     scan = (again[0].thing, again[0].placement)
-    others = [m for m in results["measurements"] if (m["thing"], m["placement"]) != scan]
-    return others + [vars(m) for m in again]
+    others = [m for m in results.measurements if (m.thing, m.placement) != scan]
+    return others + again
 
 
-def test_a_spacing_lost_by_two_hundredths_is_noticed(edition: CampaignFolder, results: dict, tmp_path: Path):
+def test_a_spacing_lost_by_two_hundredths_is_noticed(edition: CampaignFolder, results: CampaignResults, tmp_path: Path):
     """A focal length wrong by 2e-4 of itself makes 99 mm wrong by 0.02 mm."""
     calibrated = calibrations(edition)
     true: Calibration = calibrated[TWO, "water"]
@@ -157,10 +157,10 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     (result,) = compare_campaigns([imperfect])
     names = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
     errors = {
-        way: np.array([scan[way][name] for scan in result["spheres"] for name in names])
+        way: np.array([scan.by_method()[way][name] for scan in result.spheres for name in names])
         for way in ("joint", "one_refraction", "two_refractions")
     }
-    stated = np.array([scan["std"][name] for scan in result["spheres"] for name in names])
+    stated = np.array([scan.std[name] for scan in result.spheres for name in names])
     assert len(stated) == 9
     print({way: root_mean_square(e) for way, e in errors.items()}, errors["joint"] / stated)
 
@@ -184,9 +184,9 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
         assert root_mean_square(errors["joint"]) < root_mean_square(errors[way]) / 3, way
 
     summary = joint_summary([result])
-    assert max(summary["plane_std_over_speckle_limit"]) < 1.5
-    assert summary["coverage_95"] is not None
-    assert not summary["air"]["spacing_error_mm"]
+    assert max(summary.plane_std_over_speckle_limit) < 1.5
+    assert summary.coverage_95 is not None
+    assert not summary.air.spacing_error_mm
     assert summary_lines(summary)[0].startswith("water, error of the sphere spacing")
 
 

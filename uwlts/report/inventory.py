@@ -11,20 +11,19 @@ import numpy as np
 from uwlts.measurement.evaluation_file import FORMAT as EVALUATION_FORMAT
 from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError, DescriptionError, DesignError
+from uwlts.model.errors import CaptureError, DescriptionError
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.library import load_sensor
-from uwlts.model.placement import camera_from_object, check_design, laser_pose, view_of_sheet
+from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Camera, Medium, Sensor
 from uwlts.optics.design import (
-    FlatWindow,
-    Triangulation,
     depth_mm,
     depth_per_pixel_mm,
     line_length_mm,
     line_needed_mm,
     measuring_volume,
+    nominal_setup,
     scheimpflug_angle_rad,
     speckle_limit_um,
     thesis_factor,
@@ -45,43 +44,6 @@ class Quantity(NamedTuple):
     value: float
     unit: str
     source: str
-
-
-def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]:
-    """The sensor's triangulation behind its window, and Z along the laser's axis per depth along the camera's.
-
-    A laser placed by its axis, or rolled, counts as the baseline and angle at which its sheet meets the plane of the
-    image's middle line across the stripe and the pupil. Lens distortion and tilts are left out.
-
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis before the window, the stripe runs along the other side of the image,
-        or no window keeps the medium out.
-    """
-    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
-    pose, index = laser_pose(sensor), medium.refractive_index(wavelength)
-    standoff = camera_from_object(sensor)[2, 3]
-    if not camera.window.mounted and index != 1:
-        raise DesignError(f"the camera's window is not mounted, but the medium's index is {index:.4f}: mount it")
-    side = 1 if camera.stripe_along == "width" else 0
-    if abs(pose.normal[side]) < 1e-6:
-        raise DesignError(f"the stripe runs across the image's {camera.stripe_along}, not along it: turn the camera")
-    trace = np.array([0.0, 0.0, 1.0])
-    trace[side] = -pose.normal[2] / pose.normal[side]
-    setup = Triangulation(
-        baseline_mm=standoff * abs(trace[side]),
-        triangulation_angle_rad=math.atan(abs(trace[side])),
-        focal_length_mm=camera.focal_length_mm,
-        pixel_size_mm=1e-3 * camera.pixel_size_um,
-        window=FlatWindow(
-            distance_mm=camera.window.distance_mm,
-            thickness_mm=camera.window.thickness_mm,
-            glass_index=camera.window.index(wavelength) if camera.window.mounted else 1.0,
-            medium_index=index,
-        ),
-    )
-    return setup, abs(trace @ pose.axis)
 
 
 def design_table(sensor: Sensor, medium: Medium) -> list[Quantity]:

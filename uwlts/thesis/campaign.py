@@ -1,17 +1,14 @@
-"""A campaign's folder: its recordings by their names, and results that are kept beside them.
+"""A campaign's folder: its recordings by their names.
 
 Scans are called OBJECT-PLACEMENT-MEDIUM.h5, such as spheres-near-2-water.h5. The calibration has target-air.h5 (through
 the camera's window), target-bare.h5 (without it), target-water.h5, and step-PLACEMENT-water.h5; line-width.h5 and
 line-height.h5 show the stripe on the pipe for either orientation of the camera.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from uwlts.model.errors import CaptureError
-from uwlts.storage.files import written_aside
 
 MEDIA = ("air", "water")
 OBJECTS = ("spheres", "plane", "pipe", "head", "weld")
@@ -73,28 +70,9 @@ def campaign_folders(folder: Path) -> list[CampaignFolder]:
     return [CampaignFolder(path) for path in found]
 
 
-def keep(path: Path, results: dict[str, Any], *, format: str, version: int) -> dict[str, Any]:
-    """Write results into a file of a campaign's folder, whole or not at all; returns what the file holds."""
-    content = {"format": format, "version": version} | results
-    with written_aside(path, overwrite=True) as aside:
-        aside.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
-    return content
-
-
 def up_to_date(path: Path) -> bool:
     """Whether there are results and no recording of the campaign is newer."""
     if not path.is_file():
         return False
     finished = path.stat().st_mtime_ns
     return all(recording.stat().st_mtime_ns <= finished for recording in path.parent.glob("*.h5"))
-
-
-def kept(path: Path, *, format: str, version: int) -> dict[str, Any]:
-    """Results as `keep` wrote them; CaptureError where the file is damaged or newer."""
-    try:
-        results = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"cannot read {path}: {error}; remove it to evaluate the campaign again") from error
-    if not isinstance(results, dict) or (results.get("format"), results.get("version")) != (format, version):
-        raise CaptureError(f"{path} holds no results that this program reads; remove it to evaluate again")
-    return results

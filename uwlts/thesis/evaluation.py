@@ -3,11 +3,9 @@
 import json
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,13 +19,20 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.reconstruction import reconstruct_by_polynomials
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture
-from uwlts.thesis.campaign import MEDIA, CampaignFolder, ScanFile, keep, kept, up_to_date
-from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED, THESIS, TWO, Measurement, calibrations, measure_scan
+from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
+from uwlts.thesis.measurements import PROPOSED, THESIS, TWO, calibrations, measure_scan
 from uwlts.thesis.monte_carlo import propagate
-from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan, window_choices
+from uwlts.thesis.results import (
+    CampaignResults,
+    LineProfile,
+    Measurement,
+    PolynomialCurves,
+    PolynomialLine,
+    SpacingInterval,
+)
+from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan, window_choices, window_of
 
 RESULTS = "results.json"
-FORMAT, VERSION = "uwlts-thesis-results", 1
 TRIALS = 100
 _SHOWN_LINES = {"one end": 0.05, "middle": 0.5, "other end": 0.95}
 Progress = Callable[[str, int, int], None]
@@ -40,8 +45,8 @@ def evaluate_campaign(
     workers: int | None = None,
     overwrite: bool = False,
     progress: Progress = lambda stage, done, total: None,
-) -> dict[str, Any]:
-    """Results of a campaign as plain JSON, kept in its file results.json; read from there if no recording is newer.
+) -> CampaignResults:
+    """Results of a campaign, kept in its file results.json; read from there if no recording is newer.
 
     Kept results without the Monte-Carlo propagation, or with another number of trials, are completed.
 
@@ -54,36 +59,37 @@ def evaluate_campaign(
     """
     path = folder.path / RESULTS
     if not overwrite and up_to_date(path):
-        results = read_results(path)
-        if trials in (0, results["trials"]):
-            return results
-        calibrated = calibrations(folder)
-        scans = _sphere_scans(folder, calibrated[PROPOSED, "water"])
-        return _keep(path, results | _monte_carlo(folder, scans, trials, workers, progress))
+        kept = CampaignResults.read(path)
+        if trials in (0, kept.trials):
+            return kept
+        scans = _sphere_scans(folder, _by_rays(calibrations(folder)[PROPOSED, "water"]))
+        intervals, trials = _monte_carlo(folder, scans, trials, workers, progress)
+        return kept.model_copy(update={"monte_carlo": intervals, "trials": trials}).keep(path)
     calibrated = calibrations(folder, progress=lambda done, total: progress("calibrations", done, total))
     measurements = _measured(folder, calibrated, workers, progress)
-    proposed = calibrated[PROPOSED, "water"]
+    proposed, two = (_by_rays(calibrated[method, "water"]) for method in (PROPOSED, TWO))
     scans = _sphere_scans(folder, proposed)
     choices, profiles = window_choices(folder, proposed, scans)
-    results = {
-        "measurements": [asdict(found) for found in measurements],
-        "window": {choice.images: asdict(choice) for choice in choices},
-        "window_profiles": profiles,
-        "two_refractions_distance_mm": calibrated[TWO, "water"].window.distance_mm,
-        "polynomials": {medium: _curves(calibrated[POLYNOMIALS, medium]) for medium in MEDIA},
-        "budget": _budget(folder, measurements, proposed, scans),
-        "line_profiles": {side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
-    }
-    return _keep(path, results | _monte_carlo(folder, scans, trials, workers, progress))
+    intervals, trials = _monte_carlo(folder, scans, trials, workers, progress)
+    return CampaignResults(
+        measurements=measurements,
+        window={choice.images: choice for choice in choices},
+        window_profiles=profiles,
+        two_refractions_distance_mm=window_of(two).distance_mm,
+        polynomials={
+            medium: _curves(each) for (_, medium), each in calibrated.items() if isinstance(each, PolynomialCalibration)
+        },
+        budget=_budget(folder, measurements, proposed, scans),
+        line_profiles={side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
+        monte_carlo=intervals,
+        trials=trials,
+    ).keep(path)
 
 
-def _keep(path: Path, results: dict[str, Any]) -> dict[str, Any]:
-    return keep(path, results, format=FORMAT, version=VERSION)
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """Results as `evaluate_campaign` has kept them; CaptureError where the file is damaged or newer."""
-    return kept(path, format=FORMAT, version=VERSION)
+def _by_rays(calibration: AnyCalibration) -> Calibration:
+    if not isinstance(calibration, Calibration):
+        raise TypeError("a calibration by polynomials has neither camera nor window")
+    return calibration
 
 
 def _measured(
@@ -119,7 +125,7 @@ def _sphere_scans(folder: CampaignFolder, calibration: Calibration) -> list[Sphe
     return found
 
 
-def _curves(calibration: PolynomialCalibration) -> dict[str, Any]:
+def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
     """Z(v) and Y(Z) of an outer, the middle and the other outer profile line (Figures 58 and 59), and the residual."""
     lines = {}
     known = np.flatnonzero(np.isfinite(calibration.domains()[:, 0]))
@@ -131,13 +137,9 @@ def _curves(calibration: PolynomialCalibration) -> dict[str, Any]:
         points = reconstruct_by_polynomials(
             calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
         ).points_mm
-        lines[name] = {
-            "line": number,
-            "centre_px": np.round(centres, 3).tolist(),
-            "y_mm": np.round(points[:, 1], 4).tolist(),
-            "z_mm": np.round(points[:, 2], 4).tolist(),
-        }
-    return {"lines": lines, "residual_mm": calibration.figures("depth")["rms_mm"]}
+        y_mm, z_mm = np.round(points[:, 1:], 4).T.tolist()
+        lines[name] = PolynomialLine(number, np.round(centres, 3).tolist(), y_mm, z_mm)
+    return PolynomialCurves(lines, calibration.figures("depth")["rms_mm"])
 
 
 def _budget(
@@ -159,10 +161,10 @@ def _budget(
 
 def _monte_carlo(
     folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: Progress
-) -> dict[str, Any]:
+) -> tuple[list[SpacingInterval], int]:
     """Intervals of every scan of spheres, and the number of trials they rest on."""
     if trials == 0 or not scans:
-        return {"monte_carlo": [], "trials": trials}
+        return [], trials
     options = CalibrationOptions(refractions=1)
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(folder.target("air")))]
@@ -178,31 +180,24 @@ def _monte_carlo(
         workers=workers,
         progress=lambda done, total: progress("Monte Carlo", done, total),
     )
-    intervals = [
-        {
-            "placement": each.placement,
-            "observed_mm": each.observed_mm,
-            "std_mm": each.std_mm(),
-            "interval_mm": each.interval_mm(),
-            "contains_truth": each.contains_truth(),
-        }
+    return [
+        SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())
         for each in found
-    ]
-    return {"monte_carlo": intervals, "trials": trials}
+    ], trials
 
 
 def _knowledge(folder: CampaignFolder) -> dict[str, float]:
-    """What is known of the inputs, from the plan that lies beside the campaigns; nothing without one."""
+    """Imperfections of the inputs, from the plan that lies beside the campaigns; none without one."""
     path = folder.path.parent / "plan.json"
     try:
         return dict(json.loads(path.read_text(encoding="utf-8"))["campaign"]["imperfections"])
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CaptureError(f"{path} does not tell the campaign's imperfections: {error}") from error
+        raise CaptureError(f"{path} does not hold the campaign's imperfections: {error}") from error
 
 
-def _line_profile(folder: CampaignFolder, side: str) -> dict[str, Any] | None:
+def _line_profile(folder: CampaignFolder, side: str) -> LineProfile | None:
     """Stripe on the pipe by the calibration of a sensor that is as described: its length along Y and points, mm."""
     path = folder.line(side)
     if path is None:
@@ -211,4 +206,4 @@ def _line_profile(folder: CampaignFolder, side: str) -> dict[str, Any] | None:
         header = capture.header
         scan = reconstruct(capture, nominal_calibration(header.sensor, header.medium))
     points = scan.points_mm[:, 1:]
-    return {"length_mm": float(np.ptp(points[:, 0])), "points_mm": np.round(points[::4], 3).tolist()}
+    return LineProfile(float(np.ptp(points[:, 0])), np.round(points[::4], 3).tolist())

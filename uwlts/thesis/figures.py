@@ -1,7 +1,6 @@
 """The thesis's figures, redrawn from our results with matplotlib."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,12 +8,13 @@ from matplotlib.figure import Figure
 
 from uwlts.report.page_toolkit import BLUE, COLOURS, INK, RED, legend_below, new_figure, plain_text
 from uwlts.thesis.measurements import POLYNOMIALS, PROPOSED
+from uwlts.thesis.results import CampaignResults, Points
 from uwlts.thesis.tables import MEAN, TableRow
 
 
-def window_distance_figure(result: dict[str, Any]) -> Figure:
+def window_distance_figure(results: CampaignResults) -> Figure:
     """Figure 45: a step's profile for several window distances."""
-    profiles = {f"d = {each['distance_mm']:.1f} mm": each["points_mm"] for each in result["window_profiles"]}
+    profiles = {f"d = {each.distance_mm:.1f} mm": each.points_mm for each in results.window_profiles}
     figure, (whole, upper) = new_figure(9.0, 3.2, columns=2)
     _draw_profiles(whole, "One step image for different window distances", profiles)
     _draw_profiles(upper, "Its upper face", profiles)
@@ -26,13 +26,13 @@ def window_distance_figure(result: dict[str, Any]) -> Figure:
     return figure
 
 
-def polynomials_figures(result: dict[str, Any]) -> tuple[Figure, Figure]:
+def polynomials_figures(results: CampaignResults) -> tuple[Figure, Figure]:
     """Figures 58 and 59: Z(v) and Y(Z) of three profile lines in air and in water."""
     (by_row, rows), (by_depth, depths) = (new_figure(9.0, 3.2, columns=2) for _ in range(2))
-    for z_axes, y_axes, (medium, found) in zip(rows, depths, result["polynomials"].items(), strict=True):
-        for name, line in found["lines"].items():
-            z_axes.plot(line["centre_px"], line["z_mm"], label=f"profile line, {name}")
-            y_axes.plot(line["z_mm"], line["y_mm"], label=f"profile line, {name}")
+    for z_axes, y_axes, (medium, found) in zip(rows, depths, results.polynomials.items(), strict=True):
+        for name, line in found.lines.items():
+            z_axes.plot(line.centre_px, line.z_mm, label=f"profile line, {name}")
+            y_axes.plot(line.z_mm, line.y_mm, label=f"profile line, {name}")
         z_axes.set(title=f"Z(v) in {medium}", xlabel="stripe position v / px", ylabel="Z / mm")
         y_axes.set(title=f"Y(Z) in {medium}", xlabel="Z / mm", ylabel="Y / mm")
     legend_below(by_row)
@@ -40,12 +40,12 @@ def polynomials_figures(result: dict[str, Any]) -> tuple[Figure, Figure]:
     return by_row, by_depth
 
 
-def line_figure(result: dict[str, Any]) -> Figure:
+def line_figure(results: CampaignResults) -> Figure:
     """Figure 67: the stripe on a 300 mm pipe at the stand-off, for either orientation of the camera."""
     figure, (axes,) = new_figure(4.8, 3.2)
     profiles = {
-        f"along the image's {side}: {profile['length_mm']:.1f} mm": profile["points_mm"]
-        for side, profile in result["line_profiles"].items()
+        f"along the image's {side}: {profile.length_mm:.1f} mm": profile.points_mm
+        for side, profile in results.line_profiles.items()
     }
     _draw_profiles(axes, "Stripe on a 300 mm pipe in water", profiles)
     legend_below(figure, columns=1)
@@ -69,7 +69,7 @@ def comparison_figure(rows: Sequence[TableRow]) -> Figure:
     return figure
 
 
-def _draw_profiles(axes: Axes, title: str, profiles: Mapping[str, list[list[float]]]) -> None:
+def _draw_profiles(axes: Axes, title: str, profiles: Mapping[str, Points]) -> None:
     """Draw points (Y, Z) in mm of profiles by name."""
     for name, points in profiles.items():
         axes.plot(*np.array(points, float).reshape(-1, 2).T, ".", markersize=3, label=name)

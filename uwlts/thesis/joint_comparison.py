@@ -1,12 +1,12 @@
 """The joint calibration compared with the thesis's two ways, on the same images of its campaign."""
 
-import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,23 +18,22 @@ from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.measurement.figure_uncertainty import figure_uncertainties
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
-from uwlts.optics.design import speckle_limit_um
-from uwlts.report.inventory import nominal_setup
+from uwlts.optics.design import nominal_setup, speckle_limit_um
 from uwlts.report.page_toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
 from uwlts.runtime.workers import Tell, work_through
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.files import written_aside
+from uwlts.storage.files import json_text, written_aside
 from uwlts.stripe import find_stripes
-from uwlts.thesis.campaign import CampaignFolder, ScanFile, keep, kept, up_to_date
+from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, TWO, calibrations
+from uwlts.thesis.results import JointResults, JointSummary, MediumSummary, Method, PlaneScatter, SphereErrors
 
 RESULTS = "joint.json"
-FORMAT, VERSION = "uwlts-joint-comparison", 1
-ONE_REFRACTION, TWO_REFRACTIONS, JOINT = "one_refraction", "two_refractions", "joint"
-_COVERAGE = 1.96
+_COVERAGE = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
 SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
 Progress = Callable[[int, int], None]
 
@@ -43,7 +42,7 @@ def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
     """The joint calibration from a campaign, kept with the others; the time to solve it in s.
 
     Targets, steps, and the scans of spheres in water: these were made in another water than the calibration, whose
-    index their roundness tells. Of their sizes it is told nothing.
+    index follows from their roundness. Their sizes are not used.
 
     Raises
     ------
@@ -72,8 +71,8 @@ def compare_campaigns(
     workers: int | None = None,
     again: bool = False,
     progress: Progress = lambda done, total: None,
-) -> list[dict[str, Any]]:
-    """Errors of every scan of spheres and planes by the three ways, with the joint one's uncertainties, as plain JSON.
+) -> list[JointResults]:
+    """Errors of every scan of spheres and planes by the three calibrations, with the joint one's uncertainties.
 
     Those of each campaign are kept in its folder, and read from there unless ``again`` is set or a recording is newer.
     ``progress(done, total)`` counts scans.
@@ -92,63 +91,55 @@ def compare_campaigns(
         done += 1
         progress(done, total)
 
-    jobs = [_Job(folder, again) for folder in folders]
-    return work_through(_compare, jobs, workers=workers, heard=heard)
-
-
-@dataclass(frozen=True)
-class _Job:
-    folder: CampaignFolder
-    again: bool
+    return work_through(partial(_compare, again), folders, workers=workers, heard=heard)
 
 
 def _compared(folder: CampaignFolder) -> list[ScanFile]:
     return [scan for scan in folder.scans() if scan.thing in ("spheres", "plane")]
 
 
-def _compare(job: _Job, tell: Tell) -> dict[str, Any]:
-    """Tells of every scan."""
-    folder, path = job.folder, job.folder.path / RESULTS
-    if not job.again and up_to_date(path):
+def _compare(again: bool, folder: CampaignFolder, tell: Tell) -> JointResults:
+    """Results of a campaign; ``tell`` is called for every scan."""
+    path = folder.path / RESULTS
+    if not again and up_to_date(path):
         for _ in _compared(folder):
             tell(None)
-        return kept(path, format=FORMAT, version=VERSION)
-    by_turns = calibrations(folder)
+        return JointResults.read(path)
+    sequential = calibrations(folder)
     joint, solve_s = joint_calibration(folder)
     spheres, planes = [], []
     for scan in _compared(folder):
-        known = {JOINT: joint, ONE_REFRACTION: by_turns[PROPOSED, scan.medium]}
-        if (TWO, scan.medium) in by_turns:
-            known[TWO_REFRACTIONS] = by_turns[TWO, scan.medium]
         if scan.thing == "spheres":
-            spheres.append(_of_spheres(scan, known))
+            one, two = (sequential.get((method, scan.medium)) for method in (PROPOSED, TWO))
+            spheres.append(_of_spheres(scan, {"joint": joint, "one_refraction": one, "two_refractions": two}))
         else:
             planes.append(_of_plane(scan, joint))
         tell(None)
-    results = {"campaign": folder.path.name, "solve_s": solve_s, "spheres": spheres, "planes": planes}
-    return keep(path, results, format=FORMAT, version=VERSION)
+    return JointResults(campaign=folder.path.name, solve_s=solve_s, spheres=spheres, planes=planes).keep(path)
 
 
-def _of_spheres(scan: ScanFile, known: dict[str, Calibration]) -> dict[str, Any]:
+def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration | None]) -> SphereErrors:
+    errors, std_mm = {}, {}
     with Capture(scan.path) as capture:
-        artefact, stripes = parse_artefact(capture.header.artefact), find_stripes(capture)
-        found: dict[str, Any] = {"placement": scan.placement, "medium": scan.medium}
-        for way, calibration in known.items():
-            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=way == JOINT)
+        artefact, stripes = parse_artefact(capture.header.artefact or {}), find_stripes(capture)
+        for method, calibration in known.items():
+            if calibration is None:
+                continue
+            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=method == "joint")
             evaluation = evaluate_cloud(cloud, artefact)
-            found[way] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
-            if way == JOINT:
-                std = figure_uncertainties(cloud, evaluation)
-                found["std"] = {name: std[name].expanded_mm / 2 for name in found[way]}
-    return found
+            errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
+            if method == "joint":
+                expanded = figure_uncertainties(cloud, evaluation)
+                std_mm = {name: expanded[name].expanded_mm / 2 for name in errors[method]}
+    return SphereErrors(placement=scan.placement, medium=scan.medium, std=std_mm, **errors)
 
 
-def _of_plane(scan: ScanFile, joint: Calibration) -> dict[str, Any]:
+def _of_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
     """Scatter of a plane about its fit, over the speckle limit along the laser's axis at its distance."""
     with Capture(scan.path) as capture:
         header = capture.header
         cloud = reconstruct_stripes(capture, find_stripes(capture), joint)
-        std_mm = evaluate_cloud(cloud, parse_artefact(header.artefact)).figures_mm["STD"]
+        std_mm = evaluate_cloud(cloud, parse_artefact(header.artefact or {})).figures_mm["STD"]
         setup, leaning = nominal_setup(header.sensor, header.medium)
         frame = joint.object_transform()
         depth = float(np.mean(cloud.points_mm @ frame[2, :3]) + frame[2, 3])
@@ -161,54 +152,52 @@ def _of_plane(scan: ScanFile, joint: Calibration) -> dict[str, Any]:
             distance_mm=float(window.reach_mm(depth)),
         )
     limit = across * leaning / np.tan(setup.triangulation_angle_rad)
-    return {"placement": scan.placement, "medium": scan.medium, "std_mm": std_mm, "over_limit": float(std_mm / limit)}
+    return PlaneScatter(scan.placement, scan.medium, std_mm, float(std_mm / limit))
 
 
-def joint_summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Figures of all campaigns: errors of all scans, share of the intervals that hold the truth, time to solve."""
-    summary: dict[str, Any] = {"campaigns": len(results)}
-    for medium in ("water", "air"):
-        spheres = [s for result in results for s in result["spheres"] if s["medium"] == medium]
-        ways = [way for way in (ONE_REFRACTION, TWO_REFRACTIONS, JOINT) if spheres and way in spheres[0]]
-        planes = [p["over_limit"] for result in results for p in result["planes"] if p["medium"] == medium]
-        inside = [abs(s[JOINT][n]) <= _COVERAGE * s["std"][n] for s in spheres for n in (SPACING, *DIAMETERS)]
-        summary[medium] = {
-            "spacing_error_mm": {way: [s[way][SPACING] for s in spheres] for way in ways},
-            "diameter_error_mm": {way: [s[way][n] for s in spheres for n in DIAMETERS] for way in ways},
-            "plane_std_over_speckle_limit": planes,
-            "coverage_95": float(np.mean(inside)) if inside else None,
-        }
-    return summary["water"] | {"solve_s": [result["solve_s"] for result in results]} | summary
+def joint_summary(results: Sequence[JointResults]) -> JointSummary:
+    """Errors of all campaigns' scans, share of the intervals that hold the truth, time to solve."""
+    water, air = (_medium_summary(results, medium) for medium in ("water", "air"))
+    solve_s = [result.solve_s for result in results]
+    return JointSummary(**dict(water), solve_s=solve_s, campaigns=len(results), water=water, air=air)
 
 
-def summary_lines(summary: dict[str, Any]) -> list[str]:
-    """The summary in words."""
+def _medium_summary(results: Sequence[JointResults], medium: str) -> MediumSummary:
+    spheres = [scan for result in results for scan in result.spheres if scan.medium == medium]
+    methods = list(spheres[0].by_method()) if spheres else []
+    inside = [abs(scan.joint[n]) <= _COVERAGE * scan.std[n] for scan in spheres for n in (SPACING, *DIAMETERS)]
+    return MediumSummary(
+        spacing_error_mm={m: [scan.by_method()[m][SPACING] for scan in spheres] for m in methods},
+        diameter_error_mm={m: [scan.by_method()[m][n] for scan in spheres for n in DIAMETERS] for m in methods},
+        plane_std_over_speckle_limit=[p.over_limit for r in results for p in r.planes if p.medium == medium],
+        coverage_95=float(np.mean(inside)) if inside else None,
+    )
+
+
+def summary_lines(summary: JointSummary) -> list[str]:
+    """The summary as sentences."""
     lines = []
-    for medium in ("water", "air"):
-        part = summary[medium]
-        for what, name in (("sphere spacing", "spacing_error_mm"), ("sphere diameter", "diameter_error_mm")):
+    for medium, part in (("water", summary.water), ("air", summary.air)):
+        for name, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
             means = ", ".join(
-                f"{way.replace('_', ' ')} {np.mean(np.abs(errors)):.4f} mm (largest {np.max(np.abs(errors)):.4f})"
-                for way, errors in part[name].items()
+                f"{_WORDS[method]} {np.mean(np.abs(errors)):.4f} mm (largest {np.max(np.abs(errors)):.4f})"
+                for method, errors in errors_mm.items()
             )
             if means:
-                lines.append(f"{medium}, error of the {what}, mean of the absolute values: {means}")
-        if part["coverage_95"] is not None:
-            lines.append(f"{medium}, truth within the stated 95 % intervals: {100 * part['coverage_95']:.0f} %")
-        if over := part["plane_std_over_speckle_limit"]:
+                lines.append(f"{medium}, error of the {name}, mean of the absolute values: {means}")
+        if part.coverage_95 is not None:
+            lines.append(f"{medium}, truth within the stated 95 % intervals: {100 * part.coverage_95:.0f} %")
+        if over := part.plane_std_over_speckle_limit:
             lines.append(f"{medium}, scatter of planes over the speckle limit: {np.mean(over):.2f} on average")
-    return [*lines, f"joint estimate solved in {', '.join(f'{s:.1f}' for s in summary['solve_s'])} s"]
+    return [*lines, f"joint estimate solved in {', '.join(f'{s:.1f}' for s in summary.solve_s)} s"]
 
 
-_WORDS = {ONE_REFRACTION: "one refraction", TWO_REFRACTIONS: "two refractions", JOINT: "joint"}
-_QUANTITIES = {"spacing_error_mm": ("sphere spacing", (SPACING,)), "diameter_error_mm": ("sphere diameter", DIAMETERS)}
+_WORDS: dict[Method, str] = {"one_refraction": "one refraction", "two_refractions": "two refractions", "joint": "joint"}
 # Side by side within each campaign.
-_BESIDE = {ONE_REFRACTION: -0.2, TWO_REFRACTIONS: 0.0, JOINT: 0.2}
+_BESIDE: dict[Method, float] = {"one_refraction": -0.2, "two_refractions": 0.0, "joint": 0.2}
 
 
-def write_joint_comparison(
-    folder: Path, results: Sequence[dict[str, Any]], *, overwrite: bool = False
-) -> dict[str, Any]:
+def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, overwrite: bool = False) -> JointSummary:
     """Write report.html and summary.json into a folder, each whole or not at all; OutputError where that fails."""
     summary = joint_summary(results)
     with (
@@ -216,67 +205,64 @@ def write_joint_comparison(
         written_aside(folder / "summary.json", overwrite=overwrite) as aside,
     ):
         page.write_text(joint_page(results, summary), encoding="utf-8")
-        aside.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        aside.write_text(json_text(summary, indent=1), encoding="utf-8")
     return summary
 
 
-def joint_page(results: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
+def joint_page(results: Sequence[JointResults], summary: JointSummary) -> str:
     """The page as text, from the results of `compare_campaigns` and their `joint_summary`."""
-    media = [medium for medium in ("water", "air") if any(summary[medium]["spacing_error_mm"].values())]
     return render_page(
         "uwlts.thesis",
         "joint.html.j2",
         software=f"uwlts {uwlts.__version__}",
-        campaigns=summary["campaigns"],
-        solve_s=max(summary["solve_s"]),
+        summary=summary,
         media=[
-            {
-                "name": medium,
-                "rows": _rows(summary[medium]),
-                "over_limit": summary[medium]["plane_std_over_speckle_limit"],
-                "coverage": summary[medium]["coverage_95"],
-                "picture": svg_of(_errors_figure(results, medium)),
-            }
-            for medium in media
+            (medium, part, _rows(part), svg_of(_errors_figure(results, medium)))
+            for medium, part in summary.media().items()
         ],
     )
 
 
-def _rows(part: dict[str, Any]) -> list[dict[str, Any]]:
-    """Mean and largest error by quantity and way, and how many times the joint one's mean."""
+class _Row(NamedTuple):
+    """Mean and largest error of a quantity by one calibration, and the mean over the joint one's."""
+
+    quantity: str
+    method: str
+    mean: float
+    largest: float
+    times: float
+    number: int
+
+
+def _rows(part: MediumSummary) -> list[_Row]:
     rows = []
-    for name, (quantity, _) in _QUANTITIES.items():
-        means = {way: float(np.mean(np.abs(errors))) for way, errors in part[name].items()}
+    for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
+        sizes = {method: np.abs(errors) for method, errors in errors_mm.items()}
         rows += [
-            {
-                "quantity": quantity,
-                "way": _WORDS[way],
-                "mean": mean,
-                "largest": float(np.max(np.abs(part[name][way]))),
-                "times": mean / means[JOINT],
-                "number": len(part[name][way]),
-            }
-            for way, mean in means.items()
+            _Row(quantity, _WORDS[method], size.mean(), size.max(), size.mean() / sizes["joint"].mean(), len(size))
+            for method, size in sizes.items()
         ]
     return rows
 
 
-def _errors_figure(results: Sequence[dict[str, Any]], medium: str) -> Figure:
+def _errors_figure(results: Sequence[JointResults], medium: str) -> Figure:
     """Errors of all scans by campaign; the joint ones with their stated 95 % intervals."""
-    figure, panels = new_figure(9.0, 3.4, columns=len(_QUANTITIES))
-    for axes, (quantity, figures) in zip(panels, _QUANTITIES.values(), strict=True):
-        for colour, (way, words) in zip((COLOURS[5], COLOURS[1], COLOURS[0]), _WORDS.items(), strict=True):
+    figure, panels = new_figure(9.0, 3.4, columns=2)
+    quantities = (("sphere spacing", (SPACING,)), ("sphere diameter", DIAMETERS))
+    for axes, (quantity, figures) in zip(panels, quantities, strict=True):
+        for colour, (method, words) in zip((COLOURS[5], COLOURS[1], COLOURS[0]), _WORDS.items(), strict=True):
             points = [
-                (place + _BESIDE[way] + 0.03 * (number - 2.5), 1000 * scan[way][figure], 1000 * scan["std"][figure])
+                (place + _BESIDE[method] + 0.03 * (number - 2.5), 1000 * errors[name], 1000 * scan.std[name])
                 for place, result in enumerate(results)
-                for number, scan in enumerate(s for s in result["spheres"] if s["medium"] == medium and way in s)
-                for figure in figures
+                for number, scan in enumerate(scan for scan in result.spheres if scan.medium == medium)
+                if (errors := scan.by_method().get(method))
+                for name in figures
             ]
             if points:
                 x, y, std = np.array(points).T
-                is_joint = way == JOINT
-                name = f"{words}, with the stated 95 % intervals" if is_joint else words
-                axes.errorbar(x, y, _COVERAGE * std if is_joint else None, fmt="o", ms=4, color=colour, label=name)
+                is_joint = method == "joint"
+                label = f"{words}, with the stated 95 % intervals" if is_joint else words
+                axes.errorbar(x, y, _COVERAGE * std if is_joint else None, fmt="o", ms=4, color=colour, label=label)
         axes.set(title=f"{quantity} in {medium}", xlabel="campaign", ylabel="error / µm", xticks=range(len(results)))
     legend_below(figure)
     return figure

@@ -8,8 +8,9 @@ read as five pixels, the size of the filter. Which lines show a stripe is decide
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ from uwlts.storage.cloud import PointCloud, write_cloud
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import FoundStripes, find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile
+from uwlts.thesis.results import Measurement
 
 PROPOSED, TWO, POLYNOMIALS, SINGLE = "proposed", "two refractions", "polynomials", "single viewpoint"
 FORGOTTEN = "window forgotten"
@@ -74,7 +76,7 @@ def calibrations(
     return found
 
 
-def _rays(target: Path, steps: list[Path], *, refractions: int) -> Calibration:
+def _rays(target: Path, steps: list[Path], *, refractions: Literal[1, 2]) -> Calibration:
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(target))]
         opened = [stack.enter_context(Capture(path)) for path in steps]
@@ -143,20 +145,6 @@ _SHOWN = ("pipe", "head", "weld")
 """Things whose coloured clouds are kept for the report."""
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """Figures of one scan by one method and image processing, by name, in mm. ``failure`` says why there are none."""
-
-    thing: str
-    placement: str
-    medium: str
-    method: str
-    processing: str
-    figures_mm: dict[str, float]
-    points: int = 0
-    failure: str | None = None
-
-
 def measure_scan(
     scan: ScanFile, calibrations: Mapping[tuple[str, str], AnyCalibration], *, clouds: Path
 ) -> list[Measurement]:
@@ -194,10 +182,11 @@ def _figures(evaluation: Evaluation) -> dict[str, float]:
     4 to 6 standard deviations of more than ten thousand points cannot be had without. The full ranges stand beside.
     """
     figures = {figure.key.name: figure.value_mm for figure in evaluation.figures}
-    for name in ("PE", "RE"):
-        if name in figures:
-            figures[f"{name} of all points"] = figures[name]
-            figures[name] = _range_within(evaluation.cloud.deviation_mm)
+    deviation_mm = evaluation.cloud.deviation_mm
+    for name in {"PE", "RE"} & figures.keys():
+        figures[f"{name} of all points"] = figures[name]
+        if deviation_mm is not None:
+            figures[name] = _range_within(deviation_mm)
     if (fitted := evaluation.truth_after_best_fit) is not None:
         spread = fitted.std_mm
         figures |= {"std to the true surface": spread} | ({} if evaluation.artefact else {"STD": spread})

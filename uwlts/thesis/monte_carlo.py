@@ -90,7 +90,7 @@ def propagate(
         The unperturbed evidence gives no calibration, or more than a tenth of the trials fail.
     """
     if trials < LEAST_TRIALS:
-        raise RangeError(f"{trials} trials tell no 95 % interval: make at least {LEAST_TRIALS}")
+        raise RangeError(f"{trials} trials give no 95 % interval: make at least {LEAST_TRIALS}")
     start = solve(evidence, options=options)
     # Offsets of circle centres hardly change from trial to trial; they are taken out once.
     if start.bias_px is not None:
@@ -185,10 +185,10 @@ class _Draw:
         air, steps = self._air(self._evidence.air, rng), self._steps(rng)
         window = self._evidence.window
         tilt = self._std("window_tilt_std_deg") * rng.standard_normal(2)
-        turned = window.model_copy(
-            update={"tilt_x_deg": window.tilt_x_deg + float(tilt[0]), "tilt_y_deg": window.tilt_y_deg + float(tilt[1])}
-        )
-        return replace(self._evidence, air=air, steps=steps, window=turned)
+        if window is not None:
+            tilts = {"tilt_x_deg": window.tilt_x_deg + float(tilt[0]), "tilt_y_deg": window.tilt_y_deg + float(tilt[1])}
+            window = window.model_copy(update=tilts)
+        return replace(self._evidence, air=air, steps=steps, window=window)
 
     def _air(self, air: AirEvidence, rng: np.random.Generator) -> AirEvidence:
         # The target may be turned against the stage's travel, and the travel against the laser's axis.
@@ -209,7 +209,7 @@ class _Draw:
                     for point in image.points_mm.tolist()
                 ]
             )
-            # A plate that is not square to the travel moves sideways on itself; what stands out from a bowed one
+            # A target that is not square to the travel moves sideways on itself; what stands out from a bowed one
             # is seen where its ray meets the flat one.
             sideways = np.append(tilt, 0.0) * (image.stage_mm - middle)
             height = bow * (np.linalg.norm(image.points_mm, axis=1, keepdims=True) / farthest) ** 2

@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import uwlts
 from uwlts.report import plot
@@ -18,6 +17,7 @@ from uwlts.storage.files import written_aside
 from uwlts.thesis.campaign import campaign_folders
 from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
 from uwlts.thesis.measurements import FORGOTTEN
+from uwlts.thesis.results import CampaignResults
 from uwlts.thesis.tables import LARGEST_RATIO, MEAN, Published, TableRow, all_rows, headline_rows
 
 
@@ -107,7 +107,7 @@ _COLUMNS = ("table", "row", "quantity", "published", "ours_mean", "ours_min", "o
 
 
 def write_comparison(
-    folder: Path, results: Sequence[dict[str, Any]], published: Published, *, overwrite: bool = False
+    folder: Path, results: Sequence[CampaignResults], published: Published, *, overwrite: bool = False
 ) -> list[TableRow]:
     """Write all four files into a folder, each whole or not at all; returns the rows of the tables.
 
@@ -129,7 +129,7 @@ def write_comparison(
     return rows
 
 
-def markdown(rows: Sequence[TableRow], results: Sequence[dict[str, Any]]) -> str:
+def markdown(rows: Sequence[TableRow], results: Sequence[CampaignResults]) -> str:
     """The headline as a Markdown table."""
     campaigns = len(results)
     lines = [
@@ -148,9 +148,9 @@ def markdown(rows: Sequence[TableRow], results: Sequence[dict[str, Any]]) -> str
 
 def _csv(rows: Sequence[TableRow]) -> str:
     text = io.StringIO()
-    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row.as_dict() for row in rows)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    writer.writerows(row.as_dict().values() for row in rows)
     return text.getvalue()
 
 
@@ -175,7 +175,9 @@ _TITLES = {
 }
 
 
-def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[TableRow], published: Published) -> str:
+def report_page(
+    folder: Path, results: Sequence[CampaignResults], rows: Sequence[TableRow], published: Published
+) -> str:
     """The page as text, with pictures from the first campaign in the folder."""
     first = results[0]
     z_of_v, y_of_z = polynomials_figures(first)
@@ -211,9 +213,14 @@ def report_page(folder: Path, results: Sequence[dict[str, Any]], rows: Sequence[
             ("Figure 58", "Polynomials Z(v).", svg_of(z_of_v)),
             ("Figure 59", "Polynomials Y(Z).", svg_of(y_of_z)),
         ]
-        + ([("Figure 67", "Stripe on a 300 mm pipe.", svg_of(line_figure(first)))] if first["line_profiles"] else []),
-        monte_carlo=_monte_carlo(results),
-        failures=[(number, m) for number, result in enumerate(results) for m in result["measurements"] if m["failure"]],
+        + ([("Figure 67", "Stripe on a 300 mm pipe.", svg_of(line_figure(first)))] if first.line_profiles else []),
+        intervals=[(number, each) for number, result in enumerate(results) for each in result.monte_carlo],
+        held_by_budget=sum(
+            abs(each.observed_mm) <= result.budget.get("expanded", -1.0)
+            for result in results
+            for each in result.monte_carlo
+        ),
+        failures=[(number, m) for number, result in enumerate(results) for m in result.measurements if m.failure],
         pictures=_pictures(folder),
         version=uwlts.__version__,
     )
@@ -227,25 +234,6 @@ def _folded(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[T
     values = {(row.row, row.quantity): row for row in rows}
     names = dict.fromkeys(row.row for row in rows)
     return quantities, [(name, [values.get((name, quantity)) for quantity in quantities]) for name in names]
-
-
-def _monte_carlo(results: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """How often the Monte-Carlo interval and the budget's hold the truth."""
-    trials = [each for result in results for each in result["monte_carlo"]]
-    if not trials:
-        return None
-    held = [
-        abs(each["observed_mm"]) <= result["budget"]["expanded"]
-        for result in results
-        if "expanded" in result["budget"]
-        for each in result["monte_carlo"]
-    ]
-    return {
-        "intervals": [(number, each) for number, result in enumerate(results) for each in result["monte_carlo"]],
-        "held": sum(each["contains_truth"] for each in trials),
-        "budget_held": sum(held),
-        "count": len(trials),
-    }
 
 
 def _pictures(folder: Path) -> list[tuple[str, str, str]]:

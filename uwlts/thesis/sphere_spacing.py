@@ -21,6 +21,7 @@ from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import STEP_PLACES, CampaignFolder
+from uwlts.thesis.results import WindowChoice, WindowProfile
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +89,11 @@ _TRIED_SHARES = (0.25, 0.5, 1.0, 1.5)
 """Window distances of Figure 45, as shares of the calibrated one."""
 
 
-@dataclass(frozen=True)
-class WindowChoice:
-    """Window distance found from some step images, and the mean absolute sphere spacing error that it leads to.
-
-    None where the images determine no distance within its bounds.
-    """
-
-    images: str
-    distance_mm: float | None
-    mean_sse_mm: float | None
+def window_of(calibration: Calibration) -> WindowModel:
+    """The window of a calibration; CalibrationError where it has none."""
+    if calibration.window is None:
+        raise CalibrationError("the calibration has no window: calibrate with step images")
+    return calibration.window
 
 
 def mean_spacing_error(calibration: Calibration, scans: Sequence[SphereScan]) -> float:
@@ -119,24 +115,24 @@ def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: f
 
 def window_choices(
     folder: CampaignFolder, calibration: Calibration, scans: Sequence[SphereScan]
-) -> tuple[list[WindowChoice], list[dict[str, object]]]:
+) -> tuple[list[WindowChoice], list[WindowProfile]]:
     """Every step image alone, the three of each place, and all nine; and profiles of a step at several distances.
 
-    Returns
-    -------
-    choices : list of WindowChoice
-        ``images`` is the place and the image's number (from 1), the place alone, or "all".
-    profiles : list of dict
-        For Figure 45: ``distance_mm`` and points (N, 2), Y and Z in mm, of one step image seen through a window at
-        that distance.
+    Raises
+    ------
+    CaptureError
+        A recording is missing or damaged.
+    CalibrationError
+        The calibration has no window.
     """
+    nominal = window_of(calibration)
     images = _step_images(folder, calibration)
     subsets = {f"{place} {number}": [image] for place in images for number, image in enumerate(images[place], start=1)}
     subsets |= images | {"all": [image for place in images for image in images[place]]}
     choices = []
     for name, chosen in subsets.items():
         try:
-            window = solve_window(calibration, calibration.window, chosen).model
+            window = solve_window(calibration, nominal, chosen).model
         except CalibrationError:
             choices.append(WindowChoice(name, None, None))
             continue
@@ -145,20 +141,20 @@ def window_choices(
     shown = images[STEP_PLACES[1]][0]
     profiles = []
     for share in _TRIED_SHARES:
-        window = calibration.window.model_copy(update={"distance_mm": share * calibration.window.distance_mm})
+        window = nominal.model_copy(update={"distance_mm": share * nominal.distance_mm})
         profile = step_profile(calibration, window, shown.pixels, medium_index=shown.medium_index)
         seen = profile[np.isfinite(profile).all(axis=1)][::4]
-        profiles.append({"distance_mm": window.distance_mm, "points_mm": np.round(seen, 4).tolist()})
+        profiles.append(WindowProfile(window.distance_mm, np.round(seen, 4).tolist()))
     return choices, profiles
 
 
 def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, list[StepImage]]:
-    """Step images by place, with their treads told apart."""
+    """Step images by place, with their faces told apart."""
     found = {}
     for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
         with Capture(path) as capture:
             evidence, _ = step_evidence([capture])
-            sensor, refractions = capture.header.sensor, calibration.window.refractions
+            sensor, refractions = capture.header.sensor, window_of(calibration).refractions
             described = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
         found[place] = [step_image(calibration, described, step) for step in evidence]
     return found
@@ -197,7 +193,7 @@ def spacing_budget(
         for sign in (1, -1)
     ]
     changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in ends]
-    by_index = float(np.mean(np.abs(np.subtract(*changes)))) / 2
+    by_index = float(np.mean(np.abs(np.diff(changes, axis=0)))) / 2
     expansion = thermal_expansion_mm(
         length_mm=scans[0].spacing_mm, alpha_per_k=_EXPANSION_PER_K, temperature_change_k=TEMPERATURE_HALF_WIDTH_C
     )

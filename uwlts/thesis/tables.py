@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, read_table
 from uwlts.thesis.campaign import MEDIA, STEP_PLACES
 from uwlts.thesis.measurements import FORGOTTEN, OURS, POLYNOMIALS, PROPOSED, SINGLE, THESIS, TWO, VARIANTS
+from uwlts.thesis.results import CampaignResults, Measurement
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class TableRow:
         """Our mean over the published value."""
         return self.mean / self.published if self.published and self.mean is not None else None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, str | float | None]:
         """As the summary file holds it."""
         return {
             "table": self.table,
@@ -83,8 +85,8 @@ class TableRow:
         }
 
 
-def all_rows(results: Sequence[dict[str, Any]], published: Published) -> list[TableRow]:
-    """Rows of all tables from the results of campaigns (`uwlts.thesis.evaluation`)."""
+def all_rows(results: Sequence[CampaignResults], published: Published) -> list[TableRow]:
+    """Rows of all tables from the results of campaigns."""
     spheres, planes = ("spheres", ("PE", "STD", "SSE")), ("plane", ("RE", "STD"))
     seen = _Seen(results, published)
     rows = [
@@ -116,7 +118,9 @@ def headline_rows(rows: Sequence[TableRow]) -> list[TableRow]:
     ]
 
 
-def _collected(results: Sequence[dict[str, Any]], value: Callable[[dict[str, Any]], float | None]) -> tuple[float, ...]:
+def _collected(
+    results: Sequence[CampaignResults], value: Callable[[CampaignResults], float | None]
+) -> tuple[float, ...]:
     """A value of every campaign that has it, without its sign."""
     found = (value(result) for result in results)
     return tuple(abs(number) for number in found if number is not None)
@@ -126,6 +130,7 @@ def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
     """Rows of one quantity and their mean over the positions that were measured, campaign by campaign."""
     yield from rows
     theirs = [row.published for row in rows if row.ours]
+    published = [value for value in theirs if value is not None]
     complete = [row.ours for row in rows if row.ours]
     counts = {len(values) for values in complete}
     if complete and len(counts) == 1:
@@ -133,28 +138,32 @@ def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
             rows[0].table,
             name,
             rows[0].quantity,
-            None if None in theirs else float(np.mean(theirs)),
+            float(np.mean(published)) if len(published) == len(theirs) else None,
             tuple(np.mean(complete, axis=0).tolist()),
         )
+
+
+def _key(found: Measurement) -> tuple[str, str, str, str, str]:
+    return found.thing, found.placement, found.medium, found.method, found.processing
 
 
 @dataclass(frozen=True)
 class _Seen:
     """All campaigns' measurements, looked up by what was measured and how."""
 
-    results: Sequence[dict[str, Any]]
+    results: Sequence[CampaignResults]
     published: Published
 
     def figures(
         self, thing: str, place: str, medium: str, method: str, processing: str, name: str
     ) -> tuple[float, ...]:
         """A figure of every campaign that has it, without its sign."""
-        wanted = {"thing": thing, "placement": place, "medium": medium, "method": method, "processing": processing}
+        wanted = thing, place, medium, method, processing
         return tuple(
-            abs(found["figures_mm"][name])
+            abs(found.figures_mm[name])
             for result in self.results
-            for found in result["measurements"]
-            if wanted.items() <= found.items() and name in found["figures_mm"]
+            for found in result.measurements
+            if _key(found) == wanted and name in found.figures_mm
         )
 
     def objects(self, table: str, thing: str, names: Sequence[str], method: str, processing: str) -> Iterator[TableRow]:
@@ -170,17 +179,17 @@ class _Seen:
                 yield from _with_mean(rows, f"{thing}, {MEAN}, {medium}")
 
 
-def _window(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
+def _window(results: Sequence[CampaignResults], published: Published) -> Iterator[TableRow]:
     sets = [(f"{place} {n}", (place, n - 1)) for place in STEP_PLACES for n in (1, 2, 3)]
     sets += [(place, (place, 3)) for place in STEP_PLACES] + [("all", ("all",))]
     for quantity, key, source in (
-        ("window distance", "distance_mm", "window"),
-        ("mean SSE", "mean_sse_mm", "window_sse"),
+        ("window distance", attrgetter("distance_mm"), "window"),
+        ("mean SSE", attrgetter("mean_sse_mm"), "window_sse"),
     ):
         for name, path in sets:
-            ours = _collected(results, lambda r, n=name, k=key: r["window"].get(n, {}).get(k))
+            ours = _collected(results, lambda r, n=name, k=key: k(r.window[n]) if n in r.window else None)
             yield TableRow("Table 4", f"step images: {name}", quantity, published.value(source, *path), ours)
-    ours = _collected(results, lambda r: r["two_refractions_distance_mm"])
+    ours = _collected(results, lambda r: r.two_refractions_distance_mm)
     yield TableRow(
         "Table 4", "two refractions, all", "window distance", published.value("window", "two_refractions"), ours
     )
@@ -207,16 +216,16 @@ def _shares(seen: _Seen) -> Iterator[TableRow]:
         places = seen.published.positions("spheres")
         found = [seen.figures("spheres", place, medium, method, THESIS, "SSE") for place in places]
         depth = seen.published.value("depth_mm", medium)
-        complete = [errors for errors in found if len(errors) == len(seen.results)] if depth else []
-        shares = tuple((100 / depth * np.max(complete, axis=0)).tolist()) if complete else ()
+        complete = [errors for errors in found if len(errors) == len(seen.results)]
+        shares = tuple((100 / depth * np.max(complete, axis=0)).tolist()) if depth and complete else ()
         theirs = seen.published.value("share_percent", medium, method)
         yield TableRow("Table 8", f"{method}, {medium}", "largest SSE over depth, %", theirs, shares)
 
 
-def _budget(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
+def _budget(results: Sequence[CampaignResults], published: Published) -> Iterator[TableRow]:
     names = list(published.content.get("budget", {}))
     for name in names:
-        ours = _collected(results, lambda r, n=name: r["budget"].get(n))
+        ours = _collected(results, lambda r, n=name: r.budget.get(n))
         yield TableRow("Table 9", name.replace("_", " "), _unit_of(name), published.value("budget", name), ours)
 
 
@@ -225,15 +234,15 @@ def _unit_of(name: str) -> str:
     return known.get(name, "u")
 
 
-def _line(results: Sequence[dict[str, Any]], published: Published) -> Iterator[TableRow]:
+def _line(results: Sequence[CampaignResults], published: Published) -> Iterator[TableRow]:
     theirs = {"width": published.value("line", "length_mm"), "height": None}
     for side, length in theirs.items():
-        ours = _collected(results, lambda r, s=side: r["line_profiles"].get(s, {}).get("length_mm"))
+        ours = _collected(results, lambda r, s=side: r.line_profiles[s].length_mm if s in r.line_profiles else None)
         yield TableRow(
             "Figure 67", f"300 mm pipe at the stand-off, stripe along the {side}", "line length", length, ours
         )
     for medium in MEDIA:
-        ours = _collected(results, lambda r, m=medium: r["polynomials"][m]["residual_mm"])
+        ours = _collected(results, lambda r, m=medium: r.polynomials[m].residual_mm)
         theirs_mm = published.value("line", "polynomial_residual_mm")
         yield TableRow("Figure 58", f"Z(v) in {medium}", "residual", theirs_mm, ours)
 
@@ -241,13 +250,12 @@ def _line(results: Sequence[dict[str, Any]], published: Published) -> Iterator[T
 def _free_forms(seen: _Seen) -> Iterator[TableRow]:
     """STD of the objects of Figure 66 whose values the thesis draws and does not print."""
     keys = {
-        tuple(found[key] for key in ("thing", "placement", "medium", "method", "processing"))
+        _key(found)
         for result in seen.results
-        for found in result["measurements"]
-        if found["thing"] in ("pipe", "head", "weld")
+        for found in result.measurements
+        if found.thing in ("pipe", "head", "weld")
     }
-    for key in sorted(keys):
-        thing, _, medium, method, processing = key
+    for thing, place, medium, method, processing in sorted(keys):
         for name in ("STD", "diameter error") if thing == "pipe" else ("STD",):
             row = f"{thing}, {medium}, {method}, {processing} image processing"
-            yield TableRow("Figure 66", row, name, None, seen.figures(*key, name))
+            yield TableRow("Figure 66", row, name, None, seen.figures(thing, place, medium, method, processing, name))

@@ -12,8 +12,7 @@ from twin.design.figures import FIGURES, figures_of, scatter_at
 from twin.design.parameters import followed, parameters_of
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor
-from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, pixel_of_depth
-from uwlts.report.inventory import nominal_setup
+from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, nominal_setup, pixel_of_depth
 
 TILTED = {"camera": {"window": {"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}}}
 

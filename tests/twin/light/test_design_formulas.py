@@ -12,8 +12,14 @@ import pytest
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.recording.truth import true_stripe
-from uwlts.optics.design import depth_mm, depth_per_pixel_mm, line_length_mm, pixel_of_depth, position_along_mm
-from uwlts.report.inventory import nominal_setup
+from uwlts.optics.design import (
+    depth_mm,
+    depth_per_pixel_mm,
+    line_length_mm,
+    nominal_setup,
+    pixel_of_depth,
+    position_along_mm,
+)
 from uwlts.storage.truth import TruthStatus
 
 PIXEL = 1e-3

@@ -24,6 +24,7 @@ from uwlts.optics.design import (
     line_length_mm,
     line_needed_mm,
     measuring_volume,
+    nominal_setup,
     pixel_of_depth,
     position_along_mm,
     scheimpflug_angle_rad,
@@ -31,7 +32,7 @@ from uwlts.optics.design import (
     thesis_factor,
     window_thickness_mm,
 )
-from uwlts.report.inventory import design_table, nominal_setup, table_lines
+from uwlts.report.inventory import design_table, table_lines
 
 ANGLE = math.radians(35)
 AIR = Triangulation(baseline_mm=265, triangulation_angle_rad=ANGLE, focal_length_mm=12.5, pixel_size_mm=0.0053)

@@ -18,9 +18,9 @@ from uwlts.report.page_toolkit import svg_of
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.storage.cloud import PointCloud, write_cloud
 from uwlts.thesis.campaign import CampaignFolder, campaign_folders
-from uwlts.thesis.evaluation import FORMAT, VERSION, read_results
 from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
 from uwlts.thesis.report import differences, far_off, markdown, write_comparison
+from uwlts.thesis.results import CampaignResults, Measurement, WindowProfile
 from uwlts.thesis.tables import TableRow, all_rows, headline_rows, load_published
 
 PUBLISHED = load_published()
@@ -124,16 +124,7 @@ def test_a_file_without_positions_holds_no_tables(tmp_path):
 
 
 def measured(thing, placement, medium, method, processing="thesis", **figures):
-    return {
-        "thing": thing,
-        "placement": placement,
-        "medium": medium,
-        "method": method,
-        "processing": processing,
-        "figures_mm": figures,
-        "points": 100,
-        "failure": None,
-    }
+    return Measurement(thing, placement, medium, method, processing, figures, points=100)
 
 
 def campaign(factor=1.0):
@@ -147,9 +138,7 @@ def campaign(factor=1.0):
             measurements.append(measured("plane", PLANE_PLACES[number], medium, method, RE=re_, STD=std))
     line = {"centre_px": [1.0, 2.0, 3.0], "y_mm": [0.0, 1.0, 2.0], "z_mm": [-5.0, 0.0, 5.0], "line": 7}
     curve = {"lines": {"middle": line}, "residual_mm": 0.06 * factor}
-    return {
-        "format": FORMAT,
-        "version": VERSION,
+    content = {
         "measurements": measurements,
         "window": {
             "near 1": {"images": "near 1", "distance_mm": 46.3 * factor, "mean_sse_mm": 0.09 * factor},
@@ -170,11 +159,12 @@ def campaign(factor=1.0):
                 "std_mm": 0.05,
                 "interval_mm": [-0.2, 0.01],
                 "contains_truth": True,
-                "trials": 100,
             }
         ],
+        "trials": 100,
         "line_profiles": {"width": {"length_mm": 185.27 * factor, "points_mm": [[-90.0, 3.0], [90.0, 4.0]]}},
     }
+    return CampaignResults.model_validate(content)
 
 
 def rows_of(*results):
@@ -229,12 +219,11 @@ def test_headline_rows_are_the_means_of_four_tables():
 
 def without(results, **what):
     """Results in which measurements that match have failed."""
-    return results | {
-        "measurements": [
-            m | {"figures_mm": {}, "failure": "lost"} if what.items() <= m.items() else m
-            for m in results["measurements"]
-        ]
-    }
+    measurements = [
+        replace(m, figures_mm={}, failure="lost") if what.items() <= vars(m).items() else m
+        for m in results.measurements
+    ]
+    return results.model_copy(update={"measurements": measurements})
 
 
 def test_a_position_that_was_not_measured():
@@ -258,7 +247,7 @@ def test_a_position_that_was_not_measured():
 
 
 def test_results_with_nothing_in_them():
-    empty = campaign() | {"measurements": [], "window": {}, "budget": {}, "line_profiles": {}}
+    empty = campaign().model_copy(update={"measurements": [], "window": {}, "budget": {}, "line_profiles": {}})
     rows = all_rows([empty], PUBLISHED)
     assert {row.table for row in rows if row.ours} == {"Table 4", "Figure 58"}
     assert rows_of(empty)["Table 9", "PE", "u"].as_dict()["ours_mean"] is None
@@ -281,13 +270,15 @@ def test_a_smaller_set_of_published_tables(tmp_path):
 
 def test_free_forms_and_experiments():
     results = campaign()
-    results["measurements"] += [
-        measured("pipe", "standoff", "water", "proposed", "ours", **{"STD": 0.05, "diameter error": -0.2}),
-        measured("head", "standoff", "air", "polynomials", "thesis", STD=0.11),
-        measured("spheres", "near", "water", "proposed", "thesis, mean of 5x5", PE=0.3, STD=0.05),
-        measured("spheres", "near", "air", "window forgotten", SSE=0.5),
-        measured("spheres", "near", "water", "single viewpoint", "ours", SSE=-0.4),
-    ]
+    results.measurements.extend(
+        [
+            measured("pipe", "standoff", "water", "proposed", "ours", **{"STD": 0.05, "diameter error": -0.2}),
+            measured("head", "standoff", "air", "polynomials", "thesis", STD=0.11),
+            measured("spheres", "near", "water", "proposed", "thesis, mean of 5x5", PE=0.3, STD=0.05),
+            measured("spheres", "near", "air", "window forgotten", SSE=0.5),
+            measured("spheres", "near", "water", "single viewpoint", "ours", SSE=-0.4),
+        ]
+    )
     rows = rows_of(results)
     assert rows["Figure 66", "pipe, water, proposed, ours image processing", "diameter error"].ours == (0.2,)
     assert rows["Figure 66", "head, air, polynomials, thesis image processing", "STD"].ours == (0.11,)
@@ -392,7 +383,7 @@ def test_existing_files_are_refused_and_kept(folder):
 
 
 def test_numbers_that_are_not_finite_are_not_written(folder):
-    broken = campaign() | {"two_refractions_distance_mm": float("nan")}
+    broken = campaign().model_copy(update={"two_refractions_distance_mm": float("nan")})
     with pytest.raises(ValueError, match="JSON"):
         write_comparison(folder, [broken], PUBLISHED)
     assert not any((folder / name).exists() for name in FILES)
@@ -421,8 +412,8 @@ def test_the_page_holds_everything_it_shows(folder):
 
 def test_names_are_escaped(folder):
     strange = campaign()
-    strange["measurements"].append(
-        measured("spheres", "near", "water", "proposed", "thesis") | {"failure": "<script>a & b</script>"}
+    strange.measurements.append(
+        replace(measured("spheres", "near", "water", "proposed", "thesis"), failure="<script>a & b</script>")
     )
     write_comparison(folder, [strange], replace(PUBLISHED, title="A <b> & C"))
     text = (folder / "report.html").read_text()
@@ -437,8 +428,8 @@ def test_figures_are_well_formed_whatever_was_measured():
         TableRow("Figure 66", "nothing published, air", "STD", None, (0.1,)),
     ]
     far = [TableRow("Table 6", "spheres, mean, water", "PE", 0.5, (250.0,))]
-    lost = {"distance_mm": 1.0, "points_mm": []}
-    half = {"window_profiles": [{"distance_mm": 47.3, "points_mm": [[0.0, 1.0], [1.0, 2.0]]}, lost]}
+    profiles = [WindowProfile(47.3, [(0.0, 1.0), (1.0, 2.0)]), WindowProfile(1.0, [])]
+    half = campaign().model_copy(update={"window_profiles": profiles})
     drawn = [
         comparison_figure(rows),
         comparison_figure([]),
@@ -471,13 +462,14 @@ def test_foreign_results_are_refused(tmp_path, content):
     path = tmp_path / "results.json"
     path.write_text(content)
     with pytest.raises(CaptureError, match="remove it"):
-        read_results(path)
+        CampaignResults.read(path)
 
 
 def test_results_are_read_again(tmp_path):
     path = tmp_path / "results.json"
-    path.write_text(json.dumps(campaign()))
-    assert read_results(path) == campaign()
+    campaign().keep(path)
+    assert CampaignResults.read(path) == campaign()
+    assert list(json.loads(path.read_text()))[:3] == ["format", "version", "measurements"]
 
 
 def test_a_campaigns_recordings_are_told_by_their_names(tmp_path):

@@ -8,7 +8,8 @@ from tests.uwlts.drawn_stripes import SENSOR, SPACING_MM, STAGE_MM, sphere_profi
 from uwlts.model.errors import CaptureError
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.thesis.campaign import CampaignFolder
-from uwlts.thesis.sphere_spacing import SphereScan, WindowChoice, mean_spacing_error, spacing_error, window_choices
+from uwlts.thesis.results import WindowChoice
+from uwlts.thesis.sphere_spacing import SphereScan, mean_spacing_error, spacing_error, window_choices
 
 EXACT = nominal_calibration(SENSOR)
 DISTANCE_MM = SENSOR.camera.window.distance_mm

@@ -1,0 +1,202 @@
+"""Results of campaigns as kept in their folders: measurements, window study, budget, and the joint comparison."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
+
+from uwlts.model.errors import CaptureError
+from uwlts.storage.files import json_text, written_aside
+
+Points = list[tuple[float, float]]
+"""Y and Z of points on a profile, mm."""
+
+Method = Literal["one_refraction", "two_refractions", "joint"]
+"""Calibrations that the joint comparison sets side by side."""
+
+
+class _Kept(BaseModel):
+    """A file of a campaign's folder."""
+
+    model_config = ConfigDict(frozen=True)
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The file's content; CaptureError where it cannot be read, is damaged or of another version."""
+        try:
+            return cls.model_validate_json(path.read_bytes())
+        except OSError as error:
+            raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+        except ValidationError as error:
+            problem = error.errors()[0]
+            reason = f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}".removeprefix(": ")
+            raise CaptureError(
+                f"{path} holds no results that this program reads ({reason}); remove it to evaluate the campaign again"
+            ) from error
+
+    def keep(self, path: Path) -> Self:
+        """Write the file, whole or not at all; ValueError where a number is not finite."""
+        with written_aside(path, overwrite=True) as aside:
+            aside.write_text(json_text(self.model_dump()), encoding="utf-8")
+        return self
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Figures of one scan by one method and image processing, by name, in mm. ``failure`` says why there are none."""
+
+    thing: str
+    placement: str
+    medium: str
+    method: str
+    processing: str
+    figures_mm: dict[str, float]
+    points: int = 0
+    failure: str | None = None
+
+
+@dataclass(frozen=True)
+class WindowChoice:
+    """Window distance found from some step images, and the mean absolute sphere spacing error that it leads to.
+
+    ``images`` is the place and the image's number (from 1), the place alone, or "all". The numbers are None where the
+    images determine no distance within its bounds.
+    """
+
+    images: str
+    distance_mm: float | None
+    mean_sse_mm: float | None
+
+
+@dataclass(frozen=True)
+class WindowProfile:
+    """One step image seen through a window at a distance (Figure 45)."""
+
+    distance_mm: float
+    points_mm: Points
+
+
+@dataclass(frozen=True)
+class LineProfile:
+    """The stripe on the pipe and its length along Y (Figure 67)."""
+
+    length_mm: float
+    points_mm: Points
+
+
+@dataclass(frozen=True)
+class PolynomialLine:
+    """Stripe position, Y and Z along one profile line."""
+
+    line: int
+    centre_px: list[float]
+    y_mm: list[float]
+    z_mm: list[float]
+
+
+@dataclass(frozen=True)
+class PolynomialCurves:
+    """Z(v) and Y(Z) of some profile lines by name (Figures 58 and 59), and the residual of Z."""
+
+    lines: dict[str, PolynomialLine]
+    residual_mm: float
+
+
+@dataclass(frozen=True)
+class SpacingInterval:
+    """Error of the sphere spacing in a scan, its standard uncertainty and 95 % interval by the Monte-Carlo trials."""
+
+    placement: str
+    observed_mm: float
+    std_mm: float
+    interval_mm: tuple[float, float]
+    contains_truth: bool
+
+
+class CampaignResults(_Kept):
+    """Results of one campaign: the file results.json."""
+
+    format: Literal["uwlts-thesis-results"] = "uwlts-thesis-results"
+    version: Literal[1] = 1
+    measurements: list[Measurement]
+    window: dict[str, WindowChoice]
+    window_profiles: list[WindowProfile]
+    two_refractions_distance_mm: float
+    polynomials: dict[str, PolynomialCurves]
+    budget: dict[str, float]
+    line_profiles: dict[str, LineProfile]
+    monte_carlo: list[SpacingInterval]
+    trials: int
+
+
+class SphereErrors(BaseModel):
+    """Errors of a scan of spheres by calibration and figure, and the joint calibration's standard uncertainties, mm."""
+
+    model_config = ConfigDict(frozen=True)
+
+    placement: str
+    medium: str
+    joint: dict[str, float]
+    std: dict[str, float]
+    one_refraction: dict[str, float]
+    two_refractions: dict[str, float] | None = None
+
+    def by_method(self) -> dict[Method, dict[str, float]]:
+        """Errors by the calibrations that there are of the scan's medium."""
+        found: dict[Method, dict[str, float] | None] = {
+            "one_refraction": self.one_refraction,
+            "two_refractions": self.two_refractions,
+            "joint": self.joint,
+        }
+        return {method: errors for method, errors in found.items() if errors is not None}
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {name: value for name, value in plain(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class PlaneScatter:
+    """Standard deviation of a plane about its fit, and the same over the speckle limit at its distance."""
+
+    placement: str
+    medium: str
+    std_mm: float
+    over_limit: float
+
+
+class JointResults(_Kept):
+    """Joint and sequential calibrations of one campaign compared: the file joint.json."""
+
+    format: Literal["uwlts-joint-comparison"] = "uwlts-joint-comparison"
+    version: Literal[1] = 1
+    campaign: str
+    solve_s: float
+    spheres: list[SphereErrors]
+    planes: list[PlaneScatter]
+
+
+class MediumSummary(BaseModel):
+    """Errors of all scans in a medium by calibration, and the share of the 95 % intervals that hold the truth."""
+
+    model_config = ConfigDict(frozen=True)
+
+    spacing_error_mm: dict[Method, list[float]]
+    diameter_error_mm: dict[Method, list[float]]
+    plane_std_over_speckle_limit: list[float]
+    coverage_95: float | None
+
+
+class JointSummary(MediumSummary):
+    """Summary of the comparison on all campaigns; what stands outside the media is in water."""
+
+    solve_s: list[float]
+    campaigns: int
+    water: MediumSummary
+    air: MediumSummary
+
+    def media(self) -> dict[str, MediumSummary]:
+        """The summaries by medium, those without scans left out."""
+        both = {"water": self.water, "air": self.air}
+        return {medium: part for medium, part in both.items() if any(part.spacing_error_mm.values())}
