@@ -95,43 +95,6 @@ class Triangulation:
         return u * self.pixel_size_mm / self.focal_length_mm, v * self.pixel_size_mm / self.focal_length_mm
 
 
-def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]:
-    """The sensor's triangulation behind its window, and Z along the laser's axis per depth along the camera's.
-
-    A laser placed by its axis, or rolled, counts as the baseline and angle at which its sheet meets the plane of the
-    image's middle line across the stripe and the pupil. Lens distortion and tilts are left out.
-
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis before the window, the stripe runs along the other side of the image,
-        or no window keeps the medium out.
-    """
-    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
-    pose, index = laser_pose(sensor), medium.refractive_index(wavelength)
-    standoff = camera_from_object(sensor)[2, 3]
-    if not camera.window.mounted and index != 1:
-        raise DesignError(f"the camera's window is not mounted, but the medium's index is {index:.4f}: mount it")
-    side = 1 if camera.stripe_along == "width" else 0
-    if abs(pose.normal[side]) < 1e-6:
-        raise DesignError(f"the stripe runs across the image's {camera.stripe_along}, not along it: turn the camera")
-    trace = np.array([0.0, 0.0, 1.0])
-    trace[side] = -pose.normal[2] / pose.normal[side]
-    setup = Triangulation(
-        baseline_mm=standoff * abs(trace[side]),
-        triangulation_angle_rad=math.atan(abs(trace[side])),
-        focal_length_mm=camera.focal_length_mm,
-        pixel_size_mm=1e-3 * camera.pixel_size_um,
-        window=FlatWindow(
-            distance_mm=camera.window.distance_mm,
-            thickness_mm=camera.window.thickness_mm,
-            glass_index=camera.window.index(wavelength) if camera.window.mounted else 1.0,
-            medium_index=index,
-        ),
-    )
-    return setup, float(abs(trace @ pose.axis))
-
-
 def depth_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray = 0.0) -> np.ndarray:
     """Depth Z of the sheet at pixels, broadcast: thesis Eq. 2.8, in air Z = B f / (f tan theta_t - s u).
 
@@ -336,3 +299,40 @@ def _require_positive(**values: float) -> None:
 def _require_acute(angle_rad: float) -> None:
     if not 0 < angle_rad < math.pi / 2:
         raise RangeError(f"the triangulation angle is {angle_rad:g} rad; expected one between 0 and pi / 2")
+
+
+def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]:
+    """The sensor's triangulation behind its window, and Z along the laser's axis per depth along the camera's.
+
+    A laser placed by its axis, or rolled, counts as the baseline and angle at which its sheet meets the plane of the
+    image's middle line across the stripe and the pupil. Lens distortion and tilts are left out.
+
+    Raises
+    ------
+    DesignError
+        The sheet does not cross the camera's axis before the window, the stripe runs along the other side of the image,
+        or no window keeps the medium out.
+    """
+    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
+    pose, index = laser_pose(sensor), medium.refractive_index(wavelength)
+    standoff = camera_from_object(sensor)[2, 3]
+    if not camera.window.mounted and index != 1:
+        raise DesignError(f"the camera's window is not mounted, but the medium's index is {index:.4f}: mount it")
+    side = 1 if camera.stripe_along == "width" else 0
+    if abs(pose.normal[side]) < 1e-6:
+        raise DesignError(f"the stripe runs across the image's {camera.stripe_along}, not along it: turn the camera")
+    trace = np.array([0.0, 0.0, 1.0])
+    trace[side] = -pose.normal[2] / pose.normal[side]
+    setup = Triangulation(
+        baseline_mm=standoff * abs(trace[side]),
+        triangulation_angle_rad=math.atan(abs(trace[side])),
+        focal_length_mm=camera.focal_length_mm,
+        pixel_size_mm=1e-3 * camera.pixel_size_um,
+        window=FlatWindow(
+            distance_mm=camera.window.distance_mm,
+            thickness_mm=camera.window.thickness_mm,
+            glass_index=camera.window.index(wavelength) if camera.window.mounted else 1.0,
+            medium_index=index,
+        ),
+    )
+    return setup, float(abs(trace @ pose.axis))

@@ -183,9 +183,9 @@ def _figures(evaluation: Evaluation) -> dict[str, float]:
     """
     figures = {figure.key.name: figure.value_mm for figure in evaluation.figures}
     deviation_mm = evaluation.cloud.deviation_mm
-    for name in {"PE", "RE"} & figures.keys():
-        figures[f"{name} of all points"] = figures[name]
-        if deviation_mm is not None:
+    for name in ("PE", "RE"):
+        if name in figures and deviation_mm is not None:
+            figures[f"{name} of all points"] = figures[name]
             figures[name] = _range_within(deviation_mm)
     if (fitted := evaluation.truth_after_best_fit) is not None:
         spread = fitted.std_mm
