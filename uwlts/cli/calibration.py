@@ -35,7 +35,7 @@ def calibrate(
     """Calibrate camera, window and sheet from images of a target in air or in water, and of a step standard in water.
 
     From a target in air and steps it goes by turns: camera and sheet first, then the window's distance. With a target
-    in water, with scans, or with --joint, all is estimated together (docs/joint-calibration.md).
+    in water, with scans, or with --joint, all is estimated together (docs/explanation/joint-calibration.md).
 
     Example: uwlts calibrate --air target.h5 --step step-near.h5 step-far.h5 --out calibration.json
 
@@ -60,8 +60,8 @@ def calibrate(
     joint
         Estimate all together; what is known before and how well is the sensor's description's.
     live
-        Plan (TOML, docs/calibrate-live.md) of a guided calibration with camera and stage, in place of captures: leads
-        through the images, refuses bad ones with the reason, and records the good ones beside the calibration.
+        Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, in place of captures:
+        leads through the images, refuses bad ones with the reason, and records the good ones beside the calibration.
     out
         Calibration file to write.
     refractions

@@ -34,7 +34,7 @@ def scan(
     Parameters
     ----------
     plan
-        TOML file with sensor, medium, positions, lights and exposures (docs/scan.md).
+        TOML file with sensor, medium, positions, lights and exposures (docs/how-to/scan.md).
     out
         Capture to write.
     camera

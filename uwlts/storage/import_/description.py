@@ -106,7 +106,8 @@ def read_description(path: Path) -> ImportDescription:
     """Description in a TOML file; DescriptionError where it is missing, no TOML, or holds an unknown or wrong key."""
     if not path.is_file():
         raise DescriptionError(
-            f"no description at {path}: write one with sensor, medium, and which image is what (docs/import.md)"
+            f"no description at {path}: write one with sensor, medium, and which image is what "
+            "(docs/how-to/import-images.md)"
         )
     return validated(ImportDescription, read_table(path), path)
 
