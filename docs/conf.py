@@ -1,9 +1,11 @@
 """Settings of the documentation: Sphinx with MyST notebooks, which are executed when the site is built."""
 
-import os
 import shutil
 from importlib.metadata import version as version_of
 from pathlib import Path
+
+import twin
+import uwlts
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -11,14 +13,7 @@ project = "uwlts"
 copyright = "the uwlts authors"
 release = version = version_of("uwlts")
 
-extensions = [
-    "myst_nb",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
-    "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
-    "cyclopts.ext.sphinx",
-]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "cyclopts.ext.sphinx"]
 source_suffix = {".md": "myst-nb"}
 exclude_patterns = ["_build", "studies", "pictures"]
 html_theme = "pydata_sphinx_theme"
@@ -36,8 +31,6 @@ html_copy_source = False
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 4
-# Links to source files and scenes leave the site; they are checked by the tests against the files themselves.
-suppress_warnings = ["myst.xref_missing"] if os.environ.get("UWLTS_DOCS_DRAFT") else []
 
 # A tutorial is executed again when its text changed; a page that fails or takes longer than 2 minutes stops the build.
 nb_execution_mode = "cache"
@@ -49,7 +42,6 @@ nb_merge_streams = True
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
-autosummary_generate = True
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 
@@ -59,6 +51,13 @@ def _copy_pictures(app) -> None:
     shutil.copytree(ROOT / "docs" / "pictures", Path(app.outdir) / "pictures", dirs_exist_ok=True)
 
 
+def _import_lazy_names(app) -> None:
+    """Import every name of the public interfaces: autodoc lists a module's members by `dir`."""
+    for package in (uwlts, twin):
+        vars(package).update({name: getattr(package, name) for name in package.__all__})
+
+
 def setup(app) -> None:
     """Connect the steps of this project's own."""
     app.connect("builder-inited", _copy_pictures)
+    app.connect("builder-inited", _import_lazy_names)
