@@ -53,7 +53,7 @@ $(INSTALLED): pyproject.toml
 	@touch $@
 
 clean:
-	@rm -rf $(VENV) .llvm .aravis build dist docs/_build docs/reference/generated *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .llvm .aravis build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.

@@ -4,9 +4,6 @@ import shutil
 from importlib.metadata import version as version_of
 from pathlib import Path
 
-import twin
-import uwlts
-
 ROOT = Path(__file__).resolve().parents[1]
 
 project = "uwlts"
@@ -39,11 +36,16 @@ nb_execution_timeout = 120
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
+# A type is a word of the docstring, such as "name", which more than one attribute may have as its own name.
+suppress_warnings = ["ref.python"]
+
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 napoleon_use_rtype = False
+# Attributes as fields of their class: pydantic's fields are listed as members of their own.
+napoleon_use_ivar = True
 
 
 def _copy_pictures(app) -> None:
@@ -51,13 +53,6 @@ def _copy_pictures(app) -> None:
     shutil.copytree(ROOT / "docs" / "pictures", Path(app.outdir) / "pictures", dirs_exist_ok=True)
 
 
-def _import_lazy_names(app) -> None:
-    """Import every name of the public interfaces: autodoc lists a module's members by `dir`."""
-    for package in (uwlts, twin):
-        vars(package).update({name: getattr(package, name) for name in package.__all__})
-
-
 def setup(app) -> None:
     """Connect the steps of this project's own."""
     app.connect("builder-inited", _copy_pictures)
-    app.connect("builder-inited", _import_lazy_names)
