@@ -1,24 +1,27 @@
 """Digital twin of an underwater laser triangulation sensor: renders captures with Mitsuba 3.
 
 `render` renders a scene into arrays, `simulate` into capture and truth files, `sweep` searches the design of a sensor,
-and `demo` runs the whole chain of commands. Each is imported when it is first used, as Mitsuba must not be imported
-before its libLLVM is chosen.
+`demo` runs the whole chain of commands, and `reproduce` the evaluation of the thesis. Each is imported when it is first
+used, as Mitsuba must not be imported before its libLLVM is chosen.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from twin.design.sweep import sweep
+    from twin.design.sweep import SweepResult, sweep
     from twin.recording.demonstration import demo
     from twin.recording.recording import Recording, render, simulate
+    from twin.recording.reproduce import reproduce
 
-__all__ = ["Recording", "demo", "render", "simulate", "sweep"]
+__all__ = ["Recording", "SweepResult", "demo", "render", "reproduce", "simulate", "sweep"]
 
 _MODULES = {
     "Recording": "twin.recording.recording",
+    "SweepResult": "twin.design.sweep",
     "demo": "twin.recording.demonstration",
     "render": "twin.recording.recording",
+    "reproduce": "twin.recording.reproduce",
     "simulate": "twin.recording.recording",
     "sweep": "twin.design.sweep",
 }
@@ -27,4 +30,9 @@ _MODULES = {
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+    globals()[name] = value = getattr(import_module(_MODULES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -7,13 +7,12 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
+import twin
 import uwlts
 from twin.options import CPU, use_variant
-from twin.recording.demonstration import FOLDER as DEMO_FOLDER
-from twin.recording.demonstration import demo as run_demo
+from twin.recording.demonstration import FOLDER
 from twin.recording.recording import choose_options, choose_scene, choose_sensors
-from twin.recording.recording import simulate as render_to_file
-from twin.scene.campaign import campaign_names, load_campaign
+from twin.scene.campaign import campaign_names
 from twin.scene.description import load_scene, scene_names
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import names
@@ -84,7 +83,7 @@ def simulate(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    render_to_file(
+    twin.simulate(
         scene,
         sensor=sensor,
         out=out,
@@ -239,37 +238,23 @@ def reproduce(
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    from twin.recording.reproduce import record_campaigns
-
-    for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
-        if value < 1:
-            raise DescriptionError(f"{name} is {value}; it must be at least 1")
-    if first < 0:
-        raise DescriptionError(f"first is {first}; a seed must not be negative")
-    if trials != 0 and trials < 20:
-        raise DescriptionError(f"trials is {trials}: take 20 or more, or 0 for no Monte-Carlo propagation")
-    campaign = campaign or ("joint" if joint else "thesis")
-    description = load_campaign(campaign)
-    folder = out or Path("runs") / Path(campaign).stem
-    with progress_bar(f"rendering {description.title}") as progress:
-        record_campaigns(
-            description,
-            folder,
-            seeds=range(first, first + campaigns),
+    try:
+        twin.reproduce(
+            campaign,
+            joint=joint,
+            out=out,
+            campaigns=campaigns,
+            first=first,
             every=every,
             spp=spp,
-            variant=variant,
+            trials=trials,
             workers=workers,
             overwrite=overwrite,
-            progress=progress,
+            variant=variant,
+            show_progress=True,
         )
-    # The sensor's software is a program of its own, which knows nothing of the twin.
-    command = [sys.executable, "-m", "uwlts.cli", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
-    command += ["--joint"] if joint else []
-    command += ["--again"] if overwrite else []
-    command += ["--workers", str(workers)] if workers else []
-    if code := subprocess.run(command, check=False).returncode:
-        sys.exit(code)
+    except subprocess.CalledProcessError as error:
+        sys.exit(error.returncode)  # the command has printed why
 
 
 @app.command
@@ -310,14 +295,12 @@ def sweep(
     variant
         Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    from twin.design.description import load_study
-    from twin.design.sweep import sweep as run_sweep
-
-    described = load_study(study, designs=designs, verify=verify)
-    with progress_bar(described.title) as progress:
-        result = run_sweep(
-            described,
-            out=out or Path("runs") / Path(study).stem,
+    with progress_bar(f"sweep of {Path(study).stem}") as progress:
+        result = twin.sweep(
+            study,
+            out=out,
+            designs=designs,
+            verify=verify,
             workers=workers,
             scheduler=scheduler,
             overwrite=overwrite,
@@ -329,7 +312,7 @@ def sweep(
 
 
 @app.command
-def demo(*, out: Path = DEMO_FOLDER) -> None:
+def demo(*, out: Path = FOLDER) -> None:
     """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
 
     Runs exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html.
@@ -342,7 +325,7 @@ def demo(*, out: Path = DEMO_FOLDER) -> None:
         Folder for all results.
     """
     try:
-        run_demo(out)
+        twin.demo(out)
     except subprocess.CalledProcessError as error:
         sys.exit(error.returncode)  # the command has printed why
 

@@ -7,48 +7,155 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from uwlts.measurement.evaluation import Evaluation, evaluate
-    from uwlts.measurement.reconstruction import reconstruct
+    from uwlts.calibration.calibrate import calibrate
+    from uwlts.calibration.joint.refresh import Refreshed, refresh
+    from uwlts.calibration.model_comparison.comparison import Comparison, compare_models
+    from uwlts.calibration.polynomial import PolynomialResult, calibrate_polynomials
+    from uwlts.doctor import Finding, examine
+    from uwlts.hardware.guided.recording import GuidedRecording, record_guided
+    from uwlts.hardware.live_view import watch
+    from uwlts.hardware.scanning import scan
+    from uwlts.measurement.evaluation import Evaluation, evaluate, write_evaluation
+    from uwlts.measurement.reconstruction import ScanCloud, reconstruct
     from uwlts.measurement.verification import Verification, verify
+    from uwlts.model.calibration import Calibration
+    from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
+    from uwlts.model.polynomial_calibration import PolynomialCalibration
     from uwlts.model.sensor import Sensor
+    from uwlts.optics.nominal import nominal
+    from uwlts.report import plot
+    from uwlts.report.campaign_page import Report, write_report
+    from uwlts.report.certificate import check_certificate
+    from uwlts.report.certificate_page import write_certificate
+    from uwlts.report.inventory import describe, design
+    from uwlts.report.model_comparison import write_models
+    from uwlts.storage.calibration_file import load_calibration, write_calibration
     from uwlts.storage.capture import Capture, Frame, open_capture
-    from uwlts.storage.cloud import PointCloud, read_cloud
+    from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+    from uwlts.storage.export_ import export
+    from uwlts.storage.import_ import Imported, import_images
+    from uwlts.storage.truth import Truth, read_truth
+    from uwlts.stripe import StripeOptions
+    from uwlts.thesis.report import ThesisReport, evaluate_thesis
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Calibration",
     "Capture",
+    "Comparison",
+    "Error",
     "Evaluation",
+    "Finding",
     "Frame",
+    "GuidedRecording",
+    "Imported",
     "PointCloud",
+    "PolynomialCalibration",
+    "PolynomialResult",
+    "Refreshed",
+    "Report",
+    "ScanCloud",
     "Sensor",
+    "StripeOptions",
+    "ThesisReport",
+    "Truth",
     "Verification",
+    "calibrate",
+    "calibrate_polynomials",
+    "check_certificate",
+    "compare_models",
+    "describe",
+    "design",
     "evaluate",
+    "evaluate_thesis",
+    "examine",
+    "export",
+    "import_images",
+    "load_calibration",
     "load_sensor",
+    "nominal",
     "open_capture",
+    "plot",
     "read_cloud",
+    "read_truth",
     "reconstruct",
+    "record_guided",
+    "refresh",
+    "scan",
     "verify",
+    "watch",
+    "write_calibration",
+    "write_certificate",
+    "write_cloud",
+    "write_evaluation",
+    "write_models",
+    "write_report",
 ]
 
 _MODULES = {
-    "Evaluation": "uwlts.measurement.evaluation",
-    "PointCloud": "uwlts.storage.cloud",
-    "Verification": "uwlts.measurement.verification",
-    "evaluate": "uwlts.measurement.evaluation",
-    "read_cloud": "uwlts.storage.cloud",
-    "reconstruct": "uwlts.measurement.reconstruction",
-    "verify": "uwlts.measurement.verification",
+    "Calibration": "uwlts.model.calibration",
     "Capture": "uwlts.storage.capture",
+    "Comparison": "uwlts.calibration.model_comparison.comparison",
+    "Error": "uwlts.model.errors",
+    "Evaluation": "uwlts.measurement.evaluation",
+    "Finding": "uwlts.doctor",
     "Frame": "uwlts.storage.capture",
+    "GuidedRecording": "uwlts.hardware.guided.recording",
+    "Imported": "uwlts.storage.import_",
+    "PointCloud": "uwlts.storage.cloud",
+    "PolynomialCalibration": "uwlts.model.polynomial_calibration",
+    "PolynomialResult": "uwlts.calibration.polynomial",
+    "Refreshed": "uwlts.calibration.joint.refresh",
+    "Report": "uwlts.report.campaign_page",
+    "ScanCloud": "uwlts.measurement.reconstruction",
     "Sensor": "uwlts.model.sensor",
+    "StripeOptions": "uwlts.stripe",
+    "ThesisReport": "uwlts.thesis.report",
+    "Truth": "uwlts.storage.truth",
+    "Verification": "uwlts.measurement.verification",
+    "calibrate": "uwlts.calibration.calibrate",
+    "calibrate_polynomials": "uwlts.calibration.polynomial",
+    "check_certificate": "uwlts.report.certificate",
+    "compare_models": "uwlts.calibration.model_comparison.comparison",
+    "describe": "uwlts.report.inventory",
+    "design": "uwlts.report.inventory",
+    "evaluate": "uwlts.measurement.evaluation",
+    "evaluate_thesis": "uwlts.thesis.report",
+    "examine": "uwlts.doctor",
+    "export": "uwlts.storage.export_",
+    "import_images": "uwlts.storage.import_",
+    "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",
+    "nominal": "uwlts.optics.nominal",
     "open_capture": "uwlts.storage.capture",
+    "plot": "uwlts.report.plot",
+    "read_cloud": "uwlts.storage.cloud",
+    "read_truth": "uwlts.storage.truth",
+    "reconstruct": "uwlts.measurement.reconstruction",
+    "record_guided": "uwlts.hardware.guided.recording",
+    "refresh": "uwlts.calibration.joint.refresh",
+    "scan": "uwlts.hardware.scanning",
+    "verify": "uwlts.measurement.verification",
+    "watch": "uwlts.hardware.live_view",
+    "write_calibration": "uwlts.storage.calibration_file",
+    "write_certificate": "uwlts.report.certificate_page",
+    "write_cloud": "uwlts.storage.cloud",
+    "write_evaluation": "uwlts.measurement.evaluation",
+    "write_models": "uwlts.report.model_comparison",
+    "write_report": "uwlts.report.campaign_page",
 }
 
 
 def __getattr__(name: str) -> object:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+    module = import_module(_MODULES[name])
+    value = module if name == "plot" else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -14,7 +14,7 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_ import import_folder
+from uwlts.storage.import_ import import_images
 from uwlts.targets import CharucoTarget, ChessboardTarget
 
 SENSOR = coarse_sensor(window_mounted=False)
@@ -104,7 +104,7 @@ def test_a_board_in_free_poses_calibrates_camera_and_sheet(tmp_path: Path, targe
         "target": target.model_dump(),
     }
     (folder / "import.toml").write_text(tomli_w.dumps(told))
-    imported = import_folder(folder, tmp_path / "board.h5")
+    imported = import_images(folder, tmp_path / "board.h5")
     assert (imported.laser, imported.lamp, imported.warnings) == (8, 8, ())
     with Capture(tmp_path / "board.h5") as capture:
         options = CalibrationOptions(poses="free", camera=CameraOptions(distortion=()))

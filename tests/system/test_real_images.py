@@ -13,7 +13,7 @@ from uwlts.calibration.camera import solve_camera
 from uwlts.calibration.evidence import air_evidence
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_ import import_folder
+from uwlts.storage.import_ import import_images
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
 from uwlts.targets.detection import detect_lattice
 
@@ -38,7 +38,7 @@ window = { mounted = false } }
 def imported(tmp_path: Path, folder: str, told: str, *, tables: str = "") -> Capture:
     description = tmp_path / "told.toml"
     description.write_text(told + SENSOR + tables)
-    import_folder(PHOTOGRAPHS / folder, tmp_path / "real.h5", description=description)
+    import_images(PHOTOGRAPHS / folder, tmp_path / "real.h5", description=description)
     return Capture(tmp_path / "real.h5")
 
 

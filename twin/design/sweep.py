@@ -18,7 +18,7 @@ import numpy as np
 import tomli_w
 
 from twin.design.choice import choose
-from twin.design.description import Study, Value
+from twin.design.description import Study, Value, load_study
 from twin.design.designs import Columns, Marked
 from twin.design.report.page import write_study_page
 from twin.design.screening import JOURNAL, PARTS, PLAN, Progress, read_parts, screen, write_csv
@@ -95,9 +95,11 @@ def _short(value: Value) -> str:
 
 
 def sweep(
-    study: Study,
+    study: str | Path | Study,
     *,
-    out: Path,
+    out: str | Path | None = None,
+    designs: int | None = None,
+    verify: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     overwrite: bool = False,
@@ -109,9 +111,13 @@ def sweep(
     Parameters
     ----------
     study
-        The study, see `twin.design.description.load_study`.
+        Name or path of the study's description, or the study itself.
     out
-        Folder for all results. A sweep that was stopped there continues.
+        Folder for all results; runs/STUDY unless given. A sweep that was stopped there continues.
+    designs
+        How many designs a random, Sobol or optimised study judges, in place of the study's own number.
+    verify
+        How many designs are rendered beside the base sensor, 0 for none, in place of the study's own number.
     workers, scheduler
         Processes of this machine, one per processor unless given, or the address of a Dask scheduler.
     overwrite
@@ -134,6 +140,13 @@ def sweep(
     """
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    if isinstance(study, Study):
+        if out is None or designs is not None or verify is not None:
+            raise DescriptionError("a study that is not loaded by name needs a folder, and states its numbers itself")
+    else:
+        out = out or Path("runs") / Path(study).stem
+        study = load_study(study, designs=designs, verify=verify)
+    out = Path(out)
     if overwrite:
         clear(out)
     paths = SweepPaths.below(out)

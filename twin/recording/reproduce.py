@@ -1,19 +1,106 @@
 """Records whole campaigns: every recording of each seed, several at a time, going on where an earlier run stopped."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 from twin.options import CPU, Options, use_variant
-from twin.scene.campaign import Campaign, Take, takes
+from twin.scene.campaign import Campaign, Take, load_campaign, takes
 from uwlts.model.errors import DescriptionError, Error, OutputError
+from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
 from uwlts.storage.files import written_aside
 from uwlts.storage.truth import truth_path
 
 PLAN = "plan.json"
+_LEAST_TRIALS = 20
+"""As `uwlts thesis` demands, to refuse fewer before anything is rendered."""
+
+
+def reproduce(
+    campaign: str | Path | None = None,
+    *,
+    joint: bool = False,
+    out: str | Path | None = None,
+    campaigns: int = 2,
+    first: int = 0,
+    every: int = 1,
+    spp: int = 16,
+    trials: int = 100,
+    workers: int | None = None,
+    overwrite: bool = False,
+    variant: str = CPU,
+    show_progress: bool = False,
+) -> Path:
+    """Render the thesis's whole evaluation and evaluate it with ``uwlts thesis``; returns the report.
+
+    Parameters
+    ----------
+    campaign
+        Name or path of the campaign's description; "thesis" unless given, or "joint" with ``joint``.
+    joint
+        Compare the joint calibration with the thesis's two ways on the same images.
+    out
+        Folder for campaigns and report; runs/CAMPAIGN unless given. What is complete in it is not rendered again.
+    campaigns, first
+        Number of campaigns, and the seed of the first one; the others follow.
+    every
+        Take only every n-th profile of the scans; calibrations keep all their images.
+    spp
+        Samples per lit pixel.
+    trials
+        Trials of the Monte-Carlo propagation of every campaign, at least 20, or 0 for none.
+    workers
+        Recordings rendered at a time; as many as there are processors unless given.
+    overwrite
+        Render and evaluate everything anew.
+    variant
+        Mitsuba variant, "llvm_ad_mono" (CPU) or "cuda_ad_mono" (NVIDIA GPU).
+    show_progress
+        Draw progress bars on the terminal.
+
+    Raises
+    ------
+    DescriptionError, DesignError, OutputError, SetupError
+        As `record_campaigns`, or an argument is out of its range.
+    subprocess.CalledProcessError
+        The evaluation failed; it has printed why.
+    """
+    for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
+        if value < 1:
+            raise DescriptionError(f"{name} is {value}; it must be at least 1")
+    if first < 0:
+        raise DescriptionError(f"first is {first}; a seed must not be negative")
+    if trials != 0 and trials < _LEAST_TRIALS:
+        raise DescriptionError(f"trials is {trials}: take {_LEAST_TRIALS} or more, or 0 for no Monte-Carlo propagation")
+    campaign = campaign or ("joint" if joint else "thesis")
+    folder = Path(out or Path("runs") / Path(campaign).stem)
+    described = load_campaign(campaign)
+    bar = progress_bar(f"rendering {described.title}") if show_progress else nullcontext(lambda done, total: None)
+    with bar as progress:
+        record_campaigns(
+            described,
+            folder,
+            seeds=range(first, first + campaigns),
+            every=every,
+            spp=spp,
+            variant=variant,
+            workers=workers,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    # The sensor's software is a program of its own, which shares no mathematics with the twin.
+    command = [sys.executable, "-m", "uwlts.cli", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
+    command += ["--joint"] if joint else []
+    command += ["--again"] if overwrite else []
+    command += ["--workers", str(workers)] if workers else []
+    subprocess.run(command, check=True)
+    return folder / "report.html"
 
 
 @dataclass(frozen=True)

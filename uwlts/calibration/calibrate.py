@@ -1,18 +1,20 @@
 """Calibration of a sensor from its captures, by the method that they need."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal, assert_never
 
+from uwlts.calibration.camera import Poses
 from uwlts.calibration.evidence import Progress
+from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.procedure import calibrate_jointly
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError
-from uwlts.storage.capture import Capture
+from uwlts.model.errors import CalibrationError, DescriptionError
+from uwlts.optics.window import require_index
+from uwlts.storage.capture import Capture, opened_captures
+from uwlts.stripe import StripeOptions
 
-CalibrationMethod = Literal["auto", "sequential", "joint"]
 _Captures = Sequence[Capture | str | Path]
 
 
@@ -22,8 +24,14 @@ def calibrate(
     water: _Captures = (),
     step: _Captures = (),
     scan: _Captures = (),
-    method: CalibrationMethod = "auto",
-    options: CalibrationOptions | None = None,
+    method: Literal["auto", "sequential", "joint"] = "auto",
+    new_water: bool = False,
+    unknown_sizes: bool = False,
+    refractions: Literal[1, 2] = 2,
+    poses: Poses = "stage-normal",
+    distortion: tuple[str, ...] = ("k1", "k2"),
+    index: float | None = None,
+    stripe: StripeOptions = StripeOptions(),
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate a sensor from captures, open ones or by their paths.
@@ -40,7 +48,25 @@ def calibrate(
         Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
     method : {"auto", "sequential", "joint"}
         sequential: camera and sheet from ``air``, then the window's distance from ``step``. joint: all parameters from
-        all captures at once, with their covariance. auto: joint where ``water`` or ``scan`` needs it, else sequential.
+        all captures at once, with their covariance. auto: joint if ``water`` or ``scan`` needs it, else sequential.
+    new_water : bool
+        The scans were taken in other water than the target, or on another day: its index is a parameter of its own.
+    unknown_sizes : bool
+        Estimate the diameters and spacings of what was scanned, even if the captures state their uncertainty.
+    refractions : {1, 2}
+        2: a window of known thickness; the images in air are taken without it. 1: a single interface; the images in air
+        are taken through the window, whose effect goes into the distortion. The joint method ignores it.
+    poses : {"stage-normal", "stage", "free"}
+        stage-normal: one target pose, moved by the stage along the target's normal. stage: the same in a free
+        direction, as always in the joint method. free: every image has a pose of its own.
+    distortion : tuple of str
+        The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0.
+    index : float, optional
+        Refractive index of the medium relative to air, in place of the one that follows from the captures.
+    stripe : StripeOptions, optional
+        How stripes are found.
+    progress : callable, optional
+        Called with the name of the stage, the number of images done, and the number in all.
 
     Returns
     -------
@@ -52,28 +78,45 @@ def calibrate(
     CalibrationError
         The captures do not determine the calibration or contradict it, or the method cannot use them.
     DescriptionError
-        A capture does not describe its target, its step standard or what it scans.
+        There is no capture of a target, or one does not describe its target, its step standard or what it scans.
     CaptureError
         A file is missing or damaged, or a scan shows no stripe.
+    RangeError
+        The refractive index is not that of a medium.
     """
+    if index is not None:
+        require_index(index)
+    if not (air or water):
+        raise DescriptionError("nothing to calibrate from: give --air or --water with captures of a target, or --live")
+    if (new_water or unknown_sizes) and not scan:
+        raise DescriptionError("--new-water and --unknown-sizes are about scans: give these with --scan")
+    options = CalibrationOptions(
+        refractions=refractions,
+        poses=poses,
+        camera=CameraOptions(distortion=distortion),
+        stripe=stripe,
+        medium_index=index,
+        same_water=not new_water,
+        sizes_known=not unknown_sizes,
+    )
     if method == "auto":
         method = "joint" if water or scan else "sequential"
-    with ExitStack() as stack:
-        in_air, on_steps, in_water, scans = (
-            [each if isinstance(each, Capture) else stack.enter_context(Capture(each)) for each in captures]
-            for captures in (air, step, water, scan)
-        )
+    with (
+        opened_captures(air) as in_air,
+        opened_captures(step) as steps,
+        opened_captures(water) as in_water,
+        opened_captures(scan) as scans,
+    ):
         match method:
             case "joint":
-                return calibrate_jointly(
-                    [*in_air, *in_water], on_steps, scans, options=options, progress=progress
-                ).calibration
+                targets = [*in_air, *in_water]
+                return calibrate_jointly(targets, steps, scans, options=options, progress=progress).calibration
             case "sequential":
                 if in_water or scans:
                     raise CalibrationError(
                         "the sequential calibration takes a target in air and steps only: calibrate jointly with "
                         "targets in water or scans"
                     )
-                return calibrate_sequentially(in_air, on_steps, options=options, progress=progress).calibration
+                return calibrate_sequentially(in_air, steps, options=options, progress=progress).calibration
             case _:
                 assert_never(method)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -18,7 +19,7 @@ from uwlts.calibration.polynomial_evidence import (
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.storage.capture import Capture, CaptureHeader
+from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
 from uwlts.stripe import StripeOptions
 
 MOST_SMOOTH = 8
@@ -141,7 +142,6 @@ def _scaled(x: np.ndarray, low: float, high: float) -> np.ndarray:
     return (2 * x - low - high) / (high - low)
 
 
-_STRIPE = StripeOptions()
 _LARGEST_REJECTED = 0.2  # outliers are few; more contradict the positions or the target
 # Share of the lines that may lack a centre in succession and still borrow their range from both sides.
 _LARGEST_GAP = 0.1
@@ -170,14 +170,19 @@ class PolynomialResult:
 
 
 def calibrate_polynomials(
-    captures: Sequence[Capture], *, degree: int = 6, stripe: StripeOptions = _STRIPE, progress: Progress | None = None
+    target: Sequence[Capture | str | Path],
+    *,
+    degree: int = 6,
+    stripe: StripeOptions = StripeOptions(),
+    progress: Progress | None = None,
 ) -> PolynomialResult:
-    """Calibrate a sensor by polynomials.
+    """Calibrate a sensor by polynomials, position to Z and Z to Y for each profile line.
 
     Parameters
     ----------
-    captures : a target in the medium of use, square to the laser's axis, that stands still in all captures while the
-        stage moves the sensor along Z. Images with the laser off show the target, those with the laser on, at the same
+    target : sequence of Capture or path
+        A target in the medium of use, square to the laser's axis, that stands still in all captures while the stage
+        moves the sensor along Z. Images with the laser off show the target, those with the laser on, at the same
         positions and in the same capture, the stripe on it.
     degree : of all polynomials
 
@@ -199,9 +204,10 @@ def calibrate_polynomials(
     """
     if degree < 1:
         raise RangeError(f"the polynomials' degree is {degree}; expected at least 1, as a rule 6")
-    header = common_header(captures)
-    evidence = air_evidence(captures, stripe=stripe, progress=progress)
-    sources = [{"file": capture.path.name, "name": capture.header.name} for capture in captures]
+    with opened_captures(target) as captures:
+        header = common_header(captures)
+        evidence = air_evidence(captures, stripe=stripe, progress=progress)
+        sources = [{"file": capture.path.name, "name": capture.header.name} for capture in captures]
     return fit_polynomials(evidence, header, degree=degree, sources=sources)
 
 

@@ -1,15 +1,16 @@
-"""Commands about sensors and files: what they hold, what they give, and other formats."""
+"""Commands about sensors and files: design formulas, nominal calibrations, contents, and other formats."""
 
 from pathlib import Path
 from typing import Literal
 
-from uwlts.cli.options import Flag, app, warn
+import uwlts
+from uwlts.cli.options import Flag, app, show, warn
 from uwlts.runtime.console import progress_bar
 
 
 @app.command
 def design(sensor: str, *, medium: str) -> None:
-    """Say what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
+    """Print what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
 
     Example: uwlts design thesis --medium water
 
@@ -20,11 +21,9 @@ def design(sensor: str, *, medium: str) -> None:
     medium
         One of the sensor's media.
     """
-    from uwlts.model.library import load_sensor
-    from uwlts.report.inventory import design_table, table_lines
+    from uwlts.report.inventory import table_lines
 
-    described = load_sensor(sensor)
-    print("\n".join(table_lines(design_table(described, described.medium(medium)))))
+    show(table_lines(uwlts.design(sensor, medium=medium)))
 
 
 @app.command
@@ -44,18 +43,13 @@ def nominal(sensor: str, *, medium: str, out: Path, overwrite: Flag = False) -> 
     overwrite
         Replace an existing file.
     """
-    from uwlts.model.library import load_sensor
-    from uwlts.optics.nominal import nominal_calibration
-    from uwlts.storage.calibration_file import write_calibration
-
-    described = load_sensor(sensor)
-    write_calibration(out, nominal_calibration(described, described.medium(medium)), overwrite=overwrite)
+    uwlts.write_calibration(out, uwlts.nominal(sensor, medium=medium), overwrite=overwrite)
     print(f"wrote {out}")
 
 
 @app.command
 def info(path: str) -> None:
-    """Say what a file holds: a capture, cloud, calibration, evaluation, or a sensor description (by name or path).
+    """Describe a file: a capture, cloud, calibration, evaluation, or a sensor description (by name or path).
 
     Example: uwlts info capture.h5
 
@@ -64,9 +58,7 @@ def info(path: str) -> None:
     path
         File, or name of a shipped sensor such as thesis.
     """
-    from uwlts.report.inventory import describe
-
-    print(describe(path))
+    print(uwlts.describe(path))
 
 
 @app.command(name="import")
@@ -86,12 +78,9 @@ def import_images(folder: Path, *, out: Path, description: Path | None = None, o
     overwrite
         Replace an existing file.
     """
-    from uwlts.storage.import_ import import_folder
-
     with progress_bar(f"importing {folder.name}") as progress:
-        imported = import_folder(folder, out, description=description, overwrite=overwrite, progress=progress)
-    for warning in imported.warnings:
-        warn(warning)
+        imported = uwlts.import_images(folder, out, description=description, overwrite=overwrite, progress=progress)
+    warn(*imported.warnings)
     print(f"wrote {out} with {imported.laser} laser and {imported.lamp} lamp images")
 
 
@@ -113,15 +102,6 @@ def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", ove
     overwrite
         Replace an existing cloud.
     """
-    from uwlts.storage.capture import Capture
-    from uwlts.storage.cloud import is_cloud, read_cloud
-    from uwlts.storage.export_ import export_capture, export_cloud
-
-    if is_cloud(file):
-        cloud = read_cloud(file)
-        export_cloud(cloud, out, overwrite=overwrite)
-        print(f"wrote {out} with {len(cloud)} points")
-        return
-    with Capture(file) as capture, progress_bar(f"exporting {file.name}") as progress:
-        export_capture(capture, out, image_format=images, progress=progress)
-        print(f"wrote {len(capture)} images and import.toml to {out}")
+    with progress_bar(f"exporting {file.name}") as progress:
+        written = uwlts.export(file, out, images=images, overwrite=overwrite, progress=progress)
+    print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
-from uwlts.cli.options import Flag, Method, app
-from uwlts.model.errors import OutputError
+import uwlts
+from uwlts.cli.options import Flag, Method, app, show, stripe_options
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable
 
@@ -31,7 +31,7 @@ def reconstruct(
     calibration
         Calibration of the sensor, or one by polynomials.
     out
-        Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and by a joint
+        Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a joint
         calibration its uncertainty.
     index
         Refractive index of the medium, in place of the one that follows from the capture.
@@ -42,19 +42,12 @@ def reconstruct(
     overwrite
         Replace an existing file.
     """
-    from uwlts.measurement.reconstruction import reconstruct as reconstructed
-    from uwlts.storage.calibration_file import read_any_calibration
-    from uwlts.storage.capture import Capture
-    from uwlts.storage.cloud import write_cloud
-    from uwlts.stripe import PeakRule, StripeOptions
-
     refuse_unsuitable(out, overwrite=overwrite)
-    options = StripeOptions(method=method or StripeOptions.method, peak=PeakRule(peak))
-    known = read_any_calibration(calibration)
-    with Capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
-        cloud = reconstructed(opened, known, options=options, index=index, progress=progress)
+    known = uwlts.load_calibration(calibration)
+    with uwlts.open_capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
+        cloud = uwlts.reconstruct(opened, known, stripe=stripe_options(method, peak), index=index, progress=progress)
         lit = int(opened.laser_on.sum())
-    write_cloud(out, cloud, overwrite=overwrite)
+    uwlts.write_cloud(out, cloud, overwrite=overwrite)
     print(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
     print(f"profile lines: {_counts(cloud.lines_by_status)}")
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):
@@ -87,7 +80,7 @@ def evaluate(
     out
         Evaluation to write (JSON).
     artefact
-        TOML file with the artefact's kind and calibrated values, in place of what the capture says.
+        TOML file with the artefact's kind and calibrated values, in place of those in the capture.
     truth
         Ground truth of the capture, if it was rendered.
     coloured
@@ -95,19 +88,16 @@ def evaluate(
     overwrite
         Replace existing files.
     """
-    from uwlts.measurement.evaluation import evaluate as evaluated
-    from uwlts.measurement.evaluation import write_evaluation
     from uwlts.report.inventory import evaluation_lines
-    from uwlts.storage.cloud import write_cloud
 
     for path in (out, coloured):
         if path:
             refuse_unsuitable(path, overwrite=overwrite)
-    evaluation = evaluated(cloud, artefact, truth)
-    write_evaluation(out, evaluation, overwrite=overwrite)
+    evaluation = uwlts.evaluate(cloud, artefact, truth)
+    uwlts.write_evaluation(out, evaluation, overwrite=overwrite)
     if coloured:
-        write_cloud(coloured, evaluation.cloud, overwrite=overwrite)
-    print("\n".join(evaluation_lines(evaluation.record())))
+        uwlts.write_cloud(coloured, evaluation.cloud, overwrite=overwrite)
+    show(evaluation_lines(evaluation.record()))
     print(f"wrote {out}")
 
 
@@ -140,22 +130,60 @@ def report(
     overwrite
         Replace an existing report, summary and pictures.
     """
-    from uwlts.report.campaign_page import write_report
-    from uwlts.report.gather import gather_campaign, load_reference
-    from uwlts.report.pictures import write_pictures
-    from uwlts.report.summary_file import write_summary
-    from uwlts.report.tables import print_table, summary_table
+    from uwlts.report.tables import print_table
 
-    campaign = gather_campaign(folder)
-    published = load_reference(reference) if reference else None
-    page = out or folder / "report.html"
-    write_summary(page.with_name("summary.json"), campaign, published, overwrite=overwrite)
-    write_report(page, campaign, published, overwrite=overwrite)
-    if pictures:
-        try:
-            pictures.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"cannot make the folder {pictures}: {error.strerror}") from error
-        write_pictures(pictures, campaign, overwrite=overwrite)
-    print_table(summary_table(campaign, published))
-    print(f"wrote {page} and {page.with_name('summary.json')}")
+    written = uwlts.write_report(folder, reference=reference, out=out, pictures=pictures, overwrite=overwrite)
+    print_table(written.rows())
+    print(f"wrote {written.page} and {written.summary}")
+
+
+@app.command
+def thesis(
+    folder: Path,
+    *,
+    published: str = "thesis-tables",
+    trials: int = 100,
+    workers: int | None = None,
+    joint: Flag = False,
+    again: Flag = False,
+    overwrite: Flag = False,
+) -> None:
+    """Evaluate campaigns as the thesis does, by all its methods, and set its tables beside the results.
+
+    The folder holds campaign-0, campaign-1, ..., each with the recordings of the whole evaluation; `twin reproduce`
+    renders such. Writes report.html, summary.json, tables.csv and summary.md into it.
+
+    Example: uwlts thesis runs/thesis
+
+    Parameters
+    ----------
+    folder
+        Folder of the campaigns.
+    published
+        Published tables: name or path of a TOML file.
+    trials
+        Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
+    workers
+        Scans measured at a time; as many as there are processors unless given.
+    joint
+        Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without Monte
+        Carlo; writes report.html and summary.json.
+    again
+        Evaluate campaigns anew that have results already.
+    overwrite
+        Replace an existing report.
+    """
+    with progress_bar(f"evaluating {folder.name}") as progress:
+        written = uwlts.evaluate_thesis(
+            folder,
+            published=published,
+            trials=trials,
+            workers=workers,
+            joint=joint,
+            again=again,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    print(written.headline.rstrip())
+    page, *others = written.files
+    print(f"wrote {page}, {', '.join(file.name for file in others)}")

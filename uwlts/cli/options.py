@@ -2,6 +2,7 @@
 
 import pkgutil
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -29,6 +30,32 @@ else:
     Method = Literal[tuple(sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)])))]
 
 
-def warn(text: str) -> None:
-    """Print a warning on standard error."""
-    print(f"warning: {text}", file=sys.stderr, flush=True)
+def stripe_options(
+    method: Method | None, peak: Literal["strongest", "first", "last"] = "strongest"
+) -> "uwlts.StripeOptions":
+    """How stripes are found, with the default method unless one is given."""
+    from uwlts.stripe import PeakRule
+
+    options = uwlts.StripeOptions
+    return options(method=method or options.method, peak=PeakRule(peak))
+
+
+def any_stage(progress: Callable[[int, int], None]) -> Callable[[str, int, int], None]:
+    """The progress of all stages of a calculation, shown by one bar."""
+    return lambda stage, done, total: progress(done, total)
+
+
+def say(line: str) -> None:
+    """Print a line at once, also into a pipe."""
+    print(line, flush=True)
+
+
+def show(lines: Iterable[str]) -> None:
+    """Print lines."""
+    print("\n".join(lines))
+
+
+def warn(*texts: str) -> None:
+    """Print warnings on standard error."""
+    for text in texts:
+        print(f"warning: {text}", file=sys.stderr, flush=True)

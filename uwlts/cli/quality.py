@@ -1,10 +1,11 @@
-"""Commands that tell what a calibration is worth."""
+"""Commands about the quality of a calibration: model comparison, certificate and verification."""
 
 import sys
 from pathlib import Path
 from typing import Literal
 
-from uwlts.cli.options import Files, Flag, Method, app, warn
+import uwlts
+from uwlts.cli.options import Files, Flag, Method, any_stage, app, show, stripe_options, warn
 from uwlts.model.errors import DescriptionError
 from uwlts.runtime.console import progress_bar
 
@@ -50,45 +51,26 @@ def models(
     overwrite
         Replace existing files.
     """
-    from contextlib import ExitStack
-
-    from uwlts.calibration.model_comparison.comparison import compare_models
-    from uwlts.calibration.sequential import CalibrationOptions
-    from uwlts.optics.window import require_index
-    from uwlts.report.model_comparison import content_of, lines_of, write_models
+    from uwlts.report.model_comparison import content_of, lines_of
     from uwlts.report.page_toolkit import refuse_unsuitable_page
-    from uwlts.storage.capture import Capture
-    from uwlts.stripe import StripeOptions
 
-    if index is not None:
-        require_index(index)
-    if workers is not None and workers < 1:
-        raise DescriptionError(f"workers is {workers}; it must be at least 1")
-    if not (air or water):
-        raise DescriptionError("nothing to compare models by: give --air or --water with captures of a target")
     if out is not None:
         refuse_unsuitable_page(out, example="models.html", overwrite=overwrite)
-    options = CalibrationOptions(
-        poses=poses, medium_index=index, stripe=StripeOptions(method=method) if method else StripeOptions()
-    )
-    with ExitStack() as stack:
-        targets = [stack.enter_context(Capture(path)) for path in (*air, *water)]
-        steps = [stack.enter_context(Capture(path)) for path in step]
-        progress = stack.enter_context(progress_bar("comparing models"))
-        comparison = compare_models(
-            targets,
-            steps,
-            options=options,
+    with progress_bar("comparing models") as progress:
+        comparison = uwlts.compare_models(
+            air=air,
+            water=water,
+            step=step,
+            poses=poses,
+            index=index,
+            stripe=stripe_options(method),
             workers=workers,
-            progress=progress,
-            searched=lambda stage, done, total: progress(done, total),
+            progress=any_stage(progress),
         )
-    content = content_of(comparison)
-    print("\n".join(lines_of(content)))
-    for warning in comparison.warnings:
-        warn(warning)
+    show(lines_of(content_of(comparison)))
+    warn(*comparison.warnings)
     if out is not None:
-        write_models(out, content, overwrite=overwrite)
+        uwlts.write_models(out, comparison, overwrite=overwrite)
         print(f"wrote {out} and {out.with_suffix('.json').name}")
 
 
@@ -101,10 +83,10 @@ def certificate(
     check: Path | None = None,
     overwrite: Flag = False,
 ) -> None:
-    """Write a calibration's certificate: what it was made from, where it holds, what lengths are worth, what is weak.
+    """Write a calibration's certificate: its evidence, where it holds, the uncertainty of lengths, and what is weak.
 
     A page to read and print, and beside it the same as sealed JSON. With --check it is verified instead: exit code 1
-    where the certificate was changed or belongs to another calibration.
+    if the certificate was changed or belongs to another calibration.
 
     Example: uwlts certificate calibration.json --out certificate.html
 
@@ -113,7 +95,7 @@ def certificate(
     Parameters
     ----------
     calibration
-        Calibration file; only a joint one tells uncertainties.
+        Calibration file; only a joint one has uncertainties.
     out
         Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
     before
@@ -123,27 +105,18 @@ def certificate(
     overwrite
         Replace existing files.
     """
-    from datetime import UTC, datetime
-
-    from uwlts.report.certificate import certificate_lines, certificate_of, check_certificate
-    from uwlts.report.certificate_page import refuse_unsuitable_certificate, write_certificate
-    from uwlts.storage.calibration_file import read_calibration
+    from uwlts.report.certificate import certificate_lines
 
     if check is not None:
         if out is not None or before is not None:
             raise DescriptionError("--check verifies and writes nothing: give it without --out and --before")
-        against = check_certificate(check, calibration)
+        against = uwlts.check_certificate(check, calibration)
         print("\n".join(against) or f"{check} is as it was issued, and is about {calibration}")
         if against:
             sys.exit(1)
         return
-    page = out or calibration.with_name(f"{calibration.stem}.certificate.html")
-    refuse_unsuitable_certificate(page, calibration, overwrite=overwrite)
-    known = read_calibration(calibration)
-    beside = None if before is None else (before.name, read_calibration(before))
-    content = certificate_of(known, calibration, issued=datetime.now(UTC).isoformat(timespec="seconds"))
-    write_certificate(page, content, known, before=beside, overwrite=overwrite)
-    print("\n".join(certificate_lines(content)))
+    page, content = uwlts.write_certificate(calibration, out=out, before=before, overwrite=overwrite)
+    show(certificate_lines(content))
     print(f"wrote {page} and {page.with_suffix('.json').name}")
 
 
@@ -152,7 +125,7 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
     """Measure a known object and answer pass or fail: exit code 0 or 1.
 
     Each calibrated size must agree with its certificate within both uncertainties (E_n at most 1, ISO/IEC 17043) and,
-    with a limit, keep it beyond doubt (ISO 14253-1).
+    with a limit, conform to it beyond doubt (ISO 14253-1).
 
     Example: uwlts verify step.h5 --calibration calibration.json --limit 0.05
 
@@ -165,11 +138,8 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
     limit
         Largest permissible error in mm.
     """
-    from uwlts.measurement.verification import verify as verified
-
-    verification = verified(capture, calibration, limit)
+    verification = uwlts.verify(capture, calibration, limit_mm=limit)
     print(verification.text)
+    print("pass" if verification.passed else "FAIL")
     if not verification.passed:
-        print("FAIL")
         sys.exit(1)
-    print("pass")

@@ -15,7 +15,7 @@ __all__ = ["Finding", "examine", "print_findings"]
 
 
 def examine(
-    folder: Path,
+    folder: Path = Path(),
     *,
     camera: str | None = None,
     stage: str | None = None,

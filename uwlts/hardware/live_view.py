@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import viser
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.errors import CaptureError
+from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import FoundStripes, extract_stripe
 
@@ -218,13 +220,48 @@ def _coloured(depth_mm: np.ndarray) -> np.ndarray:
     return cv2.applyColorMap(share[:, None], cv2.COLORMAP_TURBO).reshape(-1, 3)[:, ::-1].copy()
 
 
-def watch(path: Path, view: LiveView, calibration: AnyCalibration | None) -> int:
-    """Show a recording until it is finished; how many images it has. Errors as `images_of`."""
-    count = 0
-    for seen in images_of(path, calibration):
-        if seen is None:
-            time.sleep(_LOOK_S)
-        else:
-            view.show(seen)
-            count += 1
-    return count
+def watch(
+    capture: str | Path,
+    *,
+    calibration: AnyCalibration | str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    report: Callable[[str], None] = print,
+) -> None:
+    """Show a recording while it grows, in a browser, until Ctrl-C.
+
+    Parameters
+    ----------
+    capture : str or Path
+        Capture that is being recorded, or is to be.
+    calibration : Calibration, PolynomialCalibration or path, optional
+        Calibration of the sensor, for the cloud.
+    host : str
+        Address at which the page is served; the default can be reached from this machine only.
+    port : int
+        Port of the page; the next free one is taken if it is in use.
+    report : callable, optional
+        Called with lines of text, the first with the address of the page.
+
+    Raises
+    ------
+    CaptureError, CalibrationError
+        As `images_of`, or the calibration cannot be read.
+    """
+    path, count = Path(capture), 0
+    known = None if calibration is None else loaded_calibration(calibration)
+    view = LiveView(path.name, host=host, port=port)
+    try:
+        report(f"open {view.address}; Ctrl-C ends it")
+        for seen in images_of(path, known):
+            if seen is None:
+                time.sleep(_LOOK_S)
+            else:
+                view.show(seen)
+                count += 1
+        report(f"{path} is finished with {count} images; the page stays until Ctrl-C")
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        report("closed")
+    finally:
+        view.close()

@@ -24,7 +24,7 @@ class PageBeside:
     ``say`` is called with the line that states the page's address, from another thread.
     """
 
-    def __init__(self, capture: Path, *, calibration: Path | None, say: Callable[[str], None]):
+    def __init__(self, capture: Path, *, calibration: str | Path | None, say: Callable[[str], None]):
         command = [sys.executable, "-m", "uwlts.cli", "watch", str(capture)]
         self._command = [*command, "--calibration", str(calibration)] if calibration else command
         self._say = say

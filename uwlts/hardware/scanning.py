@@ -6,6 +6,7 @@ laser is on for its own images only; the stage's driver switches it off however 
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -15,10 +16,12 @@ import numpy as np
 
 import uwlts
 from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, settled_exposure
-from uwlts.hardware.scan_plan import Light, ScanPlan, check_plan
+from uwlts.hardware.scan_plan import Light, ScanPlan, check_plan, load_plan
 from uwlts.hardware.scan_watch import (
     LOOKS,
     LaserWatch,
@@ -30,9 +33,11 @@ from uwlts.hardware.scan_watch import (
     shows_laser,
     spread,
 )
-from uwlts.model.errors import HardwareError
+from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.sensor import Sensor
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, CaptureWriter, Frame, part_path
+from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.images import without_background
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
@@ -89,6 +94,86 @@ def shots_of(plan: ScanPlan) -> list[Shot]:
     """All images of a plan in their order."""
     pairs = enumerate(product(plan.stage.positions_mm(), plan.lights))
     return [Shot(number, position, light) for number, (position, light) in pairs]
+
+
+def scan(
+    plan: str | Path | ScanPlan,
+    out: str | Path,
+    *,
+    camera: str | None = None,
+    stage: str | None = None,
+    home: bool = False,
+    unlock: bool = False,
+    watch: bool = False,
+    calibration: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[str], None] = lambda line: None,
+    warn: Callable[[str], None] = lambda text: None,
+) -> Seen:
+    """Connect camera and stage and record a scan into a capture.
+
+    The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends.
+
+    Parameters
+    ----------
+    plan : ScanPlan or path of a TOML file
+        Sensor, medium, positions, lights and exposures.
+    out : str or Path
+        Capture to write.
+    camera : str, optional
+        Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
+    stage : str, optional
+        Serial port of the stage, in place of the plan's.
+    home, unlock : bool
+        Find the limit switch first; or take the stage's position as it is, without homing.
+    watch : bool
+        Show the recording in a browser meanwhile, as `watch` does.
+    calibration : str or Path, optional
+        Calibration of any kind for the cloud on that page.
+    resume, overwrite : bool
+        Continue an interrupted scan; replace an existing capture.
+    progress : callable, optional
+        Called with the number of images done and the number in all.
+    report, warn : callable, optional
+        Called with lines of text about the scan, and about what needs attention.
+
+    Raises
+    ------
+    DescriptionError
+        Neither the plan nor an argument names the camera or the stage.
+    RangeError, DesignError, HardwareError, OutputError
+        As `record_scan`.
+    """
+    described, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
+    address, port = camera or described.camera, stage or described.stage.port
+    if address is None or port is None:
+        what = "camera" if address is None else "stage"
+        raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
+    if not resume:
+        refuse_unsuitable(out, overwrite=overwrite)
+    if calibration:
+        if not watch:
+            raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
+        load_calibration(calibration)
+    report(plan_text(described))
+    with ExitStack() as stack:
+        page = stack.enter_context(PageBeside(out, calibration=calibration, say=report)) if watch else None
+        moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
+        if home:
+            moved.home()
+        elif unlock:
+            moved.unlock()
+
+        def recorded(done: int, total: int, seen: Seen) -> None:
+            progress(done, total)
+            if page:
+                page.start()
+
+        return record_scan(
+            described, out, camera=opened, stage=moved, overwrite=overwrite, resume=resume, progress=recorded, warn=warn
+        )
 
 
 def record_scan(

@@ -43,7 +43,7 @@ def reconstruct(
     capture: Capture | str | Path,
     calibration: AnyCalibration | str | Path,
     *,
-    options: StripeOptions = StripeOptions(),
+    stripe: StripeOptions = StripeOptions(),
     index: float | None = None,
     with_uncertainty: bool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -54,7 +54,7 @@ def reconstruct(
     ----------
     capture : Capture or path
     calibration : Calibration, PolynomialCalibration or path
-    options : StripeOptions, optional
+    stripe : StripeOptions, optional
         How stripes are found.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the capture.
@@ -76,7 +76,7 @@ def reconstruct(
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
-        stripes = find_stripes(scan, options=options, progress=progress)
+        stripes = find_stripes(scan, options=stripe, progress=progress)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
         return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
 

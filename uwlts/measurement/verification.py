@@ -90,7 +90,7 @@ class Verification:
 
 
 def verify(
-    capture: Capture | str | Path, calibration: AnyCalibration | str | Path, limit_mm: float | None = None
+    capture: Capture | str | Path, calibration: AnyCalibration | str | Path, *, limit_mm: float | None = None
 ) -> Verification:
     """Measure the artefact that a capture shows and compare it with its calibrated values.
 

@@ -1,15 +1,38 @@
 """The calibration that follows from a sensor's description alone, for designs and for checks with true parameters."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
+from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.window import trace_window
 
 _RAYS, _DEPTHS = 65, 9
+
+
+def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:
+    """Calibration of a sensor that is built exactly as described, for use in one of its media.
+
+    Parameters
+    ----------
+    sensor : str, Path or Sensor
+        Name of a shipped sensor, path of a description, or the description itself.
+    medium : str
+        Name of one of the sensor's media, in which the laser's window may turn the sheet.
+
+    Raises
+    ------
+    DescriptionError
+        The sensor or the medium is unknown, or the description cannot be read.
+    DesignError
+        The sensor cannot work.
+    """
+    described = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
+    return nominal_calibration(described, described.medium(medium))
 
 
 def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibration:

@@ -13,8 +13,9 @@ from markupsafe import Markup
 import uwlts
 from uwlts.measurement.evaluation_file import ArtefactFigures, TruthComparisons, TruthFigures
 from uwlts.model.calibration import Calibration
+from uwlts.model.errors import OutputError
 from uwlts.report import plot
-from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference
+from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference, gather_campaign, load_reference
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.report.page_toolkit import (
     Comparison,
@@ -26,8 +27,8 @@ from uwlts.report.page_toolkit import (
     svg_of,
     write_page,
 )
-from uwlts.report.pictures import cloud_png, stripe_png
-from uwlts.report.summary_file import TruthSummary, summary
+from uwlts.report.pictures import cloud_png, stripe_png, write_pictures
+from uwlts.report.summary_file import TruthSummary, summary, write_summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table, true_window_distance
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
@@ -40,19 +41,66 @@ _CAPTIONS = {
 }
 
 
+@dataclass(frozen=True)
+class Report:
+    """Report of a campaign: its page and summary, what it shows, and the published values beside the measured ones."""
+
+    page: Path
+    summary: Path
+    campaign: Campaign
+    reference: Reference | None
+
+    def rows(self) -> list[Row]:
+        """The summary table."""
+        return summary_table(self.campaign, self.reference)
+
+
 def write_report(
-    path: str | Path, campaign: Campaign, reference: Reference | None = None, *, overwrite: bool = False
-) -> None:
-    """Write the report of a campaign, whole or not at all.
+    folder: str | Path,
+    *,
+    reference: str | Path | None = None,
+    out: str | Path | None = None,
+    pictures: str | Path | None = None,
+    overwrite: bool = False,
+) -> Report:
+    """Write the report of a campaign: one page with pictures, and a summary in numbers beside it.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder with captures NAME.h5, coloured clouds NAME.ply (or .h5), evaluations NAME.evaluation.json and
+        calibrations.
+    reference : str or Path, optional
+        Published values to set beside the measured ones: "thesis", or the path of a TOML file.
+    out : str or Path, optional
+        Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
+    pictures : str or Path, optional
+        Folder for the stripe and the cloud of every measurement as PNG files; not written unless given.
+    overwrite : bool
+        Replace an existing report, summary and pictures.
 
     Raises
     ------
     OutputError
-        The page exists and ``overwrite`` is not given, or cannot be written.
+        A file exists and ``overwrite`` is not given, or cannot be written.
     CaptureError
-        An image of a capture is damaged.
+        A file of the campaign is damaged.
+    DescriptionError
+        The published values cannot be read.
     """
-    write_page(path, report_page(campaign, reference), overwrite=overwrite)
+    campaign = gather_campaign(folder)
+    published = load_reference(reference) if reference else None
+    page = Path(out or campaign.folder / "report.html")
+    report = Report(page, page.with_name("summary.json"), campaign, published)
+    write_summary(report.summary, campaign, published, overwrite=overwrite)
+    write_page(page, report_page(campaign, published), overwrite=overwrite)
+    if pictures:
+        try:
+            Path(pictures).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot make the folder {pictures}: {error.strerror}") from error
+        write_pictures(pictures, campaign, overwrite=overwrite)
+    return report
 
 
 def report_page(campaign: Campaign, reference: Reference | None = None) -> str:

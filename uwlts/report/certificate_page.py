@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import OutputError
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey
-from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, parameter_rows
+from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
 from uwlts.report.certificate_volume import LengthUncertainty, change_from, form_of, in_use, require_same_sensor
 from uwlts.report.numbers import fixed
 from uwlts.report.page_toolkit import (
@@ -31,38 +32,54 @@ from uwlts.report.page_toolkit import (
     write_page,
 )
 from uwlts.report.plot import DEVIATIONS
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture_sources import captures_in
 
 _WORST_IMAGES = 5
 
 
-def refuse_unsuitable_certificate(page: Path, source: Path, *, overwrite: bool) -> None:
-    """OutputError if a certificate cannot be written, or would replace the calibration that it is about."""
-    if json_beside(page).resolve() == source.resolve() or page.resolve() == source.resolve():
-        raise OutputError(f"the certificate's JSON beside {page} would replace the calibration; give another name")
-    refuse_unsuitable_page(page, example="cert.html", overwrite=overwrite)
-
-
 def write_certificate(
-    page: str | Path,
-    content: AnyCertificate,
-    calibration: Calibration,
-    *,
-    before: tuple[str, Calibration] | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Write a certificate's page, and its JSON beside it, each whole or not at all.
+    calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
+) -> tuple[Path, AnyCertificate]:
+    """Write the certificate of a calibration: a page to read and print, and the same beside it as sealed JSON.
+
+    Parameters
+    ----------
+    calibration : str or Path
+        Calibration file; only a joint calibration has uncertainties.
+    out : str or Path, optional
+        Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
+    before : str or Path, optional
+        Another calibration of the same sensor to set beside it.
+    overwrite : bool
+        Replace existing files.
+
+    Returns
+    -------
+    (Path, JointCertificate or SequentialCertificate)
+        The page and the content of both files.
 
     Raises
     ------
     OutputError
-        One of them exists and ``overwrite`` is not given, or cannot be written.
+        A file exists and ``overwrite`` is not given, cannot be written, or is the calibration itself.
+    CaptureError
+        A calibration cannot be read.
     CalibrationError
-        As `certificate_page`.
+        The joint estimate is damaged, or the other calibration is of another sensor.
     """
-    text = certificate_page(content, calibration, before=before)
-    beside = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
-    write_page(page, text, beside=beside, overwrite=overwrite)
+    source = Path(calibration)
+    page = Path(out or source.with_name(f"{source.stem}.certificate.html"))
+    if source.resolve() in (json_beside(page).resolve(), page.resolve()):
+        raise OutputError(f"the certificate's JSON beside {page} would replace the calibration; give another name")
+    refuse_unsuitable_page(page, example="cert.html", overwrite=overwrite)
+    known = read_calibration(source)
+    content = certificate_of(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
+    earlier = None if before is None else (Path(before).name, read_calibration(before))
+    text = certificate_page(content, known, before=earlier)
+    sealed = json.dumps(content.in_file(), indent=2, ensure_ascii=False) + "\n"
+    write_page(page, text, beside=sealed, overwrite=overwrite)
+    return page, content
 
 
 def certificate_page(

@@ -46,6 +46,20 @@ class Quantity(NamedTuple):
     source: str
 
 
+def design(sensor: str | Path | Sensor, *, medium: str) -> list[Quantity]:
+    """Resolution, line length, depth range and speckle limit of a sensor in one of its media by the design formulas.
+
+    Raises
+    ------
+    DescriptionError
+        The sensor or the medium is unknown, or the description cannot be read.
+    DesignError
+        As `nominal_setup`.
+    """
+    described = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
+    return design_table(described, described.medium(medium))
+
+
 def design_table(sensor: Sensor, medium: Medium) -> list[Quantity]:
     """What the formulas say of a sensor in a medium; depths and ranges along the camera's axis unless named otherwise.
 
@@ -110,7 +124,7 @@ def table_lines(rows: list[Quantity]) -> list[str]:
     return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]
 
 
-def describe(name_or_path: str) -> str:
+def describe(path: str | Path) -> str:
     """Text about a file, or about a sensor that ships with the package.
 
     Raises
@@ -118,7 +132,7 @@ def describe(name_or_path: str) -> str:
     CaptureError, DescriptionError
         The file is missing, foreign or damaged.
     """
-    path = Path(name_or_path)
+    name, path = str(path), Path(path)
     suffixes = [s for s in path.suffixes if s != ".part"]
     if suffixes[-2:] == [".truth", ".h5"]:
         return "\n".join(truth_lines(*read_truth(path)))
@@ -131,7 +145,7 @@ def describe(name_or_path: str) -> str:
         return "\n".join(_json_lines(path))
     if suffixes and suffixes[-1] != ".toml":
         raise DescriptionError(f"{path}: expected a .h5, .ply, .json or .toml file, or the name of a sensor")
-    return "\n".join(sensor_lines(load_sensor(name_or_path)))
+    return "\n".join(sensor_lines(load_sensor(name)))
 
 
 def _json_lines(path: Path) -> list[str]:

@@ -162,9 +162,10 @@ def _cells(score: HeldOutScore) -> str:
     return f"{points:>8}{stripes:>9}{everything:>15}{cost:>14}"
 
 
-def write_models(page: Path, content: ModelComparisonContent, *, overwrite: bool = False) -> None:
-    """Write the page, and the JSON beside it, each whole or not at all; OutputError where that fails."""
-    write_page(page, models_page(content), beside=json_text(content, indent=2, ascii=False), overwrite=overwrite)
+def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = False) -> None:
+    """Write a comparison as a page, with its figures as JSON beside it; OutputError if that fails."""
+    content = content_of(comparison)
+    write_page(path, models_page(content), beside=json_text(content, indent=2, ascii=False), overwrite=overwrite)
 
 
 def models_page(content: ModelComparisonContent) -> str:

@@ -2,23 +2,32 @@
 
 import json
 from pathlib import Path
+from typing import assert_never
 
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.storage.files import described, read_json, written_aside
 
-FORMAT = "uwlts-calibration"
+FORMAT, VERSION = "uwlts-calibration", 1
+POLYNOMIALS_FORMAT, POLYNOMIALS_VERSION = "uwlts-polynomials", 1
 
 
-VERSION = 1
-
-
-def write_calibration(path: str | Path, calibration: Calibration, *, overwrite: bool = False) -> None:
-    """Write a calibration as indented JSON, whole or not at all; OutputError where that fails."""
-    content = {"format": FORMAT, "version": VERSION} | calibration.model_dump(mode="json")
+def write_calibration(path: str | Path, calibration: AnyCalibration, *, overwrite: bool = False) -> None:
+    """Write a calibration of any kind as JSON, completely or not at all; OutputError if that fails."""
+    content = calibration.model_dump(mode="json")
+    match calibration:
+        case Calibration():
+            text = json.dumps({"format": FORMAT, "version": VERSION} | content, indent=2)
+        case PolynomialCalibration():
+            # One key a line: indented, the thousands of coefficients would take a line each.
+            content = {"format": POLYNOMIALS_FORMAT, "version": POLYNOMIALS_VERSION} | content
+            lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+            text = f"{{\n{lines}\n}}"
+        case _:
+            assert_never(calibration)
     with written_aside(path, overwrite=overwrite) as aside:
-        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        aside.write_text(text + "\n", encoding="utf-8")
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -34,20 +43,6 @@ def read_calibration(path: str | Path) -> Calibration:
     )
 
 
-POLYNOMIALS_FORMAT = "uwlts-polynomials"
-
-
-POLYNOMIALS_VERSION = 1
-
-
-def write_polynomials(path: str | Path, calibration: PolynomialCalibration, *, overwrite: bool = False) -> None:
-    """Write a polynomial calibration as JSON, one key a line, whole or not at all; OutputError where that fails."""
-    content = {"format": POLYNOMIALS_FORMAT, "version": POLYNOMIALS_VERSION} | calibration.model_dump(mode="json")
-    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
-    with written_aside(path, overwrite=overwrite) as aside:
-        aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
-
-
 def read_polynomials(path: str | Path) -> PolynomialCalibration:
     """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
     return described(
@@ -61,12 +56,12 @@ def read_polynomials(path: str | Path) -> PolynomialCalibration:
     )
 
 
-def read_any_calibration(path: str | Path) -> AnyCalibration:
-    """Read a calibration of either kind, by its "format"; CaptureError as from `read_calibration`."""
+def load_calibration(path: str | Path) -> AnyCalibration:
+    """Read a calibration of any kind; CaptureError if the file is missing, foreign, newer or damaged."""
     kind = read_json(path, called="calibration").get("format")
     return read_polynomials(path) if kind == POLYNOMIALS_FORMAT else read_calibration(path)
 
 
 def loaded_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:
-    """The calibration itself, or the one in a file; CaptureError as from `read_any_calibration`."""
-    return read_any_calibration(calibration) if isinstance(calibration, str | Path) else calibration
+    """The calibration itself, or the one in a file; CaptureError as from `load_calibration`."""
+    return load_calibration(calibration) if isinstance(calibration, str | Path) else calibration

@@ -11,8 +11,8 @@ an interrupted recording keeps all its complete frames; closing it gives it its 
 
 import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -424,6 +424,13 @@ def open_capture(path: str | Path) -> Capture:
     ...     images = [frame.image for frame in capture if frame.laser_on]
     """
     return Capture(path)
+
+
+@contextmanager
+def opened_captures(captures: Iterable[Capture | str | Path]) -> Iterator[list[Capture]]:
+    """A context with several captures, each as from `opened_capture`."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(opened_capture(each)) for each in captures]
 
 
 def opened_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:

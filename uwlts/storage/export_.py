@@ -17,12 +17,59 @@ import tomli_w
 
 from uwlts.model.errors import OutputError, SetupError
 from uwlts.storage.capture import Capture, Frame
-from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud, write_cloud
 from uwlts.storage.files import refuse_unsuitable, written_aside
 from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 
 HEADER, TABLE = "header.json", "frames.csv"
+
+
+def export(
+    file: str | Path,
+    out: str | Path,
+    *,
+    images: Literal["png", "tiff"] = "png",
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Write a capture as a folder of images that `import_images` reads back, or a cloud in another format.
+
+    Parameters
+    ----------
+    file : str or Path
+        Capture (.h5) or cloud (.ply or .h5).
+    out : str or Path
+        New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
+        .e57.
+    images : {"png", "tiff"}
+        Format of a capture's images; both keep all bits.
+    overwrite : bool
+        Replace an existing cloud.
+    progress : callable, optional
+        Called with the number of images done and the number in all.
+
+    Returns
+    -------
+    int
+        Number of images or points that were written.
+
+    Raises
+    ------
+    OutputError
+        The folder or file exists already, or cannot be written.
+    CaptureError
+        The capture or cloud cannot be read.
+    SetupError
+        The library for the cloud's format is not installed.
+    """
+    if is_cloud(file):
+        cloud = read_cloud(file)
+        export_cloud(cloud, Path(out), overwrite=overwrite)
+        return len(cloud)
+    with Capture(file) as capture:
+        export_capture(capture, Path(out), image_format=images, progress=progress)
+        return len(capture)
 
 
 def export_capture(

@@ -25,7 +25,7 @@ from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, CaptureError, EvaluationError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.storage.calibration_file import read_any_calibration, write_calibration, write_polynomials
+from uwlts.storage.calibration_file import load_calibration, write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, write_cloud
 from uwlts.storage.truth import read_truth, truth_path
@@ -65,10 +65,9 @@ def calibrations(
     for number, ((method, medium), make) in enumerate(made.items()):
         progress(number, len(made))
         path = place / f"{method.replace(' ', '-')}-{medium}.json"
-        write = write_polynomials if method == POLYNOMIALS else write_calibration
         if not path.is_file() or path.stat().st_mtime_ns < newest:
-            write(path, make(), overwrite=True)
-        found[method, medium] = read_any_calibration(path)
+            write_calibration(path, make(), overwrite=True)
+        found[method, medium] = load_calibration(path)
     progress(len(made), len(made))
     # In air nothing but camera and sheet is used of a calibration.
     for method, source in ((PROPOSED, PROPOSED), (FORGOTTEN, TWO)):

@@ -3,22 +3,105 @@
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
 import uwlts
+from uwlts.model.errors import DescriptionError
 from uwlts.report import plot
 from uwlts.report.page_toolkit import png_data_uri, render_page, svg_of
 from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import read_cloud
-from uwlts.storage.files import written_aside
+from uwlts.storage.files import refuse_unsuitable, written_aside
 from uwlts.thesis.campaign import campaign_folders
+from uwlts.thesis.evaluation import TRIALS, evaluate_campaign
 from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
+from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_comparison
 from uwlts.thesis.measurements import FORGOTTEN
+from uwlts.thesis.monte_carlo import LEAST_TRIALS
 from uwlts.thesis.results import CampaignResults
-from uwlts.thesis.tables import LARGEST_RATIO, MEAN, Published, TableRow, all_rows, headline_rows
+from uwlts.thesis.tables import LARGEST_RATIO, MEAN, Published, TableRow, all_rows, headline_rows, load_published
+
+
+@dataclass(frozen=True)
+class ThesisReport:
+    """Report of campaigns that were evaluated as in the thesis: its files, page first, and the headline as text."""
+
+    files: tuple[Path, ...]
+    headline: str
+
+
+def evaluate_thesis(
+    folder: str | Path,
+    *,
+    published: str | Path = "thesis-tables",
+    trials: int = TRIALS,
+    workers: int | None = None,
+    joint: bool = False,
+    again: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ThesisReport:
+    """Evaluate campaigns as the thesis does, by all its methods, and set its tables beside the results.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder with campaign-0, campaign-1, ..., each with the recordings of the whole evaluation. The report is written
+        into it: report.html, summary.json, tables.csv and summary.md.
+    published : str or Path
+        Published tables: name or path of a TOML file.
+    trials : int
+        Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
+    workers : int, optional
+        Scans measured at a time; as many as there are processors unless given.
+    joint : bool
+        Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without Monte
+        Carlo; writes report.html and summary.json.
+    again : bool
+        Evaluate campaigns anew that have results already.
+    overwrite : bool
+        Replace an existing report.
+    progress : callable, optional
+        Called with the number of parts done and the number in all, starting again for every campaign.
+
+    Raises
+    ------
+    DescriptionError
+        An argument is out of its range, or the published tables cannot be read.
+    CaptureError, CalibrationError, EvaluationError
+        A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
+    """
+    if trials != 0 and trials < LEAST_TRIALS:
+        raise DescriptionError(f"trials is {trials}: take {LEAST_TRIALS} or more, or 0 for no Monte-Carlo propagation")
+    if workers is not None and workers < 1:
+        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    folder = Path(folder)
+    names = ("report.html", "summary.json") if joint else ("report.html", "summary.json", "tables.csv", "summary.md")
+    files = tuple(folder / name for name in names)
+    tables, campaigns = load_published(published), campaign_folders(folder)
+    for file in files:
+        refuse_unsuitable(file, overwrite=overwrite)
+    if joint:
+        compared = compare_campaigns(campaigns, workers=workers, again=again, progress=progress)
+        summary = write_joint_comparison(folder, compared, overwrite=overwrite)
+        return ThesisReport(files, "\n".join(summary_lines(summary)))
+    results = [
+        evaluate_campaign(
+            campaign,
+            trials=trials,
+            workers=workers,
+            overwrite=again,
+            progress=lambda stage, done, total: progress(done, total),
+        )
+        for campaign in campaigns
+    ]
+    return ThesisReport(files, markdown(write_comparison(folder, results, tables, overwrite=overwrite), results))
 
 
 def differences(rows: Sequence[TableRow]) -> list[str]:

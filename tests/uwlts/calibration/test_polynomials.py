@@ -29,7 +29,7 @@ from uwlts.optics.reconstruction import reconstruct_by_polynomials
 from uwlts.optics.window import RayStatus
 from uwlts.report.inventory import describe
 from uwlts.runtime.console import run
-from uwlts.storage.calibration_file import read_any_calibration, read_polynomials, write_calibration, write_polynomials
+from uwlts.storage.calibration_file import load_calibration, read_polynomials, write_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.storage.cloud import read_cloud
 from uwlts.targets import CircleTarget
@@ -367,12 +367,12 @@ def test_plate_map_needs_points(sensor, evidence):
 @pytest.fixture
 def file(tmp_path, result):
     path = tmp_path / "polynomials.json"
-    write_polynomials(path, result.calibration)
+    write_calibration(path, result.calibration)
     return path
 
 
 def test_file_gives_back_the_same(file, result):
-    assert read_polynomials(file) == result.calibration == read_any_calibration(file)
+    assert read_polynomials(file) == result.calibration == load_calibration(file)
     assert result.calibration.residuals["depth"]["points"] > 4000
     text = describe(str(file))
     assert "degree 6" in text
@@ -382,7 +382,7 @@ def test_file_gives_back_the_same(file, result):
 def test_the_other_kind_is_told_by_its_format(tmp_path, sensor):
     rays = nominal_calibration(sensor)
     write_calibration(tmp_path / "rays.json", rays)
-    assert read_any_calibration(tmp_path / "rays.json") == rays
+    assert load_calibration(tmp_path / "rays.json") == rays
     with pytest.raises(CaptureError, match="no polynomial calibration"):
         read_polynomials(tmp_path / "rays.json")
 
@@ -431,18 +431,18 @@ def test_damaged_files(file, name, says):
     content = edit(json.loads(file.read_text()), name)
     file.write_text(json.dumps(content))
     with pytest.raises(CaptureError, match=says):
-        read_any_calibration(file)
+        load_calibration(file)
 
 
 def test_files_that_are_none(file, tmp_path):
     file.write_text(file.read_text()[:5000])
     with pytest.raises(CaptureError, match="truncated"):
-        read_any_calibration(file)
+        load_calibration(file)
     file.write_text("[1, 2]")
     with pytest.raises(CaptureError, match="not a calibration"):
         read_polynomials(file)
     with pytest.raises(CaptureError, match="cannot read"):
-        read_any_calibration(tmp_path / "missing.json")
+        load_calibration(tmp_path / "missing.json")
 
 
 # --- from captures to a cloud

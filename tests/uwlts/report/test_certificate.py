@@ -25,7 +25,7 @@ from uwlts.report.certificate import (
     read_certificate,
     seal_of,
 )
-from uwlts.report.certificate_page import certificate_page, refuse_unsuitable_certificate, write_certificate
+from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.report.certificate_volume import (
     change_from,
     ends_over,
@@ -78,7 +78,7 @@ def test_the_same_calibration_gives_the_same_json(calibration, path, content):
 
 def test_a_changed_byte_is_found(calibration, path, content, tmp_path):
     page = tmp_path / "cert.html"
-    write_certificate(page, content, calibration)
+    assert write_certificate(path, out=page)[1].parameters == content.parameters
     beside = tmp_path / "cert.json"
     assert check_certificate(beside, path) == []
     text = beside.read_text(encoding="utf-8")
@@ -105,7 +105,7 @@ def test_what_is_no_certificate_is_refused(path, tmp_path):
 
 def test_the_calibration_itself_is_never_replaced(path):
     with pytest.raises(OutputError, match="would replace the calibration"):
-        refuse_unsuitable_certificate(path.with_suffix(".html"), path, overwrite=True)
+        write_certificate(path, out=path.with_suffix(".html"), overwrite=True)
 
 
 def test_it_says_where_it_holds(calibration, content, thesis):

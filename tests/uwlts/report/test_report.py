@@ -23,10 +23,10 @@ from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report import plot
-from uwlts.report.campaign_page import report_page, write_report
+from uwlts.report.campaign_page import report_page
 from uwlts.report.gather import gather_campaign, load_reference
 from uwlts.report.numbers import as_fine_as, fixed, small_length
-from uwlts.report.page_toolkit import png_of, svg_of
+from uwlts.report.page_toolkit import png_of, svg_of, write_page
 from uwlts.report.pictures import StripeView, stripe_picture, write_pictures
 from uwlts.report.summary_file import summary, write_summary
 from uwlts.report.tables import print_table, summary_table
@@ -540,12 +540,12 @@ def test_formulas_in_names_are_drawn_as_they_are():
 
 
 def test_the_page_is_written_once(campaign, tmp_path):
-    path, little = tmp_path / "report.html", replace(campaign, measurements=())
-    write_report(path, little)
+    path, little = tmp_path / "report.html", report_page(replace(campaign, measurements=()))
+    write_page(path, little)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     with pytest.raises(OutputError, match="exists already"):
-        write_report(path, little)
-    write_report(path, little, overwrite=True)
+        write_page(path, little)
+    write_page(path, little, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 

@@ -17,7 +17,7 @@ from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, CaptureWriter, Frame
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
 from uwlts.storage.export_ import CLOUD_FORMATS, LAZ_STEP_M, export_capture, export_cloud
-from uwlts.storage.import_ import import_folder
+from uwlts.storage.import_ import import_images
 
 
 def a_cloud(count: int = 500, *, reach_mm: float = 300.0, **changes) -> PointCloud:
@@ -51,7 +51,7 @@ def test_an_exported_capture_comes_back(tmp_path: Path, dtype: type, image_forma
     record(tmp_path / "a.h5", 7, dtype, header=header)
     with Capture(tmp_path / "a.h5") as capture:
         export_capture(capture, tmp_path / "images", image_format=image_format)
-    import_folder(tmp_path / "images", tmp_path / "b.h5")
+    import_images(tmp_path / "images", tmp_path / "b.h5")
     assert_same(tmp_path / "a.h5", tmp_path / "b.h5")
     assert sorted(path.suffix for path in (tmp_path / "images").iterdir()) == sorted(
         [".csv", ".json", ".toml"] + 7 * [f".{image_format}"]
@@ -71,7 +71,7 @@ def test_poses_and_numbers_come_back_to_the_last_bit(tmp_path: Path):
             )
     with Capture(tmp_path / "a.h5") as capture:
         export_capture(capture, tmp_path / "images")
-    import_folder(tmp_path / "images", tmp_path / "b.h5")
+    import_images(tmp_path / "images", tmp_path / "b.h5")
     assert_same(tmp_path / "a.h5", tmp_path / "b.h5")
 
 

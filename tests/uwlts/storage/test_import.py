@@ -12,7 +12,7 @@ from uwlts import cli
 from uwlts.model.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, part_path
-from uwlts.storage.import_ import import_folder
+from uwlts.storage.import_ import import_images
 from uwlts.storage.import_.images import SUFFIXES, grey_values, one_channel, read_image
 from uwlts.storage.import_.matching import natural_key, read_rows
 from uwlts.stripe import extract_stripe
@@ -69,7 +69,7 @@ def without(*keys: str, **changes) -> dict:
 def test_every_format_comes_in(tmp_path: Path, suffix: str):
     image = stripe_image()
     folder = folder_of(tmp_path, {f"a{suffix}": image}, without("laser", laser=f"*{suffix}"))
-    assert import_folder(folder, tmp_path / "a.h5").warnings == ()
+    assert import_images(folder, tmp_path / "a.h5").warnings == ()
     with Capture(tmp_path / "a.h5") as capture:
         error = np.abs(capture.image(0).astype(int) - image)
         # JPEG at OpenCV's quality of 95 quantises the cosines by a few grey levels.
@@ -84,7 +84,7 @@ def test_everything_told_is_in_the_capture(tmp_path: Path):
         f"w{n}.png": lamp_image(n) for n in (1, 9, 10)
     }
     folder = folder_of(tmp_path, images, told | {"artefact": artefact})
-    imported = import_folder(folder, tmp_path / "a.h5")
+    imported = import_images(folder, tmp_path / "a.h5")
     assert (imported.laser, imported.lamp, imported.warnings) == (3, 3, ())
     with Capture(tmp_path / "a.h5") as capture:
         header = capture.header
@@ -110,7 +110,7 @@ def test_the_chosen_channel_comes_in(tmp_path: Path, channel: str):
     blue, green, red = (lamp_image(seed) for seed in (1, 2, 3))
     red = np.maximum(red, stripe_image())
     folder = folder_of(tmp_path, {"a.png": np.dstack([blue, green, red])}, TOLD | {"channel": channel})
-    import_folder(folder, tmp_path / "a.h5")
+    import_images(folder, tmp_path / "a.h5")
     # Luminance after ITU-R BT.601, as OpenCV documents it, rounded.
     luminance = 0.114 * blue + 0.587 * green + 0.299 * red
     wanted = {
@@ -136,7 +136,7 @@ def test_all_bits_come_in(tmp_path: Path, suffix: str, bits: int, aligned: str):
     image = stripe_image().astype(np.uint16) * 2 ** (bits - 8) + 1
     stored = image * 2 ** (16 - bits) if aligned == "high" else image
     told = without("laser", laser="a*", bits=bits, aligned=aligned)
-    import_folder(folder_of(tmp_path, {f"a{suffix}": stored}, told), tmp_path / "a.h5")
+    import_images(folder_of(tmp_path, {f"a{suffix}": stored}, told), tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 2**bits - 1)
         assert np.array_equal(capture.image(0), image)
@@ -148,7 +148,7 @@ def test_a_background_is_subtracted_with_its_sign(tmp_path: Path):
     images = {f"l{n}.png": image.astype(np.uint8) for n, image in enumerate(lit)}
     images |= {f"w{n}.png": image for n, image in enumerate(dark)}
     told = without("laser", laser="l*", lamp="w*", background="w*")
-    import_folder(folder_of(tmp_path, images, told), tmp_path / "a.h5")
+    import_images(folder_of(tmp_path, images, told), tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 255 + 256)
         assert "256 added" in capture.header.provenance["background"]
@@ -166,7 +166,7 @@ def test_a_background_is_subtracted_with_its_sign(tmp_path: Path):
 
 def test_noise_below_the_background_stays_below(tmp_path: Path):
     images = {"l.png": stripe_image(seed=1), "dark.png": stripe_image(height=0, seed=2)}
-    import_folder(folder_of(tmp_path, images, without("laser", laser="l*", background="dark*")), tmp_path / "a.h5")
+    import_images(folder_of(tmp_path, images, without("laser", laser="l*", background="dark*")), tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert len(capture) == 1
         assert np.array_equal(capture.image(0).astype(int) - 256, images["l.png"].astype(int) - images["dark.png"])
@@ -189,7 +189,7 @@ def test_images_are_taken_as_stored_whatever_exif_says(tmp_path: Path):
 def test_free_poses_count_the_images(tmp_path: Path):
     told = without("laser", "stage", laser="l*", lamp="w*", stage={"free": True})
     folder = three(tmp_path, told, w1=lamp_image(1), w2=lamp_image(2), w3=lamp_image(3))
-    import_folder(folder, tmp_path / "a.h5")
+    import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
         assert "counts the poses" in capture.header.provenance["stage"]
@@ -211,7 +211,7 @@ def test_a_table_tells_each_image(tmp_path: Path, separator: str):
     told = without("laser", "stage", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
     folder = three(tmp_path, told, w=lamp_image())
     (folder / "each.csv").write_text("\n".join(lines).replace(",", separator), encoding="utf-8-sig")
-    assert import_folder(folder, tmp_path / "a.h5").warnings == ()
+    assert import_images(folder, tmp_path / "a.h5").warnings == ()
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [7.5, 0.125, -1e-3] and capture.time_s.tolist() == [0.5, 1.0, 2.0]
         assert capture.laser_on.tolist() == [True, False, True] and capture.exposure_ms.tolist() == [2.0, 3.0, 2.0]
@@ -222,7 +222,7 @@ def test_patterns_say_which_image_is_what_where_the_table_tells_positions_only(t
     told = without("stage", "laser", laser="l*", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
     folder = three(tmp_path, told)
     (folder / "each.csv").write_text("file,stage_mm\nl2.png,4\nl1.png,3\n")
-    imported = import_folder(folder, tmp_path / "a.h5")
+    imported = import_images(folder, tmp_path / "a.h5")
     assert len(imported.warnings) == 1 and "l3.png" in imported.warnings[0]
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [4.0, 3.0]
@@ -232,7 +232,7 @@ def test_the_table_names_backgrounds(tmp_path: Path):
     told = without("laser", table="each.csv", stage={"positions_mm": [1.0, 2.0], "direction": [0.0, 0.0, 1.0]})
     folder = three(tmp_path, told, dark=stripe_image(height=0, dark=4))
     (folder / "each.csv").write_text("file,light,background\nl1.png,laser,dark.png\nl2.png,laser,dark.png\n")
-    import_folder(folder, tmp_path / "a.h5")
+    import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [1.0, 2.0] and np.median(capture.image(0)) == pytest.approx(256 + 6, abs=1)
 
@@ -247,7 +247,7 @@ def test_intrinsics_fill_the_sensor(tmp_path: Path):
     storage.write("camera_matrix", matrix)
     storage.write("distortion_coefficients", coefficients)
     storage.release()
-    import_folder(folder, tmp_path / "a.h5")
+    import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         camera = capture.header.sensor.camera
     assert camera.focal_length_px() == pytest.approx(2002.0, rel=1e-12)
@@ -262,7 +262,7 @@ def refused(folder: Path, tmp_path: Path, error: type[Exception], words: str) ->
     """An import that fails with the words and leaves nothing behind."""
     out = tmp_path / "refused.h5"
     with pytest.raises(error, match=words):
-        import_folder(folder, out)
+        import_images(folder, out)
     assert not out.exists() and not part_path(out).exists()
 
 
@@ -325,7 +325,7 @@ def test_the_wrong_channel_is_black(tmp_path: Path):
 
 
 def test_one_black_image_is_told(tmp_path: Path):
-    imported = import_folder(three(tmp_path, l2=np.zeros((HEIGHT, WIDTH), np.uint8)), tmp_path / "a.h5")
+    imported = import_images(three(tmp_path, l2=np.zeros((HEIGHT, WIDTH), np.uint8)), tmp_path / "a.h5")
     assert imported.warnings[0] == "1 of 3 laser images are black, such as l2.png"
 
 
@@ -342,7 +342,7 @@ def test_white_with_ten_bits(tmp_path: Path):
 
 def test_without_stripe_is_told_and_imported(tmp_path: Path):
     folder = folder_of(tmp_path, {f"l{n}.png": stripe_image(height=0, dark=40, seed=n) for n in (1, 2)})
-    warnings = import_folder(folder, tmp_path / "a.h5").warnings
+    warnings = import_images(folder, tmp_path / "a.h5").warnings
     assert len(warnings) == 1 and "no stripe in any of the 2 laser images" in warnings[0]
     with Capture(tmp_path / "a.h5") as capture:
         assert len(capture) == 2
@@ -353,7 +353,7 @@ def test_a_stripe_across_is_told(tmp_path: Path):
     sensor = SENSOR | {"camera": SENSOR["camera"] | square}
     image = stripe_image()[:, :80].T
     folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, TOLD | {"sensor": sensor})
-    warnings = import_folder(folder, tmp_path / "a.h5").warnings
+    warnings = import_images(folder, tmp_path / "a.h5").warnings
     assert "one runs across: the images are turned, or the sensor's stripe_along" in warnings[0]
 
 
@@ -469,16 +469,16 @@ def test_a_missing_table_and_description(tmp_path: Path):
 
 def test_repeated_images_are_meant(tmp_path: Path):
     folder = three(tmp_path, TOLD | {"stage": TOLD["stage"] | {"step_mm": 0.0}, "repeated": True})
-    assert import_folder(folder, tmp_path / "a.h5").laser == 3
+    assert import_images(folder, tmp_path / "a.h5").laser == 3
 
 
 def test_an_existing_capture_stays(tmp_path: Path):
     folder, out = three(tmp_path), tmp_path / "a.h5"
     out.write_bytes(b"precious")
     with pytest.raises(OutputError, match="exists already"):
-        import_folder(folder, out)
+        import_images(folder, out)
     assert out.read_bytes() == b"precious"
-    import_folder(folder, out, overwrite=True)
+    import_images(folder, out, overwrite=True)
     with Capture(out) as capture:
         assert len(capture) == 3
 
@@ -489,7 +489,7 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
             raise KeyboardInterrupt
 
     with contextlib.suppress(KeyboardInterrupt):
-        import_folder(three(tmp_path), tmp_path / "a.h5", progress=interrupt)
+        import_images(three(tmp_path), tmp_path / "a.h5", progress=interrupt)
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
 
 

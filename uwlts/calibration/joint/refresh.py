@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from pydantic import JsonValue
@@ -25,8 +26,11 @@ from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium, Sensor
-from uwlts.storage.capture import Capture
+from uwlts.optics.window import require_index
+from uwlts.storage.calibration_file import read_calibration
+from uwlts.storage.capture import Capture, opened_captures
 from uwlts.storage.capture_sources import captures_in
+from uwlts.stripe import StripeOptions
 
 
 @dataclass(frozen=True)
@@ -236,22 +240,31 @@ class Refreshed:
 
 
 def refresh(
-    calibration: Calibration,
-    steps: Sequence[Capture],
+    calibration: Calibration | str | Path,
+    step: Sequence[Capture | str | Path],
     *,
-    options: CalibrationOptions | None = None,
+    index: float | None = None,
     index_std: float | None = None,
+    stripe: StripeOptions = StripeOptions(),
     progress: Progress | None = None,
 ) -> Refreshed:
     """Estimate all parameters again from a joint calibration and images of a step in new water.
 
     Parameters
     ----------
-    calibration : all that it found, correlations included, is what is known before
-    steps : a step standard in water of another day. The index of that is a parameter of its own, even where water that
-        is described alike was calibrated in.
-    options : of these ``stripe`` and ``medium_index`` count
-    index_std : how well the new water's index is known before, in place of what follows from the sensor's description
+    calibration : Calibration or path
+        All that it found, correlations included, is what is known before.
+    step : sequence of Capture or path
+        A step standard in water of another day. The index of that is a parameter of its own, even where water that is
+        described alike was calibrated in.
+    index : float, optional
+        Refractive index of the new water as far as it is known, in place of the one that follows from the captures.
+    index_std : float, optional
+        Standard uncertainty of that index, in place of what follows from the sensor's description.
+    stripe : StripeOptions, optional
+        How stripes are found.
+    progress : callable, optional
+        Called with the name of the stage, the number of images done, and the number in all.
 
     Raises
     ------
@@ -261,17 +274,22 @@ def refresh(
     DescriptionError
         A capture does not describe its step.
     RangeError
-        The index's standard uncertainty is not positive.
+        The index is not that of a medium, or its standard uncertainty is not positive.
     """
+    if index is not None:
+        require_index(index)
+    if not isinstance(calibration, Calibration):
+        calibration = read_calibration(calibration)
     _earlier(calibration)
-    if not steps:
+    if not step:
         raise CalibrationError("no capture is given: take at least one image of a step in the new water")
     if index_std is not None and not index_std > 0:
         raise RangeError(f"the standard uncertainty of the index is {index_std:g}; it must be positive")
-    for capture in steps:
-        _refuse_unsuitable(capture, calibration)
-    options = CalibrationOptions() if options is None else options
-    gathered = gather_jointly([], steps, options=options, progress=progress)
+    options = CalibrationOptions(medium_index=index, stripe=stripe)
+    with opened_captures(step) as captures:
+        for capture in captures:
+            _refuse_unsuitable(capture, calibration)
+        gathered = gather_jointly([], captures, options=options, progress=progress)
     used = {source.sha256 for source in calibration.origin().captures()}
     again = [source["file"] for source in captures_in(gathered.provenance) if source["sha256"] in used]
     if again:

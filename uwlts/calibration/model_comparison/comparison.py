@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 from uwlts.calibration.evidence import Progress as Searched
 from uwlts.calibration.joint.evidence import TargetEvidence
@@ -12,11 +14,14 @@ from uwlts.calibration.model_comparison.held_out import INSIDE, Prediction, Spli
 from uwlts.calibration.model_comparison.scores import PolynomialScore, Score, Tally, polynomial_score, tally
 from uwlts.calibration.polynomial_evidence import common_header
 from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.model.errors import CalibrationError
+from uwlts.model.errors import CalibrationError, DescriptionError
+from uwlts.optics.window import require_index
 from uwlts.runtime.workers import Tell, work_through
-from uwlts.storage.capture import Capture
+from uwlts.storage.capture import Capture, opened_captures
+from uwlts.stripe import StripeOptions
 
 Progress = Callable[[int, int], None]
+_Captures = Sequence[Capture | str | Path]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,35 +187,58 @@ class Comparison:
 
 
 def compare_models(
-    targets: Sequence[Capture],
-    steps: Sequence[Capture] = (),
     *,
-    options: CalibrationOptions,
+    air: _Captures = (),
+    water: _Captures = (),
+    step: _Captures = (),
+    poses: Literal["stage", "free"] = "stage",
+    index: float | None = None,
+    stripe: StripeOptions = StripeOptions(),
     workers: int | None = None,
-    searched: Searched | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Searched = lambda stage, done, total: None,
 ) -> Comparison:
-    """Search the images once and compare all models by images held out.
+    """Compare models of the sensor by how well each predicts images that its calibration has not seen.
 
     Parameters
     ----------
-    targets, steps : as `calibrate_jointly`
-    options : its distortion and its refractions do not count: the models are compared in them
-    workers : processes; as many as there are processors unless given
-    searched, progress : callable, optional; called for images searched, and for models calibrated
+    air, water, step : sequence of Capture or path
+        A target in air, the same in the medium of use, and a step standard in the medium of use.
+    poses : {"stage", "free"}
+        stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
+    index : float, optional
+        Refractive index of the medium relative to air, in place of the one that follows from the captures.
+    stripe : StripeOptions, optional
+        How stripes are found.
+    workers : int, optional
+        Models calibrated at a time; as many as there are processors unless given.
+    progress : callable, optional
+        Called with the name of the stage, the number of images or models done, and the number in all.
 
     Raises
     ------
     CalibrationError
         There are too few images, or they do not determine a calibration.
     DescriptionError
-        A capture does not describe its target or its step standard.
+        There is no capture of a target, one does not describe its target or its step standard, or ``workers`` is less
+        than 1.
+    CaptureError
+        A file is missing or damaged.
+    RangeError
+        The refractive index is not that of a medium.
     """
-    gathered = gather_jointly(targets, steps, options=options, progress=searched)
-    problem = joint_problem(gathered, options=options)
-    choice = choose(problem, workers=workers, progress=progress)
-    score, why_none = _polynomials(gathered, problem, choice, targets, free=options.poses == "free")
-    captures = [capture.path.name for capture in [*targets, *steps]]
+    if index is not None:
+        require_index(index)
+    if workers is not None and workers < 1:
+        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+    if not (air or water):
+        raise DescriptionError("nothing to compare models by: give --air or --water with captures of a target")
+    options = CalibrationOptions(poses=poses, medium_index=index, stripe=stripe)
+    with opened_captures([*air, *water]) as targets, opened_captures(step) as steps:
+        gathered = gather_jointly(targets, steps, options=options, progress=progress)
+        problem = joint_problem(gathered, options=options)
+        choice = choose(problem, workers=workers, progress=lambda done, total: progress("models", done, total))
+        score, why_none = _polynomials(gathered, problem, choice, targets, free=poses == "free")
+        captures = [capture.path.name for capture in [*targets, *steps]]
     return Comparison(gathered.sensor.name, captures, choice, score, why_none, problem.warnings)
 
 

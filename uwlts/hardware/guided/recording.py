@@ -5,7 +5,7 @@ was accepted, and the laser goes off.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 import uwlts
+from uwlts.calibration.camera import Poses
 from uwlts.calibration.guidance.pose_advice import State
 from uwlts.calibration.guidance.solution import RecordedPose, Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
@@ -24,7 +25,7 @@ from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.attempt import Attempts, GuidedImages, PoseJudge
 from uwlts.hardware.guided.operator import GuidedPage, HandSwitchedLaser, Operator
 from uwlts.hardware.guided.phases import StepJudge, StepPhase, TargetPhase, places_left, recorded_poses, still_missing
-from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep, check_positions
+from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep, check_positions, load_guided_plan
 from uwlts.hardware.rig import Rig
 from uwlts.hardware.scan_plan import Light
 from uwlts.hardware.scanning import check_camera
@@ -35,10 +36,12 @@ from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, part_pa
 
 @dataclass(frozen=True)
 class GuidedRecording:
-    """What was recorded: captures of the target and, if planned, of the step standard; what is still missing."""
+    """Captures of the target in air or in water and of the step standard, how the poses are tied, what is missing."""
 
-    target: Path
-    step: Path | None
+    air: tuple[Path, ...]
+    water: tuple[Path, ...]
+    step: tuple[Path, ...]
+    poses: Poses
     missing: tuple[str, ...]
 
 
@@ -53,28 +56,39 @@ def step_path(out: Path) -> Path:
 
 
 def record_guided(
-    plan: GuidedPlan,
-    out: Path,
+    plan: str | Path | GuidedPlan,
+    out: str | Path,
     *,
-    page: GuidedPage,
-    operator: Operator,
+    camera: str | None = None,
+    stage: str | None = None,
+    port: int = 8080,
+    refractions: Literal[1, 2] = 2,
+    distortion: tuple[str, ...] = ("k1", "k2"),
     resume: bool = False,
     overwrite: bool = False,
-    refractions: Literal[1, 2] = 2,
-    camera: CameraOptions | None = None,
+    report: Callable[[str], None] = print,
 ) -> GuidedRecording:
-    """Lead through a plan and record it beside the calibration that it is for.
+    """Lead through the images of a calibration and record the good ones, beside the calibration that they are for.
 
     Parameters
     ----------
-    out : Path
+    plan : GuidedPlan or path of a TOML file
+    out : str or Path
         The calibration; captures are called like it, with ``-target.h5`` and ``-step.h5``.
+    camera : str, optional
+        Address of the camera, in place of the plan's.
+    stage : str, optional
+        Serial port of the stage, in place of the plan's.
+    port : int
+        Port of the page for the browser; the next free one is taken if it is in use.
+    refractions, distortion
+        As the calibration is going to be made; see `calibrate`.
     resume : bool
-        Go on with what is recorded, also with a finished capture of the target that is not enough.
+        Continue with what is recorded, also with a finished capture of the target that is not enough.
     overwrite : bool
-        Replace earlier recordings.
-    refractions, camera
-        As the calibration is going to be made.
+        Replace earlier recordings; without effect with ``resume``.
+    report : callable, optional
+        Called with lines of text for the operator, who answers on standard input or on the page.
 
     Raises
     ------
@@ -87,24 +101,38 @@ def record_guided(
     OutputError
         A capture exists, or cannot be written.
     """
-    if plan.camera is None:
+    described = plan if isinstance(plan, GuidedPlan) else load_guided_plan(Path(plan))
+    described = described.connected(camera=camera, port=stage)
+    if described.camera is None:
         raise DescriptionError("neither the plan nor the command line gives the camera: give --camera")
-    if plan.stage is not None and plan.stage.port is None:
+    if described.stage is not None and described.stage.port is None:
         raise DescriptionError("neither the plan nor the command line gives the stage's port: give --stage")
-    camera = camera or CameraOptions()
-    setting = replace(plan.setting(), camera=camera)
-    port = None if plan.stage is None else plan.stage.port
-    phase = _Phases(plan, setting, plan.camera, port, page, operator, resume, overwrite)
-    state = phase.target(target_path(out))
+    page = GuidedPage(described.title, port=port)
+    try:
+        report(f"open {page.address}; Ctrl-C ends it, what was accepted is kept")
+        operator = Operator(report, button=page.pressed)
+        setting = replace(described.setting(), camera=CameraOptions(distortion=distortion))
+        serial = None if described.stage is None else described.stage.port
+        phases = _Phases(described, setting, described.camera, serial, page, operator, resume, overwrite and not resume)
+        return _recorded(phases, Path(out), refractions=refractions)
+    finally:
+        page.close()
+
+
+def _recorded(phases: "_Phases", out: Path, *, refractions: Literal[1, 2]) -> GuidedRecording:
+    plan, target = phases.plan, target_path(out)
+    state = phases.target(target)
+    missing = tuple(still_missing(state))
+    in_air, in_water = ((target,), ()) if plan.target_in_air() else ((), (target,))
     if plan.step is None:
-        return GuidedRecording(target_path(out), None, tuple(still_missing(state)))
-    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=camera)
-    with Capture(target_path(out)) as capture:
-        in_air = calibrate_sequentially([capture], (), options=options).calibration
+        return GuidedRecording(in_air, in_water, (), plan.poses, missing)
+    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=phases.setting.camera)
+    with Capture(target) as capture:
+        known = calibrate_sequentially([capture], (), options=options).calibration
     sensor = plan.described_sensor()
     window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
-    unseen = phase.step(step_path(out), plan.step, StepJudge(plan.step, sensor, in_air, window))
-    return GuidedRecording(target_path(out), step_path(out), (*still_missing(state), *unseen))
+    unseen = phases.step(step_path(out), plan.step, StepJudge(plan.step, sensor, known, window))
+    return GuidedRecording(in_air, in_water, (step_path(out),), plan.poses, (*missing, *unseen))
 
 
 @dataclass(frozen=True)

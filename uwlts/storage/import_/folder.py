@@ -144,11 +144,11 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-def import_folder(
-    folder: Path,
-    out: Path,
+def import_images(
+    folder: str | Path,
+    out: str | Path,
     *,
-    description: Path | None = None,
+    description: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Imported:
@@ -159,11 +159,11 @@ def import_folder(
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         The images: PNG, TIFF, BMP or JPEG, in it or in folders below it.
-    out : Path
+    out : str or Path
         Capture to write.
-    description : Path, optional
+    description : str or Path, optional
         TOML file of an `ImportDescription`; import.toml in the folder unless given.
     overwrite : bool
         Replace an existing capture.
@@ -180,10 +180,11 @@ def import_folder(
     OutputError
         The capture cannot be written.
     """
+    folder, out = Path(folder), Path(out)
     refuse_unsuitable(out, overwrite=overwrite)
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
-    path = folder / NAME if description is None else description
+    path = folder / NAME if description is None else Path(description)
     given = read_description(path)
     sensor = described_sensor(given, beside=path.parent)
     rows = None if given.table is None else read_rows(path.parent / given.table)

@@ -1,0 +1,114 @@
+"""The public functions of both packages: documented, imported when used, and with the parameters of their commands."""
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import twin
+import twin.cli
+import uwlts
+import uwlts.cli
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "viser"}
+
+WRITES = {"out", "overwrite"}
+"""Options of commands that write what their function returns."""
+METHOD = {"method"}
+"""The stripe's method, which functions take among their `StripeOptions`."""
+LISTENS = {"progress", "report", "warn"}
+"""Parameters by which functions show what they do; commands print it."""
+
+# Command, its function, options of the command alone, and parameters of the function alone.
+PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
+    # Guided options go to record_guided; --joint is method="joint".
+    "uwlts calibrate": (
+        "uwlts.calibrate",
+        WRITES | METHOD | {"joint", "live", "camera", "stage", "port", "resume"},
+        {"stripe", "method"},
+    ),
+    "uwlts refresh": ("uwlts.refresh", WRITES | METHOD, {"stripe"}),
+    "uwlts polynomials": ("uwlts.calibrate_polynomials", WRITES | METHOD, {"stripe"}),
+    "uwlts design": ("uwlts.design", set(), set()),
+    "uwlts nominal": ("uwlts.nominal", WRITES, set()),
+    "uwlts info": ("uwlts.describe", set(), set()),
+    "uwlts import": ("uwlts.import_images", set(), set()),
+    "uwlts export": ("uwlts.export", set(), set()),
+    "uwlts reconstruct": ("uwlts.reconstruct", WRITES | METHOD | {"peak"}, {"stripe", "with_uncertainty"}),
+    "uwlts evaluate": ("uwlts.evaluate", WRITES | {"coloured"}, {"source"}),
+    "uwlts report": ("uwlts.write_report", set(), set()),
+    "uwlts thesis": ("uwlts.evaluate_thesis", set(), set()),
+    "uwlts models": ("uwlts.compare_models", WRITES | METHOD, {"stripe"}),
+    "uwlts certificate": ("uwlts.write_certificate", {"check"}, set()),
+    "uwlts verify": ("uwlts.verify", {"limit"}, {"limit_mm"}),
+    "uwlts scan": ("uwlts.scan", set(), set()),
+    "uwlts watch": ("uwlts.watch", set(), set()),
+    "uwlts doctor": ("uwlts.examine", set(), set()),
+    "twin simulate": ("twin.simulate", set(), {"show_progress"}),
+    "twin demo": ("twin.demo", set(), set()),
+    "twin sweep": ("twin.sweep", set(), set()),
+    # The evaluation is uwlts.evaluate_thesis, in a process of its own.
+    "twin reproduce": ("twin.reproduce", set(), {"show_progress"}),
+}
+PACKAGES = {"uwlts": uwlts, "twin": twin}
+APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
+
+
+def commands() -> set[str]:
+    return {f"{program} {name}" for program, app in APPS.items() for name in app if not name.startswith("-")}
+
+
+@pytest.mark.parametrize("package", [uwlts, twin], ids=["uwlts", "twin"])
+def test_every_public_name_is_there_and_documented(package):
+    assert package.__all__ == sorted(set(package.__all__), key=lambda name: (name[0].islower(), name))
+    assert set(package.__all__) <= set(dir(package))
+    for name in package.__all__:
+        assert inspect.getdoc(getattr(package, name)), name
+
+
+@pytest.mark.parametrize("package", [uwlts, twin], ids=["uwlts", "twin"])
+def test_type_checkers_see_every_public_name(package):
+    """What is imported for type checkers alone must be what is imported when it is used."""
+    (guarded,) = [
+        node
+        for node in ast.parse(Path(package.__file__).read_text(encoding="utf-8")).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    ]
+    seen = {alias.name: node.module for node in guarded.body for alias in node.names}
+    assert sorted(seen) == sorted(package.__all__)
+    assert {n: m for n, m in package._MODULES.items() if n != "plot"} == {n: m for n, m in seen.items() if n != "plot"}
+
+
+@pytest.mark.parametrize("package", ["uwlts", "twin"])
+def test_importing_is_light(package: str):
+    code = f"import sys, {package}; print(*sorted({HEAVY!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == ""
+
+
+def test_unknown_names_are_refused():
+    for package in (uwlts, twin):
+        with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+            package.nothing  # noqa: B018
+
+
+def test_every_command_has_a_function():
+    assert commands() - set(PAIRS) == {"twin scenes", "twin serve"}
+
+
+@pytest.mark.parametrize("line", PAIRS)
+def test_commands_take_what_their_functions_take(line: str):
+    function, of_command, of_function = PAIRS[line]
+    program, name = line.split()
+    package, attribute = function.split(".")
+    assert attribute in PACKAGES[package].__all__
+    given = inspect.signature(APPS[program][name].default_command).parameters
+    taken = inspect.signature(getattr(PACKAGES[package], attribute)).parameters
+    assert set(given) - of_command == set(taken) - of_function - LISTENS
+    assert of_command <= set(given) and of_function <= set(taken)
+    for shared in set(given) - of_command:
+        assert given[shared].default == taken[shared].default, shared
