@@ -42,7 +42,7 @@ def plate(
 def block(
     size: tuple[float, float, float], position: tuple[float, float, float], *, reflectance: float = 0.0
 ) -> dict[str, Any]:
-    """A block, black unless told otherwise."""
+    """A block, black by default."""
     return {"kind": "block", "size_mm": size, "position_mm": position, "reflectance": reflectance}
 
 
@@ -109,7 +109,7 @@ def oracle_fan(sensor: Sensor, medium: Medium) -> Fan:
 
 
 def oracle_paths(sensor: Sensor, medium: Medium, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the camera sees points (N, 3) of the OCS by Fermat's principle.
+    """Paths of light from points (N, 3) of the OCS to the camera by Fermat's principle.
 
     Unit directions (N, 3) at the pupil in the camera frame, and the path's part in the medium, from the window's outer
     face (N, 3) in the OCS and its length (N,).

@@ -1,4 +1,4 @@
-"""How a recording is rendered: samples, seed, the effects that it shows, and Mitsuba's variant.
+"""Options of rendering: samples, seed, the effects that are shown, and Mitsuba's variant.
 
 Call `use_variant` before importing any module of the twin that renders: Mitsuba and Dr.Jit look for libLLVM when they
 are imported.

@@ -1,4 +1,4 @@
-"""The camera's rays: lens and pupil, distortion, the window's glass faces, mirrors, and ray segments."""
+"""Rays of the camera from the image through lens, pupil and window into the scene, and on by way of its mirrors."""
 
 from __future__ import annotations
 
@@ -27,106 +27,16 @@ from uwlts.model.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
-STEP_MM = 1e-3
+_STEP_MM = 1e-3
 """How far along its direction a refracted ray starts; far above the spacing of 32-bit floats at 1 m (6e-5 mm)."""
-
-
-def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Right-handed rotation (3, 3) with columns x, y, z where z = ``axis`` and x is ``across`` made square to it."""
-    z = axis / np.linalg.norm(axis)
-    x = across - (across @ z) * z
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-@dataclass(frozen=True)
-class LightPath:
-    """Rays in the medium behind a window: origin, unit direction, weight, and whether they got there."""
-
-    origin: Point3f
-    direction: Vector3f
-    weight: Float
-    valid: Bool
-
-
-class WindowFaces:
-    """Both faces of a window. Rays meet them in a known order, so each is asked alone, without a scene around it.
-
-    Parameters
-    ----------
-    window
-        Description of the window; unmounted it lets rays pass unchanged.
-    origin_mm, rotation
-        Module frame in the camera frame: its origin (3,) and rotation (3, 3); the third column is the module's axis.
-    """
-
-    def __init__(
-        self, window: Window, medium: Medium, *, wavelength_nm: float, origin_mm: np.ndarray, rotation: np.ndarray
-    ):
-        index = medium.refractive_index(wavelength_nm)
-        self.mounted = window.mounted
-        if not window.mounted:
-            if medium.kind != "air":
-                raise DesignError("a window is left out although the sensor is in water: mount it or measure in air")
-            return
-        glass = window.index(wavelength_nm)
-        self._absorption = window.absorption_per_mm()
-        normal = rotation @ window.normal()
-        inner = origin_mm + window.distance_mm * rotation[:, 2]
-        outer = inner + window.thickness_mm * normal
-        self._faces = []
-        for centre, outside, inside in ((inner, 1.0, glass), (outer, glass, index)):
-            to_world = np.eye(4)
-            to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (
-                window.aperture_diameter_mm / 2,
-                window.aperture_diameter_mm / 2,
-                1,
-            )
-            to_world[:3, 3] = centre
-            bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
-            self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
-
-    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> LightPath:
-        """Send rays from the module's side through both faces.
-
-        ``mode`` is Radiance for rays traced backwards from the camera (weights carry 1 / n^2) and Importance for light
-        sent forwards from the laser.
-        """
-        width = dr.width(direction)
-        weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
-        if not self.mounted:
-            return LightPath(origin, direction, weight, valid)
-        context = mi.BSDFContext(mode)
-        context.component = 1
-        ray = mi.Ray3f(origin, direction)
-        for face in self._faces:
-            si = face.ray_intersect(ray, active=valid)
-            valid &= si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0)
-            sample, transmitted = face.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
-            weight *= dr.select(valid, transmitted[0], 0.0)
-            if face is self._faces[1] and self._absorption > 0:
-                weight *= dr.exp(-self._absorption * (si.t + STEP_MM))
-            onward = si.to_world(sample.wo)
-            ray = mi.Ray3f(si.p + onward * STEP_MM, onward)
-        return LightPath(ray.o, ray.d, weight, valid & (weight > 0))
-
-
 _NEWTON_STEPS = 6
 """Lead to the rounding of 32 bits for the distortion of real lenses."""
-
-
 _FIELD = 0.96
 """Blur is measured in the image's middle and at this share of the way to its edges and corners."""
-
-
 _RIM_POINTS = 8
 """Rays through the pupil's rim; the blur's largest radius changes little from one to the next."""
-
-
 _DEPTHS = 200
 """Depths of the blur's table, evenly spread on a logarithmic scale from 1 mm to 10 m behind the window."""
-
-
 _CLEAR_MM = 1e-2
 """Reflected rays start this far from the mirror."""
 
@@ -191,6 +101,86 @@ class LensRays:
         return self.camera.f_number * (1 + focal / (self.camera.focus_distance_mm - focal))
 
 
+def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Right-handed rotation (3, 3) with columns x, y, z where z = ``axis`` and x is ``across`` made square to it."""
+    z = axis / np.linalg.norm(axis)
+    x = across - (across @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+@dataclass(frozen=True)
+class LightPath:
+    """Rays in the medium behind a window: origin, unit direction, weight, and whether they passed both faces."""
+
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
+    valid: Bool
+
+
+class WindowFaces:
+    """Both faces of a window. Rays meet them in a known order, so each is intersected alone, without a scene.
+
+    Parameters
+    ----------
+    window
+        Description of the window; unmounted it lets rays pass unchanged.
+    origin_mm, rotation
+        Module frame in the camera frame: its origin (3,) and rotation (3, 3); the third column is the module's axis.
+    """
+
+    def __init__(
+        self, window: Window, medium: Medium, *, wavelength_nm: float, origin_mm: np.ndarray, rotation: np.ndarray
+    ):
+        index = medium.refractive_index(wavelength_nm)
+        self.mounted = window.mounted
+        if not window.mounted:
+            if medium.kind != "air":
+                raise DesignError("a window is left out although the sensor is in water: mount it or measure in air")
+            return
+        glass = window.index(wavelength_nm)
+        self._absorption = window.absorption_per_mm()
+        normal = rotation @ window.normal()
+        inner = origin_mm + window.distance_mm * rotation[:, 2]
+        outer = inner + window.thickness_mm * normal
+        self._faces = []
+        for centre, outside, inside in ((inner, 1.0, glass), (outer, glass, index)):
+            to_world = np.eye(4)
+            to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (
+                window.aperture_diameter_mm / 2,
+                window.aperture_diameter_mm / 2,
+                1,
+            )
+            to_world[:3, 3] = centre
+            bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
+            self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
+
+    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> LightPath:
+        """Send rays from the module's side through both faces.
+
+        ``mode`` is Radiance for rays traced backwards from the camera (weights carry 1 / n^2) and Importance for light
+        sent forwards from the laser.
+        """
+        width = dr.width(direction)
+        weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
+        if not self.mounted:
+            return LightPath(origin, direction, weight, valid)
+        context = mi.BSDFContext(mode)
+        context.component = 1
+        ray = mi.Ray3f(origin, direction)
+        for face in self._faces:
+            si = face.ray_intersect(ray, active=valid)
+            valid &= si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0)
+            sample, transmitted = face.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
+            weight *= dr.select(valid, transmitted[0], 0.0)
+            if face is self._faces[1] and self._absorption > 0:
+                weight *= dr.exp(-self._absorption * (si.t + _STEP_MM))
+            onward = si.to_world(sample.wo)
+            ray = mi.Ray3f(si.p + onward * _STEP_MM, onward)
+        return LightPath(ray.o, ray.d, weight, valid & (weight > 0))
+
+
 @dataclass(frozen=True)
 class Bundle:
     """Camera rays in the medium, in the sensor's OCS: origins, unit directions, and sensor irradiance per radiance."""
@@ -206,12 +196,9 @@ class View:
     def __init__(self, sensor: Sensor, medium: Medium):
         self.camera = sensor.camera
         self.lens = LensRays(sensor.camera)
+        wavelength = sensor.laser.wavelength_nm
         self._faces = WindowFaces(
-            sensor.camera.window,
-            medium,
-            wavelength_nm=sensor.laser.wavelength_nm,
-            origin_mm=np.zeros(3),
-            rotation=np.eye(3),
+            self.camera.window, medium, wavelength_nm=wavelength, origin_mm=np.zeros(3), rotation=np.eye(3)
         )
         self._camera_from_object = camera_from_object(sensor)
         self._to_object = np.linalg.inv(self._camera_from_object)

@@ -1,4 +1,4 @@
-"""Which pixels are rendered finely, and where in a pixel, on the pupil and during the exposure samples are taken.
+"""Choice of the pixels that are rendered finely, and of the samples over pixel, pupil and exposure.
 
 Cells of a coarse grid of camera rays show where the stripe is. All pixels share one rank-1 lattice of samples: it is
 evenly spaced along every axis, so that a smooth stripe is integrated as by the midpoint rule, without the noise of
@@ -52,7 +52,7 @@ def lattice(count: int, axes: int) -> np.ndarray:
 
 
 def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """By how much the points on the pupil are shifted, cyclically, in pixels (P,): (2, P), from 0 to 1.
+    """Cyclic shifts (2, P), from 0 to 1, of the points on the pupil in pixels (P,).
 
     The few points of a pixel turn a blurred edge into steps; where they lie elsewhere in neighbouring pixels, the steps
     do too. The 16 pixels of a block 4 px square take 8 evenly spread shifts (the R2 sequence, Roberts 2018) and their

@@ -1,4 +1,4 @@
-"""Where the sensor stands in the scene, and how far it travels during an exposure."""
+"""Pose of the sensor in the scene, and its travel during an exposure."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from twin.backend.arrays import Float, UInt32, to_jit
 from twin.light.camera import Bundle, RaySegment, View, ray_segments
-from twin.light.direct import Light, Source, lights
+from twin.light.illumination import Light, Source, lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
     any_corner,
@@ -282,7 +282,7 @@ class Renderer:
     def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
         """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
         bundle, shape = self.view.grid(1)
-        value = self._evenly_lit(pose, bundle, None, ambient=ambient)
+        (value,) = self._evenly_lit(pose, bundle, None, ambient)
         segment = next(self._segments(pose, bundle, None))
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
@@ -296,16 +296,11 @@ class Renderer:
             changes[:] = True  # what moves by may change any pixel
         image = corner_mean(nodes)
         for rows, columns in _parts(*np.nonzero(changes), spp=spp):
-            fine = self._fine(self._evenly_lit_sums, pose, rows, columns, ambient, spp=spp, shifted=True)
+            fine = self._fine(self._evenly_lit, pose, rows, columns, ambient, spp=spp, shifted=True)
             image[rows, columns] = fine[0]
         return image
 
-    def _evenly_lit_sums(
-        self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, ambient: bool
-    ) -> tuple[Float]:
-        return (self._evenly_lit(pose, bundle, travel_mm, ambient=ambient),)
-
-    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, *, ambient: bool) -> Float:
+    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, ambient: bool) -> tuple[Float]:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -321,7 +316,7 @@ class Renderer:
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += scattered / self.scattering.extinction * (1 - left)
-        return segment.weight * level * radiance
+        return (segment.weight * level * radiance,)
 
     # --- pixels -------------------------------------------------------------------------------------------------------
 

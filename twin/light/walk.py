@@ -27,7 +27,7 @@ import numpy as np
 
 from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInteraction3f, UInt32, Vector3f
 from twin.light.camera import Bundle
-from twin.light.direct import Light
+from twin.light.illumination import Light
 from twin.light.pose import SensorPose
 from twin.light.sheet import SheetLight
 from twin.light.water import Scattering
@@ -48,7 +48,7 @@ class _Walks:
     """Walks in the sensor's OCS: the ray, the light it stands for, and the pixel or cell it counts for.
 
     ``density`` is that of the ray's direction in 1/sr where a lit surface at its end is to be counted, else 0.
-    ``away`` tells whether the walk has left the camera's own ray, ``reflected`` whether it has met a surface.
+    ``away`` is True once the walk has left the camera's own ray, ``reflected`` once it has met a surface.
     """
 
     origin: Point3f

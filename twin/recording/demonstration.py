@@ -1,4 +1,4 @@
-"""The main job in a row of commands: record a virtual campaign, calibrate, reconstruct, evaluate, report."""
+"""Demonstration of all commands: record a virtual campaign, calibrate, reconstruct, evaluate, report."""
 
 import json
 import shlex

@@ -237,5 +237,5 @@ def choose_sensors(sensor: str | Path | Sensor, as_built: str | Path | Sensor | 
 
 
 def choose_options(*, spp: int, seed: int, without: Sequence[str], ideal: bool) -> Options:
-    """How to render, with some effects or all of them left out."""
+    """Options of rendering, with some effects or all of them left out."""
     return Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))

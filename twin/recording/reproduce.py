@@ -122,7 +122,7 @@ class _Job:
         return capture.is_file() and truth.is_file() and not part.exists()
 
     def images(self) -> int:
-        """How many images the recording has."""
+        """Number of images of the recording."""
         motion = self.take.scene.motion
         return motion.count * len(motion.lights)
 
@@ -185,7 +185,7 @@ def record_campaigns(
 
 
 def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, overwrite: bool) -> None:
-    """Write down how a folder's campaigns are rendered, or make sure that it says the same."""
+    """Write the settings of a folder's campaigns, or check that they are the same as before."""
     path = folder / PLAN
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -200,7 +200,7 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, ov
     if known == plan:
         return
     if recorded:
-        how = f"that {PLAN} does not tell of"
+        how = f"that {PLAN} does not describe"
         if isinstance(known, dict):
             how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
         if not overwrite:
@@ -217,8 +217,8 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, ov
         aside.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
 
 
-def _record(job: _Job, tell: Callable[[None], None]) -> None:
-    """Render a take; tells of every image."""
+def _record(job: _Job, report: Callable[[None], None]) -> None:
+    """Render a take; calls ``report`` after every image."""
     use_variant(job.variant)
     import drjit as dr
 
@@ -235,7 +235,7 @@ def _record(job: _Job, tell: Callable[[None], None]) -> None:
             options=job.options,
             overwrite=True,
             resume=part_path(job.path).exists(),
-            progress=lambda images, total: tell(None),
+            progress=lambda images, total: report(None),
         )
     except Error as error:
         raise type(error)(f"{job.path}: {error}") from error

@@ -90,7 +90,14 @@ class Studio:
             else None
         )
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
-        self._check_motion()
+        shortest_s = self._shortest_period_s()
+        motion = scene.motion
+        if motion.speed_mm_per_s > 0 and motion.count > 1 and self.period_s < shortest_s * (1 - 1e-9):
+            raise DesignError(
+                f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached after "
+                f"{1e3 * self.period_s:.3g} ms, but the camera needs {1e3 * shortest_s:.3g} ms from frame to frame: "
+                "travel more slowly, in longer steps, or with shorter exposures"
+            )
 
     @property
     def period_s(self) -> float:
@@ -102,16 +109,6 @@ class Studio:
 
     def _shortest_period_s(self) -> float:
         return max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
-
-    def _check_motion(self) -> None:
-        """Refuse a travel that is too fast for the camera."""
-        motion = self.scene.motion
-        if motion.speed_mm_per_s > 0 and motion.count > 1 and self.period_s < self._shortest_period_s() * (1 - 1e-9):
-            raise DesignError(
-                f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached after "
-                f"{1e3 * self.period_s:.3g} ms, but the camera needs {1e3 * self._shortest_period_s():.3g} ms from "
-                "frame to frame: travel more slowly, in longer steps, or with shorter exposures"
-            )
 
     def pose(self, shot: Shot) -> np.ndarray:
         """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
@@ -171,9 +168,10 @@ class Studio:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
         self._shift_points(shot, index)
         rng = np.random.default_rng([self.options.seed, index]) if self.options.effects.noise else None
+        walks = np.random.SeedSequence([self.options.seed, index])
         exposure = self.exposure_ms[shot.light]
         light = exposure * self.electrons_per_ms(
-            shot, spp=self.options.spp, seed=self._seed(index), travel=self.travel(shot.light)
+            shot, spp=self.options.spp, seed=int(walks.generate_state(1)[0]), travel=self.travel(shot.light)
         )
         return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng, pattern=self._pattern)
 
@@ -199,10 +197,6 @@ class Studio:
         outside = depth_mm - window.distance_mm - window.thickness_mm
         in_medium = outside / self.medium.refractive_index(wavelength)
         return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
-
-    def _seed(self, index: int) -> int:
-        """Seed of a frame's random walks."""
-        return int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
 
     def _exposure(self, light: Literal["lamp", "laser"]) -> float:
         """Exposure in ms as described, or so that the first, middle or last shot just reaches the wanted level."""

@@ -1,4 +1,4 @@
-"""Ground truth of a frame: where every profile line truly sees the middle of the sheet, and what lies there."""
+"""Ground truth of a frame: true stripe centres of all profile lines, the points of the surface there, and depths."""
 
 from __future__ import annotations
 

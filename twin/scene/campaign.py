@@ -1,4 +1,4 @@
-"""A campaign of many recordings, and how the things in it differ from their descriptions: drawn anew by each seed."""
+"""Campaigns of many recordings, with deviations of the real things from their descriptions drawn for each seed."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ FOLDER = "campaigns"
 
 
 class Imperfections(Description):
-    """How far real things lie from their descriptions: standard deviations if normal, half widths if evenly spread.
+    """Deviations of real things from their descriptions: standard deviations if normal, half widths if even.
 
     ``circle_centre_std_mm``
         every printed circle or corner of the target, along x and y.
@@ -73,7 +73,7 @@ class Recording(Description):
 
 
 class Campaign(Description):
-    """What is recorded with which sensor. ``as_built`` is the sensor that the imperfections are laid over.
+    """Recordings with one sensor. ``as_built`` is the sensor to which the imperfections are added.
 
     Sensors are names, or paths that start at the campaign's folder if they are relative.
     """
@@ -148,7 +148,10 @@ def _take(recording: Recording, scene: Scene, drawn: "_Drawn", *, every: int) ->
     sensor = drawn.described
     built = sensor if recording.as_described else drawn.sensor
     if recording.stripe_along is not None:
-        sensor, built = (_turned(each, recording.stripe_along) for each in (sensor, built))
+        sensor, built = (
+            each.model_copy(update={"camera": each.camera.model_copy(update={"stripe_along": recording.stripe_along})})
+            for each in (sensor, built)
+        )
     # A calibration keeps all its images, and a scan at least a few profiles.
     scan = scene.target is None and scene.motion.count >= 5 * every
     if scan and every > 1:
@@ -159,10 +162,6 @@ def _take(recording: Recording, scene: Scene, drawn: "_Drawn", *, every: int) ->
         calibrating = scene.target is not None or _shows_step(scene)
         built = drawn.with_true_water(built, calibrating=calibrating)
     return Take(name, scene, sensor, built, int(rng.integers(2**31)))
-
-
-def _turned(sensor: Sensor, stripe_along: str) -> Sensor:
-    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"stripe_along": stripe_along})})
 
 
 def _with_motion(scene: Scene, **changes: object) -> Scene:
@@ -214,7 +213,9 @@ class _Drawn:
         """The scene with its target's, step's and stage's errors; ``rng`` draws those of this recording alone."""
         objects = [self._real(thing, rng) for thing in scene.objects]
         if self._lower_step != 0 and _shows_step(scene):
-            objects[_lower_block(scene)] = _moved(objects[_lower_block(scene)], (0.0, 0.0, self._lower_step))
+            number = _lower_block(scene)
+            x, y, z = objects[number].position_mm
+            objects[number] = objects[number].model_copy(update={"position_mm": (x, y, z + self._lower_step)})
         motion = scene.motion
         positions = np.array([motion.start_mm + index * motion.step_mm for index in range(motion.count)])
         errors = self._lead * positions + self._size.stage_position_std_mm * rng.standard_normal(motion.count)
@@ -255,11 +256,6 @@ def _lower_block(scene: Scene) -> int:
             "step_height_half_width_mm to 0"
         )
     return max(blocks, key=lambda number: blocks[number])
-
-
-def _moved(thing: AnyObject, by_mm: tuple[float, float, float]) -> AnyObject:
-    moved = np.array(thing.position_mm) + by_mm
-    return thing.model_copy(update={"position_mm": tuple(moved.tolist())})
 
 
 def _turned_slightly(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:

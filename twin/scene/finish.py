@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.backend.arrays import Float
 from twin.scene.description import Flat, Placed, Printed
 from twin.scene.pattern import pattern_texture
 from uwlts.model.errors import DescriptionError
@@ -132,7 +134,7 @@ def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 409
     (Roberts 2018), good to 1e-3.
     """
     index = dr.arange(mi.UInt32, len(cosines) * samples)
-    sample = mi.Float(index % samples)
+    sample = cast(Float, mi.Float(index % samples))
     si = dr.zeros(mi.SurfaceInteraction3f, len(cosines) * samples)
     cosine = dr.gather(mi.Float, mi.Float(np.asarray(cosines, np.float32)), index // samples)
     si.wi = mi.Vector3f(dr.safe_sqrt(1 - dr.square(cosine)), 0, cosine)
@@ -151,7 +153,8 @@ def albedo_parts(
     """
     black, white = (_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm) for grey in (0.0, 1.0))
     # A metal does not have a diffuse reflectance; Mitsuba returns pi times its BSDF at normal incidence instead.
-    unit = float(white.eval_diffuse_reflectance(square_on(dr.zeros(mi.SurfaceInteraction3f)))[0][0])
+    square = square_on(dr.zeros(mi.SurfaceInteraction3f))
+    unit = float(cast(Float, white.eval_diffuse_reflectance(square))[0][0])
     without = directional_albedo(black, cosines)
     return without, (directional_albedo(white, cosines) - without) / unit
 

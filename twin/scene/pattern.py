@@ -93,7 +93,7 @@ def register_pattern() -> None:
             return True
 
         def to_string(self) -> str:
-            return f"TargetPattern[{self.plate.described_target().kind}]"
+            return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
 
     mi.register_texture("target_pattern", TargetPattern)
 

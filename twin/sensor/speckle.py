@@ -67,7 +67,7 @@ class Speckle:
 
     def __init__(self, camera: Camera, *, wavelength_nm: float, seed: int) -> None:
         magnification = _magnification(camera)
-        wavelength_mm = 1e-6 * float(_wavelength(wavelength_nm))
+        wavelength_mm = 1e-6 * float(_within("the wavelength in nm", wavelength_nm, 1.0, math.inf))
         grain_mm = wavelength_mm * camera.f_number * (1 + magnification)
         grain_px = grain_mm / (1e-3 * camera.pixel_size_um)
         if grain_px > _WIDEST_PX:
@@ -119,7 +119,14 @@ class Speckle:
         """
         # Small integers would overflow where a pixel's place in the tile is counted.
         rows, columns = (np.asarray(values).astype(np.intp, casting="same_kind") for values in (rows, columns))
-        self._check_pixels(rows, columns)
+        height, width = self.camera.height_px, self.camera.width_px
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        if not inside.all():
+            worst = np.argmin(inside)
+            raise ImageError(
+                f"row {rows[worst]}, column {columns[worst]} lies outside the image of {height} rows and {width} "
+                "columns: ask for pixels of the image only"
+            )
         travel = float(_within("the travel in mm", travel_mm, -math.inf, math.inf))
         polarised = _within("the degree of polarisation", polarisation, 0.0, 1.0)
         looks = _look_weights(self._strength * _within("the coherence", coherence, 0.0, 1.0))
@@ -138,16 +145,6 @@ class Speckle:
     def _pattern(self, number: int, *, position: float) -> np.ndarray:
         """Intensity (along, across) of one of the independent patterns, ``position`` in renewal lengths."""
         return self._tile.intensity(_amplitudes(self._tile.size, self._seed, number, position))
-
-    def _check_pixels(self, rows: np.ndarray, columns: np.ndarray) -> None:
-        height, width = self.camera.height_px, self.camera.width_px
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-        if not inside.all():
-            worst = np.argmin(inside)
-            raise ImageError(
-                f"row {rows[worst]}, column {columns[worst]} lies outside the image of {height} rows and {width} "
-                "columns: ask for pixels of the image only"
-            )
 
 
 def coherence(
@@ -187,7 +184,7 @@ def coherence(
     """
     roughness = _within("the roughness in um", roughness_um, 0.0, math.inf)
     width = _within("the line width in nm", linewidth_nm, 0.0, math.inf)
-    wavelength = _wavelength(wavelength_nm)
+    wavelength = _within("the wavelength in nm", wavelength_nm, 1.0, math.inf)
     spread_per_um = 1e3 * 2 * math.pi / wavelength**2 * width / math.sqrt(8 * math.log(2))
     return (1 + 4 * (spread_per_um * index * sum(cosines) * roughness) ** 2) ** -0.25
 
@@ -319,10 +316,6 @@ def _magnification(camera: Camera) -> float:
             f"focus_distance_mm {focus:g} is not beyond focal_length_mm {focal:g}: such a lens forms no image"
         )
     return focal / (focus - focal)
-
-
-def _wavelength(value: ArrayLike) -> np.ndarray:
-    return _within("the wavelength in nm", value, 1.0, math.inf)
 
 
 def _within(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:

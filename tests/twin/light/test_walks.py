@@ -23,7 +23,7 @@ from tests.virtual_sensors import (
     sensor_at,
 )
 from twin.backend.arrays import to_jit
-from twin.light.direct import lights
+from twin.light.illumination import lights
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
 from twin.light.walk import Walker

@@ -1,4 +1,4 @@
-"""A sheet as it lights points before the sensor: directly, from another laser, or after a mirror."""
+"""Illumination of points before the sensor by its laser sheets, directly or by way of a mirror, with shadows."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Light:
         return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
 
     def _at_rest(self, p: Point3f, travel_mm: Float | None) -> Point3f:
-        """Where points of the travelling OCS, in which a mirror moves, lie in that of the resting sensor."""
+        """Points of the travelling OCS, in which a mirror moves, in the OCS of the resting sensor."""
         return mi.Point3f(p if travel_mm is None else p + self._pose.object_travel(travel_mm))
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
