@@ -237,7 +237,7 @@ def _accepted(
         return single_images(images)
     if poses == "stage" and not options.square_pixels:
         raise CalibrationError(
-            "a free stage direction and pixels that are not square cannot be told apart: give square pixels, or "
+            "a free stage direction and pixels that are not square cannot be separated: give square pixels, or "
             "poses='stage-normal' or 'free'"
         )
     views = placements(images, approaching=approaching)
@@ -320,4 +320,4 @@ def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarra
         return None
     velocity = -(moved @ target_poses[:, :3, 3]) / (moved @ moved)
     speed = float(np.linalg.norm(velocity))
-    return velocity / speed if abs(speed - 1) < 0.05 else None
+    return velocity / speed if abs(speed - 1) < 0.05 else None  # scales of stage and target agree better than that

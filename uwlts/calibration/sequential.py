@@ -378,7 +378,7 @@ def _window(
 
 
 def step_image(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
-    """A stripe on the step standard with its treads told apart; EvaluationError where it does not show two."""
+    """A stripe on the step standard with its treads labelled; EvaluationError where it does not show two."""
     standard = step.standard
     return label_step(
         calibration,

@@ -2,7 +2,7 @@
 
 import math
 import re
-from typing import Any
+from typing import Any, TypeGuard
 
 from uwlts.report.page_toolkit import MISSING
 
@@ -50,7 +50,7 @@ def words_of(name: str) -> str:
     return re.sub(r"_+", " ", bare)
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value from JSON is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 

@@ -429,9 +429,9 @@ def residual_lists(calibration: Calibration) -> list[ResidualList]:
     for group, name, values in _lists(calibration.residuals_in_file(), ""):
         if len(values) > SHORT_LIST and any(is_number(value) for value in values):
             images = calibration.figures(group).get("images")
-            named = isinstance(images, list) and len(images) == len(values) and all(isinstance(i, str) for i in images)
+            names = [image for image in images if isinstance(image, str)] if isinstance(images, list) else []
             numbers = tuple(value if is_number(value) else None for value in values)
-            found.append(ResidualList(group, name, numbers, tuple(images) if named and images else ()))
+            found.append(ResidualList(group, name, numbers, tuple(names) if len(names) == len(values) else ()))
     return found
 
 
@@ -493,8 +493,9 @@ def window_curves(
         if curve is None:
             continue
         colour, label, least = COLOURS[number % len(COLOURS)], plain_text(name), None
-        errors = calibration.figures("window").get("errors_mm")
-        if calibration.window is not None and isinstance(errors, list) and errors and all(map(is_number, errors)):
+        stored = calibration.figures("window").get("errors_mm")
+        errors = [error for error in stored if is_number(error)] if isinstance(stored, list) else []
+        if calibration.window is not None and errors and len(errors) == len(stored):
             # The tried distances are too coarse to meet the bottom of the valley.
             least = calibration.window.distance_mm, float(np.sqrt(np.mean(np.square(errors))))
             curve = np.vstack([curve, least])

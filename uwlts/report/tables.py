@@ -198,7 +198,7 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
 
 def _camera_std(calibration: Calibration) -> dict[str, float]:
     std = calibration.figures("camera").get("std")
-    return {name: value for name, value in std.items() if is_number(value)} if isinstance(std, dict) else {}
+    return {key: each for key, each in std.items() if is_number(each)} if isinstance(std, dict) else {}
 
 
 def _with_std(value: float, std: float | None, decimals: int) -> str:

@@ -14,9 +14,8 @@ from uwlts.model.sensor import Sensor
 from uwlts.optics.camera import directions
 from uwlts.targets import Target
 
-TILT_RAD = np.radians(25.0)
-_PLACES = (0.2, 0.5, 0.8)
-_DEPTHS = (0.1, 0.5, 0.9)
+TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles stay detectable
+_PLACES, _DEPTHS = (0.2, 0.5, 0.8), (0.1, 0.5, 0.9)  # shares of the image and of the working range, inside both
 _MARGIN_PX = 10.0  # of the image, in which circles would be cut
 _SAMPLE = 100  # points of a candidate that stand for all: more repeat what these say
 

@@ -29,8 +29,8 @@ from uwlts.targets import TargetView
 _USUAL_SIGMA_PX, _LEAST_SIGMA_PX = 0.1, 0.02
 # What is known of a described lens before anything is seen, as standard deviations: shares of f and of the image's
 # side, and plain coefficients.
-_FOCAL = (LensParameter.F, LensParameter.FX, LensParameter.FY)
-_CENTRE = (LensParameter.CX, LensParameter.CY)
+_FOCAL: tuple[LensParameter, ...] = (LensParameter.F, LensParameter.FX, LensParameter.FY)
+_CENTRE: tuple[LensParameter, ...] = (LensParameter.CX, LensParameter.CY)
 _PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
     LensParameter.K1: 0.3,
     LensParameter.K2: 3.0,
@@ -38,11 +38,12 @@ _PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
     LensParameter.P2: 0.02,
     LensParameter.K3: 10.0,
 }
-_COVERAGE_WEIGHT = 4.0
-_SPREAD_WEIGHT = 0.5
+# A fully uncovered image counts as a factor of 55 in a standard deviation, a side never tilted as one of 1.6.
+_COVERAGE_WEIGHT, _SPREAD_WEIGHT = 4.0, 0.5
 _SIDES = ("right side", "left side", "lower side", "upper side")
 # Decides between poses once everything wanted is reached.
 _BEYOND = 0.05
+# What a hand can keep: closer to the advised pose nothing is said.
 _SAME_TILT_RAD, _SAME_PLACE, _SAME_DISTANCE = np.radians(9.0), 0.15, 0.1
 
 

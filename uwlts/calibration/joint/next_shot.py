@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from uwlts.calibration.joint.estimate import Evidence
 from uwlts.calibration.joint.evidence import TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.noise import Noise, with_slope_bias
 from uwlts.calibration.joint.observability import (
-    Lengths,
     Region,
     estimate_in,
     format_weaknesses,
@@ -31,6 +31,7 @@ from uwlts.targets import Target, parse_target
 
 _FEWEST_POINTS, _FEWEST_LINES = 20, 20  # an image with less determines its own pose poorly
 _SAMPLES = 400  # of a curve; more than the image of one needs for a point on each of its lines to be interpolated
+# A step standard and spheres as the thesis used them, in size; more images of a sphere say nothing new.
 STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
 SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
 _SEEN = np.radians(60)
@@ -72,8 +73,7 @@ def target_shot(calibration: Calibration, known: StoredEstimate, target: Target,
         middle_mm=middle,
     )
     local = np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])
-    parts = evidence.residuals(known.parameters, known.values, local)
-    return None if parts is None else Shot(known, parts, np.full(6, np.inf))
+    return _shot(known, evidence, local, Uncertainty())
 
 
 def step_shot(
@@ -109,8 +109,7 @@ def step_shot(
         image=0,
     )
     local = np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
-    parts = evidence.residuals(known.parameters, known.values, local)
-    return None if parts is None else Shot(known, parts, np.full(2, np.inf))
+    return _shot(known, evidence, local, uncertainty)
 
 
 def sphere_shot(
@@ -161,7 +160,13 @@ def sphere_shot(
         source="",
     )
     local = np.concatenate([(centres @ frame[:3, :3].T + frame[:3, 3]).ravel(), np.zeros(SPHERES + len(positions))])
+    return _shot(known, evidence, local, uncertainty)
+
+
+def _shot(known: StoredEstimate, evidence: Evidence, local: np.ndarray, uncertainty: Uncertainty) -> Shot | None:
+    """The shot of some evidence; None where a ray meets nothing."""
     parts = evidence.residuals(known.parameters, known.values, local)
+    lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
     std = evidence.local_std(alignment=lean, position_mm=uncertainty.stage_position_mm)
     return None if parts is None else Shot(known, parts, std)
 
@@ -278,11 +283,8 @@ class Outlook:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    words: str
-    shot: Shot | None
-    pose: np.ndarray | None = None
+_Candidate = tuple[str, Shot | None, np.ndarray | None]
+"""A shot in words, what it would say if it is possible, and the pose of a target."""
 
 
 def next_shots(calibration: Calibration) -> list[Outlook]:
@@ -295,11 +297,12 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
         return []
     known = estimate_in(calibration, region)
     lengths = lengths_over(calibration, known, region)
-    found = [
-        _outlook(calibration, candidate, candidate.shot, lengths, known)
-        for candidate in _candidates(calibration, known, region)
-        if candidate.shot is not None
-    ]
+    count, before_mm, found = len(known.values), _rms(lengths.std_mm(known.covariance)), []
+    for words, shot, pose in _candidates(calibration, known, region):
+        if shot is not None:
+            covariance = _with(shot.known.covariance, information(calibration, shot))[:count, :count]
+            after_mm = _rms(lengths.std_mm(covariance))
+            found.append(Outlook(words, before_mm, after_mm, covariance, shot.known.view, pose))
     return sorted(found, key=lambda outlook: outlook.after_mm)
 
 
@@ -330,21 +333,6 @@ def _noise_of(calibration: Calibration, shot: Shot) -> dict[str, Noise]:
     return found
 
 
-def _outlook(
-    calibration: Calibration, candidate: _Candidate, shot: Shot, lengths: Lengths, known: StoredEstimate
-) -> Outlook:
-    count = len(known.values)
-    covariance = _with(shot.known.covariance, information(calibration, shot))[:count, :count]
-    return Outlook(
-        candidate.words,
-        _rms(lengths.std_mm(known.covariance)),
-        _rms(lengths.std_mm(covariance)),
-        covariance,
-        shot.known.view,
-        candidate.pose,
-    )
-
-
 def _with(covariance: np.ndarray, added: np.ndarray) -> np.ndarray:
     """The covariance with further information, by a root of it, as its inverse may be out of reach of rounding."""
     std = np.sqrt(np.diag(covariance))
@@ -371,10 +359,9 @@ def _candidates(calibration: Calibration, known: StoredEstimate, region: Region)
             yield from _targets(calibration, replace(known, view=in_air[0]), "air", target, depths)
     for words, depth in depths.items():
         place = f"in {region.name}, {words} (Z {depth:+.0f} mm),"
-        yield _Candidate(f"an image of a step {place}", step_shot(calibration, known, depth, uncertainty))
-        yield _Candidate(
-            f"a scan of two spheres of {SPHERE_MM:g} mm {place}", sphere_shot(calibration, known, depth, uncertainty)
-        )
+        yield f"an image of a step {place}", step_shot(calibration, known, depth, uncertainty), None
+        spheres = f"a scan of two spheres of {SPHERE_MM:g} mm {place}"
+        yield spheres, sphere_shot(calibration, known, depth, uncertainty), None
 
 
 def _targets(
@@ -386,7 +373,7 @@ def _targets(
             pose = _pose(calibration, target, depth, turns)
             words = f"an image of the target in {medium}{through}, {where} (Z {depth:+.0f} mm), {tilt}"
             words += "," if tilt == "square" else f" by {_TILT_DEG:g}°,"
-            yield _Candidate(words, target_shot(calibration, known, target, pose), pose)
+            yield words, target_shot(calibration, known, target, pose), pose
 
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:

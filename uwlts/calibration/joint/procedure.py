@@ -155,9 +155,14 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     if against.contradictions:
         raise CalibrationError(against.refusal())
     warnings += against.doubts
-    provenance = gathered.provenance | {"poses": options.poses, "medium_index": options.medium_index}
-    target = gathered.series[0].found.target.model_dump(mode="json")
-    provenance |= {"known_before": sensor.uncertainty.model_dump(), "target": target}
+    provenance: dict[str, JsonValue] = {
+        **gathered.provenance,
+        "poses": options.poses,
+        "medium_index": options.medium_index,
+        "known_before": sensor.uncertainty.model_dump(),
+        "target": gathered.series[0].found.target.model_dump(mode="json"),
+        "warnings": [*warnings],
+    }
     frame = object_frame(parameters.sheet_model(result.values), laser_axis=laser_pose(sensor).axis)
     kept = joint_estimate(result, evidence, sources, frame)
     stages = [
@@ -167,7 +172,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
         )
         for scan in [e for e in evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)][:1]
     ]
-    calibration = _calibration(gathered, result, frame, stages, kept, provenance | {"warnings": warnings})
+    calibration = _calibration(gathered, result, frame, stages, kept, provenance)
     return JointResult(calibration, result, warnings)
 
 
@@ -196,7 +201,7 @@ def _calibration(
             KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
             for number, medium in enumerate(gathered.media.values())
         ),
-        residuals=lens_and_window_figures(result),
+        residuals={**lens_and_window_figures(result)},
         joint=joint,
         provenance=provenance,
     )

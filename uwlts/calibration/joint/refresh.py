@@ -208,15 +208,20 @@ def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -
     refreshed = {
         "digest": calibration_digest(earlier),
         **{key: old.get(key) for key in ("source", "date", "software")},
-        "step_captures": [source["file"] for source in new["step_captures"]],
+        "step_captures": [source["file"] for source in captures_in(new)],
     }
+
+    def more(key: str, added: Sequence[JsonValue]) -> list[JsonValue]:
+        before = old.get(key)
+        return [*(before if isinstance(before, list) else []), *added]
+
     return old | {
         "source": "calibration refreshed in new water",
         "date": new["date"],
         "software": new["software"],
-        "step_captures": [*old.get("step_captures", []), *new["step_captures"]],
-        "refreshed": [*old.get("refreshed", []), refreshed],
-        "warnings": [*old.get("warnings", []), *warnings],
+        "step_captures": more("step_captures", captures_in(new)),
+        "refreshed": more("refreshed", [refreshed]),
+        "warnings": more("warnings", warnings),
     }
 
 

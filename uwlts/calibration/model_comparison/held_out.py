@@ -23,7 +23,7 @@ Image = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
 
 _EVERY = 4  # of the images inside one in so many is held out: enough remain, enough are judged
-_OUTER = 1 / 6
+_OUTER = 1 / 6  # of the depth, at either end
 _FEWEST_KEPT, _FEWEST_HELD = 4, 4  # images; fewer give neither a calibration nor a standard error
 
 

@@ -81,8 +81,8 @@ def test_two_that_cannot_be_told_apart_are_named_together():
     # The standard uncertainty of their sum: 0.01 sqrt(2 + 2 * 0.99).
     assert found[0].cost_mm == pytest.approx(0.01 * np.sqrt(3.98), rel=1e-3)
     said = found[0].words()
-    assert "window distance and index of water cannot be told apart" in said or (
-        "index of water and window distance cannot be told apart" in said
+    assert "window distance and index of water cannot be separated" in said or (
+        "index of water and window distance cannot be separated" in said
     )
     assert "together they cost 0.020 mm in a length of 100 mm along Z" in said
 
