@@ -495,7 +495,8 @@ def window_curves(
         colour, label, least = COLOURS[number % len(COLOURS)], plain_text(name), None
         stored = calibration.figures("window").get("errors_mm")
         errors = [error for error in stored if is_number(error)] if isinstance(stored, list) else []
-        if calibration.window is not None and errors and len(errors) == len(stored):
+        complete = isinstance(stored, list) and 0 < len(errors) == len(stored)
+        if calibration.window is not None and complete:
             # The tried distances are too coarse to meet the bottom of the valley.
             least = calibration.window.distance_mm, float(np.sqrt(np.mean(np.square(errors))))
             curve = np.vstack([curve, least])
