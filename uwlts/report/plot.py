@@ -519,12 +519,14 @@ def has_window_curve(calibrations: Mapping[str, Calibration]) -> bool:
 
 def _window_curve(calibration: Calibration) -> np.ndarray | None:
     """Tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not store them."""
-    rows = calibration.figures("window").get("curve_mm")
-    if not isinstance(rows, list) or not rows or not all(isinstance(row, list) and len(row) == 2 for row in rows):
+    stored = calibration.figures("window").get("curve_mm")
+    rows = stored if isinstance(stored, list) else []
+    curve = [row for row in rows if isinstance(row, list) and len(row) == 2]
+    if not curve or len(curve) < len(rows):
         return None
-    if not all(value is None or is_number(value) for row in rows for value in row):
+    if not all(value is None or is_number(value) for row in curve for value in row):
         return None
-    return np.array(rows, dtype=float)
+    return np.array(curve, dtype=float)
 
 
 def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
