@@ -207,7 +207,7 @@ def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder
 @pytest.mark.parametrize(
     ("stage", "top", "says"),
     [
-        ({"count": 400}, "", "the stage from 0 to"),
+        ({"count": 400}, "", "the stage moves from 0 to"),
         ({"feed_mm_per_min": 1e6}, "", "the stage does at most"),
         ({"step": 1.0}, "", "unknown key"),
         ({}, 'lights = ["moon"]', "lights"),

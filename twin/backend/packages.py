@@ -8,6 +8,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -63,10 +64,11 @@ def obtain(
         nothing_found = error
     target = _writable_folder(folders)
     refusals = []
-    for way, source in ((_install_packages, choose), (_unpack_packages, choose), (_unpack_wheel, wheel)):
+    ways = (partial(_install_packages, choose), partial(_unpack_packages, choose), partial(_unpack_wheel, wheel))
+    for way in ways:
         try:
             with tempfile.TemporaryDirectory() as scratch:
-                way(source, Path(scratch), target, lambda line: report(f"{what}: {line}"))
+                way(Path(scratch), target, lambda line: report(f"{what}: {line}"))
         except SetupError as error:
             refusals.append(f"\n  {error}")
             continue

@@ -18,47 +18,17 @@ import time
 import tty
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import TracebackType
 
 from twin.devices.grbl_firmware import GrblFirmware
 
 # The thesis's bench, as docs/how-to/hardware-stage.md sets it up.
+# fmt: off
 BENCH_SETTINGS: dict[int, float] = {
-    0: 10,
-    1: 255,
-    2: 0,
-    3: 0,
-    4: 0,
-    5: 0,
-    6: 0,
-    10: 1,
-    11: 0.01,
-    12: 0.002,
-    13: 0,
-    20: 1,
-    21: 0,
-    22: 1,
-    23: 1,
-    24: 60,
-    25: 600,
-    26: 25,
-    27: 2,
-    30: 1000,
-    31: 0,
-    32: 1,
-    100: 80,
-    101: 250,
-    102: 250,
-    110: 900,
-    111: 500,
-    112: 500,
-    120: 50,
-    121: 10,
-    122: 10,
-    130: 750,
-    131: 200,
-    132: 200,
+    0: 10, 1: 255, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 10: 1, 11: 0.01, 12: 0.002, 13: 0,
+    20: 1, 21: 0, 22: 1, 23: 1, 24: 60, 25: 600, 26: 25, 27: 2, 30: 1000, 31: 0, 32: 1,
+    100: 80, 101: 250, 102: 250, 110: 900, 111: 500, 112: 500, 120: 50, 121: 10, 122: 10, 130: 750, 131: 200, 132: 200,
 }
+# fmt: on
 _BUSY_MS, _IDLE_MS = 2, 20
 
 
@@ -76,22 +46,10 @@ class StageState:
 class GrblController:
     """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
 
-    Parameters
-    ----------
-    settings : mapping
-        Settings by number, in place of `BENCH_SETTINGS`.
-    position_mm : float
-        Where the stage stands when the power comes on.
-    speed_up : float
-        How much faster than real its time runs.
-    version, options : str
-        What it says it is: 1.1h, and the code letters of its build in ``$I``.
-    boot_s : float
-        Time of its own from a restart to the greeting: the Uno's boot loader.
-    resets_when_opened : bool
-        As the Uno does through DTR.
-    gated : bool
-        Whether the laser's supply is cut while the port is closed.
+    ``settings`` by number replace `BENCH_SETTINGS`. The stage stands at ``position_mm`` when the power comes on, and
+    time runs ``speed_up`` times as fast. ``options`` are the code letters of the build in ``$I``; ``boot_s`` is the
+    controller's own time from a restart to the greeting, that of the Uno's boot loader. ``resets_when_opened``: as the
+    Uno does through DTR. ``gated``: the laser's supply is cut while the port is closed.
     """
 
     def __init__(
@@ -131,9 +89,7 @@ class GrblController:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ending.set()
         self._thread.join()
         self.disconnect()

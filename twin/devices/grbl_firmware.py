@@ -7,35 +7,23 @@ from dataclasses import dataclass
 from twin.devices.grbl_motion import Axis
 
 _WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
-# Command to its modal group; the axis commands of group 0 exclude each other as well.
-_GROUPS = {
-    "G4": "once",
-    "G53": "once",
-    "G92": "once",
-    "G92.1": "once",
-    "G0": "motion",
-    "G1": "motion",
-    "G80": "motion",
-    "G17": "plane",
-    "G90": "distance",
-    "G91": "distance",
-    "G94": "feed",
-    "G20": "units",
-    "G21": "units",
-    "G40": "cutter",
-    "G49": "length",
-    "G54": "system",
-    "G61": "control",
-    "M0": "stop",
-    "M2": "stop",
-    "M30": "stop",
-    "M3": "spindle",
-    "M4": "spindle",
-    "M5": "spindle",
-    "M7": "coolant",
-    "M8": "coolant",
-    "M9": "coolant",
+# Commands by modal group; the axis commands of group 0 exclude each other as well.
+_COMMANDS = {
+    "once": ("G4", "G53", "G92", "G92.1"),
+    "motion": ("G0", "G1", "G80"),
+    "plane": ("G17",),
+    "distance": ("G90", "G91"),
+    "feed": ("G94",),
+    "units": ("G20", "G21"),
+    "cutter": ("G40",),
+    "length": ("G49",),
+    "system": ("G54",),
+    "control": ("G61",),
+    "stop": ("M0", "M2", "M30"),
+    "spindle": ("M3", "M4", "M5"),
+    "coolant": ("M7", "M8", "M9"),
 }
+_GROUPS = {command: group for group, commands in _COMMANDS.items() for command in commands}
 _VALUES = "XFSPNT"
 
 
@@ -110,20 +98,9 @@ _WCO_IDLE, _WCO_BUSY = 10, 30
 class GrblFirmware:
     """One controller. Not safe between threads.
 
-    Parameters
-    ----------
-    settings : mapping
-        All settings by number.
-    position_mm : float
-        Where the stage stands when the power comes on.
-    version, options : str
-        What it says it is, and the code letters of its build.
-    boot_s : float
-        Time from a restart to the greeting.
-    clock : callable
-        Its time in s.
-    say : callable
-        Takes the bytes for the computer.
+    All ``settings`` are given by number. The stage stands at ``position_mm`` when the power comes on. ``options`` are
+    the code letters of the build, ``boot_s`` is the time from a restart to the greeting. ``clock`` returns the
+    controller's time in s, ``say`` takes the bytes for the computer.
     """
 
     def __init__(
@@ -307,13 +284,11 @@ class GrblFirmware:
 
     def _spindle(self, now: float) -> float:
         """The S in force at the pin; laser mode darkens G0 and holds, and M4 while nothing moves."""
-        if self._modal["spindle"] == "M5" or self._mode == "Alarm":
+        at_rest = self.axis.at(now)[1] == 0
+        held = self.axis.held and not self.axis.braking(now)
+        dark = self._modal["motion"] == "G0" or held or (self._modal["spindle"] == "M4" and at_rest)
+        if self._modal["spindle"] == "M5" or self._mode == "Alarm" or (self._settings[32] and dark):
             return 0.0
-        if self._settings[32]:
-            moves = self.axis.at(now)[1] != 0
-            at_rest_by_hold = self.axis.held and not self.axis.braking(now)
-            dark = self._modal["motion"] == "G0" or at_rest_by_hold or (self._modal["spindle"] == "M4" and not moves)
-            return 0.0 if dark else min(self._s, self._settings[30])
         return min(self._s, self._settings[30])
 
     def _done(self) -> Generator[None, None, None]:
@@ -401,9 +376,8 @@ class GrblFirmware:
         if "S" in values or "spindle" in block.commands:
             yield from self._done()
             self._s = values.get("S", self._s)
-        for command in ("M2", "M30"):
-            if block.commands.get("stop") == command:
-                modal |= {"motion": "G1", "distance": "G90", "spindle": "M5"}
+        if block.commands.get("stop") in ("M2", "M30"):
+            modal |= {"motion": "G1", "distance": "G90", "spindle": "M5"}
         if block.commands.get("motion", self._modal["motion"]) != self._modal["motion"]:
             yield from self._done()
         self._modal = {name: modal[name] for name in self._modal}

@@ -18,6 +18,18 @@ _FEWEST_COMMON = 4
 _STRIPE = StripeOptions()
 
 
+class LampFault(str):
+    """A reason against an image that another exposure by the lamp may remove."""
+
+
+class LaserFault(str):
+    """A reason against an image that another exposure by the laser may remove."""
+
+
+class MotionFault(str):
+    """A reason against an image that is gone once the target is at rest."""
+
+
 @dataclass(frozen=True)
 class QualityLimits:
     """What an image must keep to.
@@ -98,13 +110,17 @@ def judge_target(
         )
     if contrast < limits.smallest_contrast:
         reasons.append(
-            f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
-            f"{100 * limits.smallest_contrast:.0f} % are good; more light or a longer lamp_ms"
+            LampFault(
+                f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
+                f"{100 * limits.smallest_contrast:.0f} % are good; more light or a longer lamp_ms"
+            )
         )
     if saturated > limits.largest_saturated:
         reasons.append(
-            f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
-            f"{100 * limits.largest_saturated:.0f} % are good; less light or a shorter lamp_ms"
+            LampFault(
+                f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
+                f"{100 * limits.largest_saturated:.0f} % are good; less light or a shorter lamp_ms"
+            )
         )
     return TargetQuality(count, share, blur, contrast, saturated, tuple(reasons))
 
@@ -131,9 +147,13 @@ def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
     brightest = float(np.quantile(image, 0.995)) / full_dn
     clipped = float(np.mean(image >= full_dn))
     if brightest < 0.1:
-        return f"too dark: the image reaches {100 * brightest:.0f} % of the full scale; more light or a longer lamp_ms"
+        return LampFault(
+            f"too dark: the image reaches {100 * brightest:.0f} % of the full scale; more light or a longer lamp_ms"
+        )
     if clipped > 0.3:
-        return f"saturated: {100 * clipped:.0f} % of the image is at the full scale; less light or a shorter lamp_ms"
+        return LampFault(
+            f"saturated: {100 * clipped:.0f} % of the image is at the full scale; less light or a shorter lamp_ms"
+        )
     return error
 
 
@@ -155,7 +175,8 @@ def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = 
     way = way_px(before, after)
     if way <= limits.largest_motion_px:
         return ()
-    return (f"moved: the target went {way:.1f} px between its images, at most {limits.largest_motion_px:g} are good",)
+    most = limits.largest_motion_px
+    return (MotionFault(f"moved: the target went {way:.1f} px between its images, at most {most:g} are good"),)
 
 
 def judge_novelty(
@@ -195,7 +216,8 @@ def judge_stripe(
     saturated = float(clipped.sum()) / lit
     reasons = ()
     if lit >= limits.fewest_lines and saturated > 0.05:
-        reasons = (f"stripe saturated on {100 * saturated:.0f} % of its lines, at most 5 % are good; shorten laser_ms",)
+        share = f"{100 * saturated:.0f} % of its lines, at most 5 % are good"
+        reasons = (LaserFault(f"stripe saturated on {share}; shorten laser_ms"),)
     return StripeQuality(pixels[on_target], saturated, reasons)
 
 

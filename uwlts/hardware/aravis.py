@@ -5,7 +5,6 @@ import os
 import socket
 import stat
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
@@ -16,7 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
+from uwlts.hardware.camera import (
+    BUFFERS,
+    MONO_BITS,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    Delivered,
+    Region,
+    RequestedSettings,
+)
 from uwlts.model.errors import HardwareError
 from uwlts.runtime.shared_library import load_aravis
 
@@ -120,14 +128,10 @@ class AravisFunctions:
         return "" if value is None else value.decode(errors="replace")
 
 
-# Frames that may wait to be fetched; at 60 frames/s half a second.
-_BUFFERS = 32
-# A wait in the library holds up Ctrl-C.
-_WAIT_S = 0.1
-# Packed formats are left out: hardly any camera offers them alone.
-_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
-_MONO8 = "Mono8"
+_ANSWER_S = 0.1
+"""A camera on this machine answers a search within some ms."""
 _SOCKET_BYTES = 2**23
+"""Room for the packets of some frames of 1280 x 1024 px."""
 # GigE Vision's discovery command: key, acknowledge, command 2, no content, request 1.
 _DISCOVERY = b"\x42\x01\x00\x02\x00\x00\x00\x01"
 _LOOPBACK, _CONTROL_PORT = "127.0.0.1", 3956
@@ -169,7 +173,7 @@ def list_aravis_cameras() -> list[FoundCamera]:
 def _served_on_loopback() -> list[FoundCamera]:
     """The camera that a program on this machine plays, which a search by broadcast does not reach."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        asking.settimeout(_WAIT_S)
+        asking.settimeout(_ANSWER_S)
         try:
             asking.connect((_LOOPBACK, _CONTROL_PORT))
             asking.send(_DISCOVERY)
@@ -208,7 +212,7 @@ class AravisCamera(Camera):
                 self._functions.text(self._call(f"get_{part}")) or "?"
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
-            bits = _BITS.get(self._pixel_format(), 8)
+            bits = MONO_BITS.get(self._pixel_format(), 8)
         except BaseException:
             self._close()
             raise
@@ -270,7 +274,7 @@ class AravisCamera(Camera):
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
             region=Region(*self._numbers("get_region", 4)),
-            bits=_BITS[self._pixel_format()],
+            bits=MONO_BITS[self._pixel_format()],
             trigger=requested.trigger,
             frame_rate_hz=rate if requested.trigger == "free" else None,
         )
@@ -296,16 +300,11 @@ class AravisCamera(Camera):
         return bool(self._call(f"is_{feature}_available"))
 
     def _set_pixel_format(self, bits: int | None) -> None:
-        """Grey values of so many bits; without a wish the format stays if it is a grey one, else 8 bits are taken."""
-        if bits is None and self._pixel_format() in _BITS:
-            return
-        wanted = _MONO8 if bits is None else f"Mono{bits}"
         count = ctypes.c_uint()
         names = self._call("dup_available_pixel_formats_as_strings", ctypes.byref(count))
         offered = [names[index].decode() for index in range(count.value)]
         self._functions.g_free(names)
-        if wanted not in offered or wanted not in _BITS:
-            raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
+        wanted = self._grey_format(bits, self._pixel_format(), offered)
         self._call("set_pixel_format_from_string", wanted.encode())
 
     def _pixel_format(self) -> str:
@@ -317,7 +316,7 @@ class AravisCamera(Camera):
         payload = self._call("get_payload")
         if functions.arv_camera_is_gv_device(self._camera):
             _widen(functions.arv_gv_stream_get_port(self._stream))
-        for _ in range(_BUFFERS):
+        for _ in range(BUFFERS):
             functions.arv_stream_push_buffer(self._stream, functions.arv_buffer_new(payload, None))
         self._call("start_acquisition")
 
@@ -334,14 +333,9 @@ class AravisCamera(Camera):
 
     def _next(self, timeout_s: float) -> Delivered | None:
         functions, stream = self._functions, self._stream
-        deadline = time.monotonic() + timeout_s
-        while True:
-            left_s = max(deadline - time.monotonic(), 0.0)
-            buffer = functions.arv_stream_timeout_pop_buffer(stream, int(1e6 * min(left_s, _WAIT_S)))
-            if buffer is not None:
-                break
-            if left_s <= _WAIT_S:
-                return None
+        buffer = functions.arv_stream_timeout_pop_buffer(stream, int(1e6 * timeout_s))
+        if buffer is None:
+            return None
         try:
             return self._delivered(buffer)
         finally:
@@ -377,10 +371,7 @@ class AravisCamera(Camera):
         result, complaint = self._functions.checked(f"arv_camera_{name}", *receiver, *arguments)
         if complaint is not None:
             self._gone = self._gone or "timeout" in complaint
-            raise HardwareError(
-                f"the camera {self.address} failed at '{name.replace('_', ' ')}': {complaint}. If it does not answer, "
-                "check power and cable, and whether another program uses it"
-            )
+            raise self._failed(f"'{name.replace('_', ' ')}'", complaint)
         return result
 
 
@@ -390,23 +381,15 @@ def _widen(port: int) -> None:
     Aravis does so only once the first frame has come, too late for it and for all others if its first packet was lost.
     Aravis gives the port of its socket, but not the socket.
     """
-    for number in _open_sockets():
-        with socket.socket(fileno=os.dup(number)) as same:
-            if same.family == socket.AF_INET and same.getsockname()[1] == port:
-                same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)
-
-
-def _open_sockets() -> list[int]:
-    """Numbers of this process's sockets; none where the system does not list them."""
     folder = Path("/proc/self/fd")
-    numbers = [int(entry.name) for entry in folder.iterdir()] if folder.is_dir() else []
-    found = []
-    for number in numbers:
+    for number in [int(entry.name) for entry in folder.iterdir()] if folder.is_dir() else []:
         # The folder's own number is gone by now.
         with suppress(OSError):
-            if stat.S_ISSOCK(os.fstat(number).st_mode):
-                found.append(number)
-    return found
+            if not stat.S_ISSOCK(os.fstat(number).st_mode):
+                continue
+            with socket.socket(fileno=os.dup(number)) as same:
+                if same.family == socket.AF_INET and same.getsockname()[1] == port:
+                    same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)
 
 
 def _is_ip_address(name: str) -> bool:

@@ -10,10 +10,10 @@ twice, come late, or leave out frames that were lost in transfer.
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from types import TracebackType
 from typing import Literal, Self
 
 import numpy as np
@@ -22,6 +22,12 @@ from uwlts.model.errors import HardwareError
 
 Trigger = Literal["free", "software", "line"]
 
+BUFFERS = 32
+"""Frames that may wait in a driver to be fetched; at 60 frames/s half a second. Later ones are lost."""
+MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
+"""Bits of the grey formats. Packed ones are left out: hardly any camera offers them alone, harvesters unpacks none."""
+_WAIT_S = 0.1
+"""A wait in a driver's library holds up Ctrl-C, so it lasts no longer."""
 # GigE Vision 1.x counts frames in 16 bits and leaves out 0.
 _COUNTER_16_BIT = 2**16 - 1
 
@@ -56,10 +62,8 @@ class FrameCounts:
 class FrameCheck:
     """Compares each frame with the one before.
 
-    Parameters
-    ----------
-    period_s : float, optional
-        Time between frames of a free-running camera in s; without it no frame is late by its time stamp.
+    ``period_s`` is the time between frames of a free-running camera in s; without it no frame is late by its time
+    stamp.
     """
 
     def __init__(self, *, period_s: float | None = None):
@@ -334,7 +338,7 @@ class Camera(ABC):
         self._require_running()
         deadline = time.monotonic() + timeout_s
         while True:
-            delivered = self._next(max(deadline - time.monotonic(), 0.0))
+            delivered = self._wait(deadline)
             if delivered is None:
                 raise self._no_frame(timeout_s)
             status = self._check.judge(
@@ -345,6 +349,13 @@ class Camera(ABC):
                 return self._grabbed(delivered.image, delivered, status)
             if not self._skip:
                 raise HardwareError(f"frame {delivered.frame_id} of the camera {self.address} is {_MEANING[status]}")
+
+    def _wait(self, deadline: float) -> Delivered | None:
+        while True:
+            left_s = max(deadline - time.monotonic(), 0.0)
+            delivered = self._next(min(left_s, _WAIT_S))
+            if delivered is not None or left_s <= _WAIT_S:
+                return delivered
 
     def _grabbed(self, image: np.ndarray, delivered: Delivered, status: FrameStatus) -> GrabbedFrame:
         region = self.settings.region
@@ -377,6 +388,20 @@ class Camera(ABC):
             f"the camera {self.address} gave no frame within {timeout_s:g} s though it answers commands: {advice}"
         )
 
+    def _failed(self, doing: str, error: object) -> HardwareError:
+        """The error of a driver's library."""
+        return HardwareError(
+            f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "
+            "whether another program uses it"
+        )
+
+    def _grey_format(self, bits: int | None, current: str, offered: Sequence[str]) -> str:
+        """The pixel format for so many bits; for None the current one if it is grey, else that of 8 bits."""
+        wanted = current if bits is None and current in MONO_BITS else f"Mono{bits or 8}"
+        if wanted not in offered or wanted not in MONO_BITS:
+            raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
+        return wanted
+
     def _require_running(self) -> None:
         if not self._started:
             raise HardwareError(f"the camera {self.address} does not run: call start() first")
@@ -385,9 +410,7 @@ class Camera(ABC):
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @abstractmethod
@@ -400,7 +423,7 @@ class Camera(ABC):
 
     @abstractmethod
     def _configure(self, requested: RequestedSettings) -> CameraSettings:
-        """Set what is wished, and read back what came of it."""
+        """Set what is asked for, and read back what came of it."""
 
     @abstractmethod
     def _start(self) -> None:
@@ -416,7 +439,7 @@ class Camera(ABC):
 
     @abstractmethod
     def _next(self, timeout_s: float) -> Delivered | None:
-        """The next frame, None after so many seconds without one; Ctrl-C must get through within 0.2 s."""
+        """The next frame, None after so many seconds, at most 0.1, without one."""
 
     @abstractmethod
     def _answers(self) -> None:

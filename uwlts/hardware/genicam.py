@@ -5,7 +5,6 @@ XIMEA's producer for the thesis's camera is among them, and so are those of Basl
 
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,14 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
+from uwlts.hardware.camera import (
+    BUFFERS,
+    MONO_BITS,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    Delivered,
+    Region,
+    RequestedSettings,
+)
 from uwlts.model.errors import HardwareError, SetupError
 
-# A wait in the producer holds up Ctrl-C.
-_WAIT_S = 0.1
-_BUFFERS = 32
-# Packed formats are left out, which harvesters does not unpack.
-_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 # GenApi's access modes count: not implemented, not available, write only, read only, both.
 _WRITE_ONLY = 2
 # Names after the standard, then those in use before it.
@@ -52,11 +55,10 @@ class GenicamCamera(Camera):
             )
         self._harvester = core.Harvester()
         try:
-            info = self._connect(self._harvester)
+            return self._connect(self._harvester)
         except BaseException:
             self._close()
             raise
-        return info
 
     def _connect(self, harvester: Any) -> CameraInfo:
         harvester.add_file(str(self._producer))
@@ -72,9 +74,9 @@ class GenicamCamera(Camera):
                 )
             with _own_interrupt():
                 self._open_acquirer = harvester.create(found.index(fitting[0]))
-            self._acquirer.num_buffers = _BUFFERS
+            self._acquirer.num_buffers = BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
-            bits = _BITS.get(self._node("PixelFormat").value, 8)
+            bits = MONO_BITS.get(self._node("PixelFormat").value, 8)
         except self._faults as error:
             raise self._failed("opening it", error) from error
         return CameraInfo(f"{fitting[0].vendor} {fitting[0].model}", fitting[0].serial_number, width, height, bits)
@@ -118,20 +120,16 @@ class GenicamCamera(Camera):
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
             region=region,
-            bits=_BITS[self._node("PixelFormat").value],
+            bits=MONO_BITS[self._node("PixelFormat").value],
             trigger=requested.trigger,
             frame_rate_hz=rate if requested.trigger == "free" else None,
         )
 
     def _set_pixel_format(self, bits: int | None) -> None:
-        """Grey values of so many bits; without a wish the format stays if it is a grey one, else 8 bits are taken."""
         node = self._node("PixelFormat")
-        if bits is None and node.value in _BITS:
-            return
-        wanted = f"Mono{bits or 8}"
-        if wanted not in node.symbolics or wanted not in _BITS:
-            raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(node.symbolics)}")
-        node.value = wanted
+        wanted = self._grey_format(bits, node.value, node.symbolics)
+        if node.value != wanted:
+            node.value = wanted
 
     def _set_region(self, region: Region | None) -> None:
         wanted = region or Region(0, 0, self.info.width_px, self.info.height_px)
@@ -206,17 +204,12 @@ class GenicamCamera(Camera):
             raise self._failed("triggering it", error) from error
 
     def _next(self, timeout_s: float) -> Delivered | None:
-        deadline = time.monotonic() + timeout_s
-        while True:
-            left_s = max(deadline - time.monotonic(), 0.0)
-            try:
-                buffer = self._acquirer.fetch(timeout=min(left_s, _WAIT_S))
-                break
-            except self._timeout:
-                if left_s <= _WAIT_S:
-                    return None
-            except self._faults as error:
-                raise self._failed("waiting for a frame", error) from error
+        try:
+            buffer = self._acquirer.fetch(timeout=timeout_s)
+        except self._timeout:
+            return None
+        except self._faults as error:
+            raise self._failed("waiting for a frame", error) from error
         try:
             return self._delivered(buffer)
         finally:
@@ -240,12 +233,6 @@ class GenicamCamera(Camera):
             self._whole("Width")
         except self._faults as error:
             raise self._failed("asking it", error) from error
-
-    def _failed(self, doing: str, error: BaseException) -> HardwareError:
-        return HardwareError(
-            f"the camera {self.address} failed at {doing}: {error}. If it does not answer, check power and cable, and "
-            "whether another program uses it"
-        )
 
 
 @contextmanager

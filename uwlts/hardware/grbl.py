@@ -44,23 +44,9 @@ _PIN_MARGIN_MM = 0.5
 class GrblStage:
     """A stage, open from construction on; a context manager that leaves the laser off. Not safe between threads.
 
-    Parameters
-    ----------
-    port : str
-        Serial port, such as /dev/ttyACM0.
-    baud : int
-        Grbl 1.1 speaks 115200.
-    boot_s : float
-        How long a controller that restarts when the port is opened may take.
-
-    Attributes
-    ----------
-    settings : GrblSettings
-        What ``$$`` says.
-    version : str
-        Grbl's version.
-    limits_mm : tuple
-        Lowest and highest position.
+    ``port`` is a serial port such as /dev/ttyACM0; ``boot_s`` is how long a controller that restarts when the port is
+    opened may take. Attributes are the ``settings`` as ``$$`` reports them, Grbl's ``version``, and ``limits_mm``, the
+    lowest and the highest position.
 
     Raises
     ------
@@ -91,11 +77,10 @@ class GrblStage:
             )
         travel = self.settings.travel_mm
         zero_at_switch = "Z" in options
-        self._origin_mm = 0.0 if not self.settings.homing or (zero_at_switch and self._switch_is_low()) else -travel
+        self._origin_mm = (
+            0.0 if not self.settings.homing or (zero_at_switch and self.settings.homes_to_negative) else -travel
+        )
         self.limits_mm = (0.0, travel) if self.settings.homing else (-travel, travel)
-
-    def _switch_is_low(self) -> bool:
-        return self.settings.homes_to_negative
 
     @property
     def position_known(self) -> bool:
@@ -121,11 +106,8 @@ class GrblStage:
         self._recover()
         if self._power:
             self.laser(False)
-        seek, feed, pull_off = (
-            settings.homing_seek_mm_per_min / 60,
-            settings.homing_feed_mm_per_min / 60,
-            settings.homing_pull_off_mm,
-        )
+        seek, feed = settings.homing_seek_mm_per_min / 60, settings.homing_feed_mm_per_min / 60
+        pull_off = settings.homing_pull_off_mm
         # Grbl seeks over 1.5 times the travel and then, twice the pull-off at the seek rate, 5 times it at the feed.
         longest_s = (1.5 * settings.travel_mm + 2 * pull_off) / seek + 5 * pull_off / feed
         longest_s += 4 * (settings.homing_debounce_ms / 1000 + seek / settings.acceleration_mm_per_s2)
@@ -180,7 +162,7 @@ class GrblStage:
         reached_mm = self._rest()
         missing = round((reached_mm - position_mm) * self.settings.steps_per_mm)
         if abs(missing) > 1:
-            raise self._failed(
+            raise self._line.failed(
                 f"missed steps: {reached_mm:.3f} mm read back where {position_mm:.3f} mm was asked for, {missing:+d} "
                 "steps; a command or pulses were lost: check the wiring for interference, then home"
             )
@@ -200,7 +182,9 @@ class GrblStage:
         while (report := self._line.status()).state != "Idle":
             self._refuse_stop(report)
             if time.monotonic() > deadline:
-                raise self._failed(f"the controller is in the state {report.state} although its movements are done")
+                raise self._line.failed(
+                    f"the controller is in the state {report.state} although its movements are done"
+                )
             time.sleep(POLL_S / 5)
         return self._position_of(report)
 
@@ -217,7 +201,7 @@ class GrblStage:
                 # The report is rounded to 1 um; what the controller counts is steps.
                 return round(machine_mm * self.settings.steps_per_mm) / self.settings.steps_per_mm - self._origin_mm
             report = self._line.status()
-        raise self._failed("work positions without their offset (WCO) are reported: send $10=1")
+        raise self._line.failed("work positions without their offset (WCO) are reported: send $10=1")
 
     def _refuse_stop(self, report: Status) -> None:
         """Raise for a state in which a movement will not end, and for a switch pressed where it should not be."""
@@ -230,16 +214,16 @@ class GrblStage:
             "Jog": "jogging",
         }
         if report.state in advice:
-            raise self._failed(f"the controller has stopped: {advice[report.state]}")
+            raise self._line.failed(f"the controller has stopped: {advice[report.state]}")
         self._refuse_pressed_switch(report)
 
     def _refuse_pressed_switch(self, report: Status) -> None:
         if not self.settings.homing or "X" not in report.pins:
             return
         position_mm = self._position_of(report)
-        switch_mm = 0.0 if self._switch_is_low() else self.settings.travel_mm
+        switch_mm = 0.0 if self.settings.homes_to_negative else self.settings.travel_mm
         if abs(position_mm - switch_mm) > self.settings.homing_pull_off_mm + _PIN_MARGIN_MM:
-            raise self._failed(
+            raise self._line.failed(
                 f"missed steps: the limit switch at {switch_mm:g} mm is pressed where {position_mm:.3f} mm is counted: "
                 "the motor lost steps (feed or acceleration too high, or something is in the way); home"
             )
@@ -272,7 +256,9 @@ class GrblStage:
             self._see_spindle(0.0)
             return
         if not self._line.guarded:
-            raise self._failed("the process that switches the laser off after a crash is gone; open the stage again")
+            raise self._line.failed(
+                "the process that switches the laser off after a crash is gone; open the stage again"
+            )
         speed = max(1, round(power * self.settings.spindle_max))
         # In laser mode ($32=1) the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
         self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
@@ -283,7 +269,7 @@ class GrblStage:
     def _see_spindle(self, expected: float) -> None:
         report = self._line.status()
         if report.spindle is not None and abs(report.spindle - expected) > 1:
-            raise self._failed(
+            raise self._line.failed(
                 f"the laser's pin does not follow: S{report.spindle:g} is reported where S{expected:g} was sent "
                 f"(state {report.state}): a hold, an override of the spindle, or $31 above it"
             )
@@ -301,7 +287,7 @@ class GrblStage:
         # Hold:1 brakes, Hold:0 has come to rest.
         while (report := self._line.status()).state in ("Run", "Hold", "Jog") and report.substate != 0:
             if time.monotonic() > deadline:
-                raise self._failed(f"the stage does not stop on a feed hold, its state is {report.state}")
+                raise self._line.failed(f"the stage does not stop on a feed hold, its state is {report.state}")
             time.sleep(POLL_S / 5)
         self._held = True
         if reset:
@@ -311,9 +297,6 @@ class GrblStage:
     def close(self, error: BaseException | None = None) -> None:
         """Switch the laser off and close the port; HardwareError where the controller does not confirm."""
         self._line.close(error)
-
-    def _failed(self, what: str) -> HardwareError:
-        return self._line.failed(what)
 
     def __enter__(self) -> "GrblStage":
         return self
@@ -337,7 +320,7 @@ class _MotionWatch:
         if report.state != "Run" or not math.isclose(position_mm, self._last_mm, abs_tol=1e-9):
             self._last_mm, self._since = position_mm, now
         elif now - self._since > self._patience_s:
-            raise self._stage._failed(
+            raise self._stage._line.failed(
                 f"stall: the stage has stood at {position_mm:.3f} mm for {now - self._since:.1f} s although the "
                 "controller says it runs: restart the controller, then home"
             )

@@ -150,7 +150,6 @@ class GrblSettings:
     acceleration_mm_per_s2: float
     travel_mm: float
     soft_limits: bool
-    hard_limits: bool
     homing: bool
     homes_to_negative: bool
     homing_feed_mm_per_min: float
@@ -158,8 +157,6 @@ class GrblSettings:
     homing_debounce_ms: float
     homing_pull_off_mm: float
     spindle_max: float
-    spindle_min: float
-    laser_mode: bool
 
     @property
     def step_mm(self) -> float:
@@ -186,7 +183,6 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
         acceleration_mm_per_s2=values[120],
         travel_mm=values[130],
         soft_limits=values[20] != 0,
-        hard_limits=values[21] != 0,
         homing=values[22] != 0,
         homes_to_negative=bool(int(values[23]) & 1),
         homing_feed_mm_per_min=values[24],
@@ -194,8 +190,6 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
         homing_debounce_ms=values[26],
         homing_pull_off_mm=values[27],
         spindle_max=values[30],
-        spindle_min=values[31],
-        laser_mode=values[32] != 0,
     )
 
 
@@ -207,8 +201,7 @@ def alarm_text(code: int) -> str:
 
 def refusal_text(code: int) -> str:
     """What an ``error:N`` means and, where the operator can do something, what."""
-    meaning, advice = _ERRORS.get(code, "unknown to Grbl 1.1"), _ADVICE.get(code)
-    return f"error:{code}, {meaning}" + (f"; {advice}" if advice else "")
+    return f"error:{code}, {_ERRORS.get(code, 'unknown to Grbl 1.1')}"
 
 
 _HOME = "the position is lost: see why it happened, then home"
@@ -232,19 +225,19 @@ _ERRORS = {
     2: "a number is missing or malformed",
     3: "unknown $ command",
     4: "negative value",
-    5: "homing is disabled",
+    5: "homing is disabled; wire the limit switch and send $22=1",
     6: "the step pulse must be longer than 3 us",
-    7: "the EEPROM could not be read; its defaults are restored",
-    8: "this $ command needs an idle controller",
-    9: "locked by an alarm",
-    10: "soft limits need homing",
+    7: "the EEPROM could not be read; its defaults are restored; check all settings with $$: any may have changed",
+    8: "this $ command needs an idle controller; wait until it is at rest",
+    9: "locked by an alarm; home (or unlock where the position is known)",
+    10: "soft limits need homing; send $22=1 first",
     11: "line too long",
-    12: "the step rate would exceed 30 kHz",
-    13: "the safety door is open",
+    12: "the step rate would exceed 30 kHz; lower the greatest feed $110",
+    13: "the safety door is open; close it",
     14: "line too long for the EEPROM",
     15: "the jog's target exceeds the travel",
     16: "invalid jog command",
-    17: "laser mode needs a PWM output",
+    17: "laser mode needs a PWM output; flash a Grbl with variable spindle",
     20: "unsupported G-code",
     21: "two commands of one modal group",
     22: "no feed rate",
@@ -265,17 +258,6 @@ _ERRORS = {
     37: "invalid axis for G43.1",
     38: "tool number too large",
 }
-_ADVICE = {
-    5: "wire the limit switch and send $22=1",
-    7: "check every setting with $$: they may all have changed",
-    8: "wait until it is at rest",
-    9: "home (or unlock where the position is known)",
-    10: "send $22=1 first",
-    12: "lower the greatest feed $110",
-    13: "close it",
-    17: "flash a Grbl with variable spindle",
-}
-
 
 SOFT_RESET, STATUS_QUERY, FEED_HOLD = b"\x18", b"?", b"!"
 ANSWER_S = 2.0
@@ -297,14 +279,8 @@ _QUERIES = 3
 class GrblLine:
     """An open line to a controller of version 1.1, just restarted. Not safe between threads.
 
-    Parameters
-    ----------
-    port : str
-        Serial port, such as /dev/ttyACM0.
-    baud : int
-        Grbl 1.1 speaks 115200.
-    boot_s : float
-        How long the greeting of a controller that restarts when the port is opened may take; then Ctrl-X asks for it.
+    ``port`` is a serial port such as /dev/ttyACM0. ``boot_s`` is how long the greeting of a controller that restarts
+    when the port is opened may take; then Ctrl-X asks for it.
 
     Raises
     ------

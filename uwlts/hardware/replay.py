@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
+from uwlts.hardware.camera import BUFFERS, Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
 from uwlts.model.errors import HardwareError, ImageError
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_.images import SUFFIXES, read_image
-
-# Frames that may wait to be fetched, as in the buffers of a camera's driver; later ones are lost.
-_BUFFERS = 32
 
 
 class ReplayCamera(Camera):
@@ -106,7 +103,7 @@ class ReplayCamera(Camera):
     def _wait_for_frame(self, timeout_s: float, period_s: float) -> float | None:
         """Time of the next frame once it has come; None if it does not come in time."""
         now_s = time.monotonic()
-        lost = int((now_s - self._began_s) / period_s) - self._due - _BUFFERS
+        lost = int((now_s - self._began_s) / period_s) - self._due - BUFFERS
         if lost > 0:
             self._due, self._shown = self._due + lost, self._shown + lost
         stamp_s = self._began_s + self._due * period_s

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from pydantic import JsonValue
 
+import uwlts
 from uwlts.hardware.camera import Camera, GrabbedFrame
-from uwlts.hardware.scan_plan import Light, ScanPlan
+from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings, Table
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.stripe import StripeStatus, extract_stripe
@@ -122,6 +124,19 @@ _RUN_UP_MM = 1.0
 """More than the play of a ball screw or belt."""
 
 
+def provenance_of(plan: RigPlan, camera: Camera, *, source: str, stage: str, **more: JsonValue) -> Table:
+    """Where the images of a capture come from."""
+    return {
+        "source": source,
+        "title": plan.title,
+        "camera": f"{camera.info.name} {camera.info.serial}".strip(),
+        "stage": stage,
+        **more,
+        "laser_power": plan.laser_power,
+        "uwlts": uwlts.__version__,
+    }
+
+
 class LaserStage(Protocol):
     """What a rig needs of a stage and its laser; positions in mm."""
 
@@ -151,38 +166,35 @@ class LaserStage(Protocol):
 class Rig:
     """Takes the images of a plan one by one. The laser is on for its own images only.
 
-    Attributes
-    ----------
-    repeated : int
-        Images that were asked for again, as their frames were lost or damaged on their way.
+    ``ahead`` is the direction in which the stage reaches every position, 1 or -1, so that play of the drive does not
+    show. ``repeated`` counts images that were asked for again, as their frames were lost or damaged on their way.
     """
 
-    def __init__(self, plan: ScanPlan, sensor: Sensor, camera: Camera, stage: LaserStage):
+    def __init__(
+        self, plan: RigPlan, settings: StageSettings, sensor: Sensor, camera: Camera, stage: LaserStage, *, ahead: float
+    ):
         self._plan, self._bits, self._camera, self._stage = plan, sensor.detector.bits, camera, stage
-        self._settle_s = sensor.stage.settling_s if plan.stage.settle_s is None else plan.stage.settle_s
+        self._feed_mm_per_min, self._ahead = settings.feed_mm_per_min, math.copysign(1.0, ahead)
+        self._settle_s = sensor.stage.settling_s if settings.settle_s is None else settings.settle_s
         self._position_mm: float | None = None
         self._read_back_mm = stage.position_mm()
         self._exposure_ms: float | None = None
         self.repeated = 0
 
     def move_to(self, position_mm: float) -> float:
-        """Move with the laser off and let the stage settle; the position read back in mm.
-
-        Every position is reached in the direction of the plan, so that play of the drive does not show.
-        """
+        """Move with the laser off and let the stage settle; the position read back in mm."""
         if self._position_mm is None or abs(self._position_mm - position_mm) > 1e-9:
             self._laser(False)
-            ahead = 1.0 if self._plan.stage.step_mm >= 0 else -1.0
-            if (position_mm - self._read_back_mm) * ahead < 0:
+            if (position_mm - self._read_back_mm) * self._ahead < 0:
                 low, high = self._stage.limits_mm
-                self._move(min(max(position_mm - ahead * _RUN_UP_MM, low), high))
+                self._move(min(max(position_mm - self._ahead * _RUN_UP_MM, low), high))
             self._read_back_mm = self._move(position_mm)
             time.sleep(self._settle_s)
             self._position_mm = position_mm
         return self._read_back_mm
 
     def _move(self, position_mm: float) -> float:
-        return self._stage.move_to(position_mm, feed_mm_per_min=self._plan.stage.feed_mm_per_min)
+        return self._stage.move_to(position_mm, feed_mm_per_min=self._feed_mm_per_min)
 
     def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
         """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says."""

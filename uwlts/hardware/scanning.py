@@ -10,18 +10,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-import uwlts
 from uwlts.hardware.camera import Camera
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, settled_exposure
-from uwlts.hardware.scan_plan import Light, ScanPlan, check_plan, load_plan
+from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, provenance_of, settled_exposure
+from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import (
     LOOKS,
     LaserWatch,
@@ -206,27 +204,22 @@ def record_scan(
     """
     sensor = plan.described_sensor()
     check_camera(camera, sensor)
-    check_plan(plan, limits_mm=stage.limits_mm, fastest_mm_per_min=stage.settings.max_feed_mm_per_min)
+    plan.check(stage)
     dtype = np.dtype(np.uint16) if plan.background or camera.info.bits > 8 else np.dtype(np.uint8)
     shots, seen = shots_of(plan), Seen()
-    provenance = {
-        "source": "scan",
-        "title": plan.title,
-        "camera": f"{camera.info.name} {camera.info.serial}".strip(),
-        "stage": f"Grbl {stage.version}",
-        "images": len(shots),
-        "background": plan.background,
-        "laser_power": plan.laser_power,
-        "uwlts": uwlts.__version__,
-    }
-    before_s = _recorded(part_path(out), seen) if resume else 0.0
+    version = f"Grbl {stage.version}"
+    provenance = provenance_of(
+        plan, camera, source="scan", stage=version, images=len(shots), background=plan.background
+    )
+    seen.exposure_ms, before_s = left_over(out) if resume else ({}, 0.0)
     with CaptureWriter(
         out, plan.header(out.stem, provenance=provenance), dtype=dtype, overwrite=overwrite, resume=resume
     ) as writer:
         begun = len(writer)
         if begun == len(shots):
             return seen
-        taking = _Taking(plan, sensor, Rig(plan, sensor, camera, stage), seen, warn)
+        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
+        taking = _Taking(plan, sensor, rig, seen, warn)
         taking.settle_exposures()
         start_s = time.monotonic() - before_s
         for shot in shots[begun:]:
@@ -247,14 +240,14 @@ def record_scan(
     return seen
 
 
-def _recorded(part: Path, seen: Seen) -> float:
-    """Time in s of an interrupted scan's last image, 0 without one; takes over the exposures of its lights."""
-    if not part.exists():
-        return 0.0
-    with Capture(part) as left:
-        for laser_on, exposure_ms in zip(left.laser_on.tolist(), left.exposure_ms.tolist(), strict=True):
-            seen.exposure_ms["laser" if laser_on else "lamp"] = exposure_ms
-        return float(left.time_s[-1]) if len(left) else 0.0
+def left_over(path: Path) -> tuple[dict[Light, float], float]:
+    """Exposures in ms that an interrupted recording of a path used last, and the time in s of its last image."""
+    if not part_path(path).exists():
+        return {}, 0.0
+    with Capture(part_path(path)) as capture:
+        lights: list[Light] = ["laser" if on else "lamp" for on in capture.laser_on.tolist()]
+        known = dict(zip(lights, capture.exposure_ms.tolist(), strict=True))
+        return known, float(capture.time_s[-1]) if len(capture) else 0.0
 
 
 def check_camera(camera: Camera, sensor: Sensor) -> None:
@@ -285,7 +278,7 @@ class _Taking:
         exposures: dict[Light, float] = self._seen.exposure_ms
         missing: list[Light] = []
         for light in dict.fromkeys(self._plan.lights):
-            planned = self._planned(light)
+            planned = self._plan.planned_ms(light)
             if light not in exposures and planned == "auto":
                 missing.append(light)
             elif light not in exposures and planned != "auto":
@@ -304,9 +297,6 @@ class _Taking:
                 if light == "laser":
                     raise no_light(self._positions_mm, longest_ms)
                 exposures[light] = longest_ms
-
-    def _planned(self, light: Light) -> float | Literal["auto"]:
-        return self._plan.laser_ms if light == "laser" else self._plan.lamp_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
         """Shorten the exposure of a light if it is too long here; settle it if nothing was seen in it before."""
@@ -339,7 +329,7 @@ class _Taking:
         position, light, zero_dn = self._rig.move_to(shot.position_mm), shot.light, self._plan.zero_dn(self._sensor)
         image, exposure_ms = self._rig.image(light, self._seen.exposure_ms[light])
         bright = brightness(image, self._sensor, light)
-        if bright.overexposed and self._planned(light) == "auto" and self._shorten(light, shot.position_mm):
+        if bright.overexposed and self._plan.planned_ms(light) == "auto" and self._shorten(light, shot.position_mm):
             image, exposure_ms = self._rig.image(light, self._seen.exposure_ms[light])
             bright = brightness(image, self._sensor, light)
         unlit = self._rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None

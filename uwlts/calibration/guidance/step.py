@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.evidence import StepEvidence
+from uwlts.calibration.image_quality import LaserFault
 from uwlts.calibration.sequential import step_image
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import Calibration, WindowModel
@@ -90,7 +91,7 @@ def judge_step(
     clipped = (image.max(axis=0 if along == "width" else 1) >= full_dn) & (stripe.status != StripeStatus.NO_STRIPE)
     saturated = float(clipped.sum()) / len(pixels)
     if saturated > _MOST_SATURATED:
-        reasons.append(f"stripe saturated on {100 * saturated:.0f} % of its lines; shorten laser_ms")
+        reasons.append(LaserFault(f"stripe saturated on {100 * saturated:.0f} % of its lines; shorten laser_ms"))
     evidence = StepEvidence(pixels, standard, medium_index, "this image")
     try:
         step_image(calibration, window, evidence)

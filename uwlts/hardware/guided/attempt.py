@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from uwlts.calibration.image_quality import (
     why_not_found,
 )
 from uwlts.hardware.rig import START_MS, Rig, settled_exposure
-from uwlts.hardware.scan_plan import Light, ScanPlan
+from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.errors import CalibrationError, TargetError
 from uwlts.model.sensor import Sensor
 from uwlts.targets import TargetView
@@ -37,9 +36,8 @@ class GuidedImages:
         Exposures already settled, as those of a recording that is gone on with.
     """
 
-    def __init__(self, rig: Rig, plan: ScanPlan, sensor: Sensor, *, dtype: np.dtype, known_ms: dict[Light, float]):
-        self._rig, self._sensor, self._dtype = rig, sensor, dtype
-        self._planned: dict[Light, float | Literal["auto"]] = {"lamp": plan.lamp_ms, "laser": plan.laser_ms}
+    def __init__(self, rig: Rig, plan: RigPlan, sensor: Sensor, *, dtype: np.dtype, known_ms: dict[Light, float]):
+        self._rig, self._plan, self._sensor, self._dtype = rig, plan, sensor, dtype
         self._exposure_ms: dict[Light, float] = dict(known_ms)
 
     def move_to(self, position_mm: float) -> float:
@@ -58,7 +56,7 @@ class GuidedImages:
 
     def settle(self, light: Light) -> bool:
         """Find the exposure for what is seen now; whether there is one: in the dark there is none."""
-        planned = self._planned[light]
+        planned = self._plan.planned_ms(light)
         if planned != "auto":
             self._exposure_ms[light] = planned
             return True
@@ -74,7 +72,7 @@ class GuidedImages:
 
     def resettle(self, light: Light) -> bool:
         """Find the exposure again; whether that can change anything."""
-        return self._planned[light] == "auto" and self.settle(light)
+        return self._plan.planned_ms(light) == "auto" and self.settle(light)
 
 
 # The stage's steps may be small; the poses are distinguished by its position.

@@ -14,13 +14,12 @@ from uwlts.calibration.guidance.pose_advice import (
     missing,
     missing_sheet,
 )
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, pose_of
+from uwlts.calibration.guidance.solution import RecordedPose, pose_of
 from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
-from uwlts.calibration.image_quality import judge_novelty, way_px
+from uwlts.calibration.image_quality import LampFault, LaserFault, MotionFault, judge_novelty, way_px
 from uwlts.hardware.guided.attempt import Accepted, Attempt, Attempts, Found, GuidedImages, PoseJudge, Refused
 from uwlts.hardware.guided.operator import GuidedPage, Operator
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
-from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureWriter, Frame
@@ -61,31 +60,49 @@ def places_left(plan: GuidedPlan, state: State) -> list[float]:
     return [place for place in plan.stage.places_mm() if not (np.abs(done - place) <= _SAME_POSITION_MM).any()]
 
 
-class TargetPhase:
-    """Records poses of the target until what is wanted is reached.
+class Session:
+    """A recording with camera and stage open: takes images, talks to the operator, and writes the capture.
 
-    Parameters
-    ----------
-    clock : callable
-        Time in s.
+    ``before_s`` is the time of the last image of an interrupted recording, ``clock`` returns the time in s.
     """
 
     def __init__(
         self,
-        plan: GuidedPlan,
-        setting: Setting,
-        *,
         images: GuidedImages,
-        attempts: Attempts,
         operator: Operator,
         page: GuidedPage,
         writer: CaptureWriter,
+        *,
         before_s: float,
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._plan, self._setting, self._images, self._attempts = plan, setting, images, attempts
-        self._operator, self._page, self._writer, self._clock = operator, page, writer, clock
-        self._start_s = clock() - before_s
+        self.images, self.operator, self.page, self.clock = images, operator, page, clock
+        self._writer, self._start_s = writer, clock() - before_s
+
+    def show(
+        self, image: np.ndarray, remark: str, *, points: np.ndarray | None = None, stripe: np.ndarray | None = None
+    ) -> None:
+        """Show an image (H, W) with points (N, 2) and stripe pixels (N, 2) on the page."""
+        full = self._writer.header.saturation_dn
+        self.page.live(image, full_dn=full, points=points, stripe=stripe, remark=remark)
+
+    def report(self, line: str) -> None:
+        """Say a line, and add it to the page's list of images."""
+        self.operator.say(line)
+        self.page.add(line)
+
+    def record(self, image: np.ndarray, exposure_ms: float, *, stage_mm: float, laser_on: bool) -> None:
+        """Write an image (H, W) to the capture."""
+        self._writer.append(Frame(image, stage_mm, laser_on, exposure_ms, self.clock() - self._start_s))
+
+
+class TargetPhase:
+    """Records poses of the target until what is wanted is reached."""
+
+    def __init__(self, plan: GuidedPlan, session: Session, judge: PoseJudge):
+        self._plan, self._session = plan, session
+        self._images, self._operator, self._page = session.images, session.operator, session.page
+        self._attempts = Attempts(session.images, judge)
         self._settled_s = -np.inf
 
     def run(self, state: State) -> State:
@@ -115,12 +132,12 @@ class TargetPhase:
 
     def _can_change(self, attempt: Refused) -> bool:
         """Whether another attempt at the same place may be better: another exposure, or a target come to rest."""
-        if any(reason.startswith("moved") for reason in attempt.reasons):
+        if any(isinstance(reason, MotionFault) for reason in attempt.reasons):
             return True
         return self._improve_light(attempt.reasons)
 
     def _free(self, state: State) -> State:
-        watch = _Watch(self._plan.still_s, self._clock)
+        watch = _Watch(self._plan.still_s, self._session.clock)
         wish: PoseAdvice | None = None
         refused: list[TargetView] = []
         while still_missing(state) and len(state.recorded) < self._plan.most_images:
@@ -170,45 +187,31 @@ class TargetPhase:
         self._page.request(request if reasons else "hold it still")
         self._operator.hint(f"next: {request if wish is None or sheet else format_pose_advice(wish, state, None)}")
         points = None if found.view is None else found.view.pixels
-        self._page.live(
-            found.image,
-            full_dn=self._writer.header.saturation_dn,
-            points=points,
-            stripe=None,
-            remark="; ".join(reasons) or "good",
-        )
+        self._session.show(found.image, "; ".join(reasons) or "good", points=points)
 
     def _improve_light(self, reasons: tuple[str, ...]) -> bool:
         """Settle the lamp's exposure again where an image was too bright or too dark, but not all the time."""
-        light = any(reason.startswith(("saturated", "faint", "too dark")) for reason in reasons)
-        if not light or self._clock() - self._settled_s < _RESETTLE_S:
+        light, clock = any(isinstance(reason, LampFault) for reason in reasons), self._session.clock
+        if not light or clock() - self._settled_s < _RESETTLE_S:
             return False
         changed = self._images.resettle("lamp")
-        self._settled_s = self._clock()
+        self._settled_s = clock()
         return changed
 
     def _done(self, attempt: Attempt, state: State, name: str) -> State:
         """Record what was accepted, and say what became of it; the state after it."""
         stripe = None
         if isinstance(attempt, Accepted):
-            self._record(attempt)
-            state, stripe = attempt.state, attempt.pose.stripe
+            state, stripe, stage_mm = attempt.state, attempt.pose.stripe, attempt.pose.stage_mm
+            self._session.record(*attempt.lamp, stage_mm=stage_mm, laser_on=False)
+            if attempt.laser is not None:
+                self._session.record(*attempt.laser, stage_mm=stage_mm, laser_on=True)
         line = f"{name}: {attempt.line()}"
-        self._operator.say(line)
-        self._page.add(line)
+        self._session.report(line)
         points = attempt.found.view.pixels if attempt.found.view is not None else None
-        self._page.live(
-            attempt.found.image, full_dn=self._writer.header.saturation_dn, points=points, stripe=stripe, remark=line
-        )
+        self._session.show(attempt.found.image, line, points=points, stripe=stripe)
         self._show_state(state)
         return state
-
-    def _record(self, attempt: Accepted) -> None:
-        stage_mm = attempt.pose.stage_mm
-        for taken, laser_on in ((attempt.lamp, False), (attempt.laser, True)):
-            if taken is not None:
-                image, exposure_ms = taken
-                self._writer.append(Frame(image, stage_mm, laser_on, exposure_ms, self._clock() - self._start_s))
 
     def _show_state(self, state: State) -> None:
         self._page.recorded(state.coverage, [pose.view.pixels for pose in state.recorded])
@@ -251,7 +254,7 @@ class StepJudge:
     def __init__(self, step: GuidedStep, sensor: Sensor, calibration: Calibration, window: WindowModel):
         self.sensor = sensor
         self._calibration, self._window = calibration, window
-        self._standard = StepStandard.model_validate(step.artefact())
+        self._standard = step.standard()
         self._index = sensor.medium(step.medium).refractive_index(sensor.laser.wavelength_nm)
 
     def judge(self, image: np.ndarray) -> StepQuality:
@@ -274,29 +277,19 @@ class StepJudge:
 class StepPhase:
     """Records images of the standard until it was seen near, in the middle and far."""
 
-    def __init__(
-        self,
-        step: GuidedStep,
-        judge: StepJudge,
-        *,
-        images: GuidedImages,
-        operator: Operator,
-        page: GuidedPage,
-        writer: CaptureWriter,
-        before_s: float,
-    ):
-        self._step, self._judge, self._images = step, judge, images
-        self._operator, self._page, self._writer = operator, page, writer
-        self._start_s = time.monotonic() - before_s
+    def __init__(self, step: GuidedStep, judge: StepJudge, session: Session):
+        self._step, self._judge, self._session = step, judge, session
+        self._images = session.images
 
     def run(self, seen_mm: Sequence[float]) -> list[float]:
         """Go on after the depths that are recorded; all depths then. Errors as `TargetPhase.run`."""
         seen = list(seen_mm)
         while (wanted := next_depth_mm(seen, self._judge.sensor)) is not None:
-            answer = self._ask(
+            request = (
                 f"put the step standard about {wanted:.0f} mm outside the window, with the laser line across its step"
             )
-            if answer == "done":
+            self._session.page.request(request)
+            if self._session.operator.wait(request, self._glance) == "done":
                 break
             before = tuple(seen)
             for position in self._step.positions_mm or (None,):
@@ -304,20 +297,15 @@ class StepPhase:
                 seen += [] if taken is None else [taken]
         return seen
 
-    def _ask(self, request: str) -> str:
-        self._page.request(request)
-        return self._operator.wait(request, self._glance)
-
     def _glance(self) -> None:
-        full = self._writer.header.saturation_dn
-        self._page.live(self._images.unlit(), full_dn=full, points=None, stripe=None, remark="the laser is off")
+        self._session.show(self._images.unlit(), "the laser is off")
 
     def _take(self, position: float | None, before_mm: Sequence[float]) -> float | None:
         """Take the standard as it stands; at which depth it was recorded, None if it was refused."""
         stage_mm = 0.0 if position is None else self._images.move_to(position)
         image, exposure_ms = self._images.take("laser")
         quality = self._judge.judge(image)
-        if any(reason.startswith("stripe saturated") for reason in quality.reasons) and self._images.resettle("laser"):
+        if any(isinstance(reason, LaserFault) for reason in quality.reasons) and self._images.resettle("laser"):
             image, exposure_ms = self._images.take("laser")
             quality = self._judge.judge(image)
         # Whoever moves the standard must not have the laser before him.
@@ -328,7 +316,7 @@ class StepPhase:
         self._report(image, quality, reasons)
         if reasons or depth_mm is None:
             return None
-        self._writer.append(Frame(image, stage_mm, True, exposure_ms, time.monotonic() - self._start_s))
+        self._session.record(image, exposure_ms, stage_mm=stage_mm, laser_on=True)
         return depth_mm
 
     def _why_not_here(self, depth_mm: float, before_mm: Sequence[float]) -> tuple[str, ...]:
@@ -345,7 +333,5 @@ class StepPhase:
             line = f"refused: {'; '.join(reasons)}"
         else:
             line = f"stripe on {len(quality.pixels)} lines, {quality.depth_mm:.0f} mm outside the window"
-        self._operator.say(f"step: {line}")
-        self._page.add(f"step: {line}")
-        full = self._writer.header.saturation_dn
-        self._page.live(image, full_dn=full, points=None, stripe=quality.pixels, remark=line)
+        self._session.report(f"step: {line}")
+        self._session.show(image, line, stripe=quality.pixels)

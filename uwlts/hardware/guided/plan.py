@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -10,35 +10,32 @@ from pydantic import Field, model_validator
 from uwlts.calibration.camera import Poses
 from uwlts.calibration.guidance.pose_advice import Wanted
 from uwlts.calibration.guidance.solution import Setting, without_window
-from uwlts.hardware.scan_plan import ScanPlan, StagePlan, plan_table
+from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, plan_table
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.errors import DescriptionError, RangeError
-from uwlts.model.library import load_sensor, validated
-from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import validated
+from uwlts.model.sensor import Description, NotNegative, Positive
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
 
-class GuidedStage(Description):
+class GuidedStage(StageSettings):
     """The stage, which also switches the laser; for free poses it stands still.
 
     The target is shown at ``positions_mm``, or at ``count`` positions from ``first_mm`` to ``last_mm``, in the stage's
-    own coordinate. ``direction`` is where growing positions move the sensor, in the OCS. ``home`` finds the limit
-    switch first; without it the position that the controller counts is taken as it is.
+    own coordinate. ``home`` finds the limit switch first; without it the position that the controller counts is taken
+    as it is.
     """
 
-    port: str | None = None
     positions_mm: tuple[float, ...] = ()
     first_mm: float | None = None
     last_mm: float | None = None
     count: Annotated[int, Field(ge=2, le=1000)] = 12
-    direction: Vector = (0.0, 0.0, 1.0)
-    feed_mm_per_min: Positive = 300.0
-    settle_s: NotNegative | None = None
+    direction: Direction = (0.0, 0.0, 1.0)
     home: bool = False
 
     @model_validator(mode="after")
-    def _one_way_to_tell(self) -> "GuidedStage":
+    def _one_way_to_give_them(self) -> "GuidedStage":
         ends = self.first_mm is not None, self.last_mm is not None
         if any(ends) != all(ends) or (self.positions_mm and any(ends)):
             raise ValueError("give positions_mm, or first_mm and last_mm with count, not parts of both")
@@ -63,12 +60,11 @@ class GuidedStep(Description):
     reference: Literal["lower", "upper"] = "lower"
     edge_mm: NotNegative = 1.0
     positions_mm: tuple[float, ...] = ()
-    direction: Vector = (1.0, 0.0, 0.0)
+    direction: Direction = (1.0, 0.0, 0.0)
 
-    def artefact(self) -> dict[str, Any]:
-        """The standard as captures name it."""
-        given = self.model_dump(include={"height_mm", "height_uncertainty_mm", "reference", "edge_mm"})
-        return StepStandard.model_validate(given).model_dump(exclude_none=True)
+    def standard(self) -> StepStandard:
+        """The artefact."""
+        return StepStandard.model_validate(self.model_dump(include=set(StepStandard.model_fields)))
 
 
 class WantedPlan(Description):
@@ -91,29 +87,22 @@ class WantedPlan(Description):
         )
 
 
-class GuidedPlan(Description):
+class GuidedPlan(RigPlan):
     """A guided calibration as read from TOML.
 
     The target stands in ``medium``; ``window_mounted``: whether the camera sees it through its window, as it does
-    in any medium but air. ``poses`` are as for `solve_camera`. Exposures are in ms or "auto". A free pose is taken once
-    the target has stood still for ``still_s``.
+    in any medium but air. ``poses`` are as for `solve_camera`. A free pose is taken once the target has stood still for
+    ``still_s``.
     """
 
-    title: str
-    sensor: str = "thesis"
-    camera: str | None = None
     medium: str = "air"
     window_mounted: bool | None = None
     poses: Poses = "free"
-    target: dict[str, Any]
+    target: Table
     stage: GuidedStage | None = None
     step: GuidedStep | None = None
     wanted: WantedPlan = WantedPlan()
     most_images: Annotated[int, Field(ge=3)] = 40
-    laser_ms: Positive | Literal["auto"] = "auto"
-    lamp_ms: Positive | Literal["auto"] = "auto"
-    gain_db: float | None = None
-    laser_power: Annotated[float, Field(gt=0, le=1)] = 1.0
     still_s: NotNegative = 0.8
 
     @model_validator(mode="after")
@@ -140,10 +129,6 @@ class GuidedPlan(Description):
         """Whether the target stands in air; DescriptionError where the sensor does not know the medium."""
         return self.described_sensor().medium(self.medium).kind == "air"
 
-    def described_sensor(self) -> Sensor:
-        """The sensor of the plan, with its window; DescriptionError where it is unknown or not valid."""
-        return load_sensor(self.sensor)
-
     def setting(self) -> Setting:
         """How the target is seen.
 
@@ -164,51 +149,22 @@ class GuidedPlan(Description):
             approaching=approaching,
         )
 
-    def target_header(self, name: str, *, provenance: dict[str, Any]) -> CaptureHeader:
+    def target_header(self, name: str, *, provenance: Table) -> CaptureHeader:
         """Header of the capture of the target; errors as `setting`."""
-        setting = self.setting()
-        direction = (0.0, 0.0, 1.0) if self.stage is None else self.stage.direction
-        return self._header(name, setting.sensor, self.medium, direction, provenance, target=self.target)
+        sensor, direction = self.setting().sensor, (self.stage or GuidedStage()).direction
+        return self.capture_header(
+            name, sensor, medium=self.medium, direction=direction, provenance=provenance, target=self.target
+        )
 
-    def step_header(self, name: str, step: GuidedStep, *, provenance: dict[str, Any]) -> CaptureHeader:
+    def step_header(self, name: str, step: GuidedStep, *, provenance: Table) -> CaptureHeader:
         """Header of the capture of the step standard; DescriptionError where sensor or medium are not valid."""
-        sensor = self.described_sensor()
-        return self._header(name, sensor, step.medium, step.direction, provenance, artefact=step.artefact())
-
-    def _header(
-        self, name: str, sensor: Sensor, medium: str, direction: Vector, provenance: dict[str, Any], **shown: Any
-    ) -> CaptureHeader:
-        unit = StagePlan(start_mm=0.0, direction=direction).direction
-        table = {
-            "name": name,
-            "sensor": sensor,
-            "medium_name": medium,
-            "medium": sensor.medium(medium),
-            "stage_direction": unit,
-            "saturation_dn": sensor.detector.full_scale_dn(),
-            "provenance": provenance,
-        }
-        return validated(CaptureHeader, table | shown, f"the plan '{self.title}'")
-
-    def scan_plan(self, *, medium: str, positions_mm: list[float]) -> ScanPlan:
-        """The plan of the same images for the rig that takes them."""
-        stage = self.stage or GuidedStage()
-        first, last = (positions_mm[0], positions_mm[-1]) if positions_mm else (0.0, 0.0)
-        return ScanPlan(
-            title=self.title,
-            sensor=self.sensor,
-            medium=medium,
-            lights=("lamp", "laser"),
-            laser_ms=self.laser_ms,
-            lamp_ms=self.lamp_ms,
-            gain_db=self.gain_db,
-            laser_power=self.laser_power,
-            stage=StagePlan(
-                start_mm=first,
-                step_mm=1.0 if last >= first else -1.0,
-                feed_mm_per_min=stage.feed_mm_per_min,
-                settle_s=stage.settle_s,
-            ),
+        return self.capture_header(
+            name,
+            self.described_sensor(),
+            medium=step.medium,
+            direction=step.direction,
+            provenance=provenance,
+            artefact=step.standard().model_dump(exclude_none=True),
         )
 
 
@@ -230,13 +186,3 @@ def load_guided_plan(path: Path) -> GuidedPlan:
                 "window's distance itself: leave out [step], or set medium to air"
             )
     return plan
-
-
-def check_positions(positions_mm: list[float], *, limits_mm: tuple[float, float]) -> None:
-    """Refuse positions outside the travel before anything moves; RangeError."""
-    low, high = limits_mm
-    outside = [position for position in positions_mm if not low <= position <= high]
-    if outside:
-        raise RangeError(
-            f"the plan asks for {outside[0]:g} mm, the stage moves from {low:g} to {high:g} mm: change its positions"
-        )

@@ -8,12 +8,12 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-import uwlts
 from uwlts.calibration.camera import Poses
 from uwlts.calibration.guidance.pose_advice import State
 from uwlts.calibration.guidance.solution import RecordedPose, Setting
@@ -22,15 +22,22 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.attempt import Attempts, GuidedImages, PoseJudge
+from uwlts.hardware.guided.attempt import GuidedImages, PoseJudge
 from uwlts.hardware.guided.operator import GuidedPage, HandSwitchedLaser, Operator
-from uwlts.hardware.guided.phases import StepJudge, StepPhase, TargetPhase, places_left, recorded_poses, still_missing
-from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep, check_positions, load_guided_plan
-from uwlts.hardware.rig import Rig
-from uwlts.hardware.scan_plan import Light
-from uwlts.hardware.scanning import check_camera
+from uwlts.hardware.guided.phases import (
+    Session,
+    StepJudge,
+    StepPhase,
+    TargetPhase,
+    places_left,
+    recorded_poses,
+    still_missing,
+)
+from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep, load_guided_plan
+from uwlts.hardware.rig import Rig, provenance_of
+from uwlts.hardware.scanning import check_camera, left_over
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.model.errors import DescriptionError
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, part_path
 
 
@@ -160,25 +167,10 @@ class _Phases:
             os.replace(path, part_path(path))
         stage = self.plan.stage
         positions = [] if self.plan.poses == "free" or stage is None else stage.places_mm()
-        with self._opened(self.plan.medium, positions) as (rig, provenance, dtype):
-            header = self.plan.target_header(path.stem, provenance=provenance)
-            known, before_s = _left_over(path) if self.resume else ({}, 0.0)
-            scan = self.plan.scan_plan(medium=self.plan.medium, positions_mm=positions)
-            images = GuidedImages(rig, scan, self.setting.sensor, dtype=dtype, known_ms=known)
-            attempts = Attempts(images, judge)
-            state = judge.state(self._before(path, judge))
-            with self._writer(path, header, dtype) as writer:
-                phase = TargetPhase(
-                    self.plan,
-                    self.setting,
-                    images=images,
-                    attempts=attempts,
-                    operator=self.operator,
-                    page=self.page,
-                    writer=writer,
-                    before_s=before_s,
-                )
-                return phase.run(state)
+        before = self._before(path, judge)
+        header = partial(self.plan.target_header, path.stem)
+        with self._session(path, positions, header) as session:
+            return TargetPhase(self.plan, session, judge).run(judge.state(before))
 
     def _to_go_on(self, state: State) -> bool:
         """Whether a finished recording of the target is not enough, and more poses can be taken."""
@@ -208,39 +200,29 @@ class _Phases:
         request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
         self.page.request(request)
         self.operator.wait(request)
-        with self._opened(step.medium, list(step.positions_mm)) as (rig, provenance, dtype):
-            header = self.plan.step_header(path.stem, step, provenance=provenance)
-            known, before_s = _left_over(path) if self.resume else ({}, 0.0)
-            scan = self.plan.scan_plan(medium=step.medium, positions_mm=list(step.positions_mm))
-            images = GuidedImages(rig, scan, judge.sensor, dtype=dtype, known_ms=known)
-            with self._writer(path, header, dtype) as writer:
-                phase = StepPhase(
-                    step, judge, images=images, operator=self.operator, page=self.page, writer=writer, before_s=before_s
-                )
-                seen = phase.run(seen)
+        header = partial(self.plan.step_header, path.stem, step)
+        with self._session(path, list(step.positions_mm), header) as session:
+            seen = StepPhase(step, judge, session).run(seen)
         count = len(apart_mm(seen, judge.sensor))
         return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
 
-    def _writer(self, path: Path, header: CaptureHeader, dtype: np.dtype) -> CaptureWriter:
-        return CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume)
-
     @contextmanager
-    def _opened(self, medium: str, positions_mm: list[float]) -> Iterator[tuple[Rig, dict[str, Any], np.dtype]]:
-        """Camera and stage, ready to take images, with their provenance for the captures."""
+    def _session(
+        self, path: Path, positions_mm: list[float], header: Callable[..., CaptureHeader]
+    ) -> Iterator[Session]:
+        """Camera and stage, ready to record a capture with a ``header(provenance=...)``."""
         sensor = self.setting.sensor
         with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
             check_camera(camera, sensor)
-            provenance = {
-                "source": "guided calibration",
-                "title": self.plan.title,
-                "camera": f"{camera.info.name} {camera.info.serial}".strip(),
-                "stage": f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none",
-                "laser_power": self.plan.laser_power,
-                "uwlts": uwlts.__version__,
-            }
+            version = f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none"
+            described = header(provenance=provenance_of(self.plan, camera, source="guided calibration", stage=version))
             dtype = np.dtype(np.uint16) if camera.info.bits > 8 else np.dtype(np.uint8)
-            scan = self.plan.scan_plan(medium=medium, positions_mm=positions_mm)
-            yield Rig(scan, sensor, camera, stage), provenance, dtype
+            ahead = positions_mm[-1] - positions_mm[0] if positions_mm else 1.0
+            rig = Rig(self.plan, self.plan.stage or GuidedStage(), sensor, camera, stage, ahead=ahead)
+            known, before_s = left_over(path) if self.resume else ({}, 0.0)
+            images = GuidedImages(rig, self.plan, sensor, dtype=dtype, known_ms=known)
+            with CaptureWriter(path, described, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
+                yield Session(images, self.operator, self.page, writer, before_s=before_s)
 
     @contextmanager
     def _stage(self, positions_mm: list[float]) -> Iterator[GrblStage | HandSwitchedLaser]:
@@ -249,22 +231,9 @@ class _Phases:
             yield HandSwitchedLaser(self.operator)
             return
         with GrblStage(self.port) as stage:
-            check_positions(positions_mm, limits_mm=stage.limits_mm)
-            fastest = stage.settings.max_feed_mm_per_min
-            if planned.feed_mm_per_min > fastest:
-                raise RangeError(f"feed_mm_per_min is {planned.feed_mm_per_min:g}, the stage does at most {fastest:g}")
+            planned.check(positions_mm, stage)
             if planned.home:
                 stage.home()
             elif not stage.position_known:
                 stage.unlock()
             yield stage
-
-
-def _left_over(path: Path) -> tuple[dict[Light, float], float]:
-    """Exposures in ms of an interrupted recording, and the time in s of its last image."""
-    if not part_path(path).exists():
-        return {}, 0.0
-    with Capture(part_path(path)) as capture:
-        lights: list[Light] = ["laser" if on else "lamp" for on in capture.laser_on.tolist()]
-        known = dict(zip(lights, capture.exposure_ms.tolist(), strict=True))
-        return known, float(capture.time_s[-1]) if len(capture) else 0.0
