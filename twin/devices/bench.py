@@ -108,7 +108,7 @@ _WALKS, _NOISE = 0, 1
 
 @dataclass(frozen=True)
 class Track:
-    """Where the scene's motion lies on the stage: it starts at ``start_mm`` of the stage's own positions."""
+    """Place of the scene's motion on the stage: it starts at ``start_mm`` of the stage's own positions."""
 
     motion: Motion
     start_mm: float
@@ -152,7 +152,7 @@ class Track:
 
 @dataclass(frozen=True)
 class FrameRates:
-    """How many frames were made, how many of them had to be rendered, and what both kinds took in s."""
+    """Numbers of frames made and rendered, and the times in s that rendered and repeated ones took."""
 
     frames: int = 0
     rendered: int = 0

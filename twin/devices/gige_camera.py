@@ -122,7 +122,7 @@ class _Shot:
 
 @dataclass(frozen=True)
 class _Faults:
-    """How many of the next frames are lost, repeat the one before, lack packets, or come late by so many seconds."""
+    """Numbers of the next frames that are lost, repeated, lack packets, or come late by so many seconds."""
 
     drop: int = 0
     repeat: int = 0
@@ -158,7 +158,8 @@ class GigeCamera:
         serial: str = "1",
         first_number: int = 1,
     ):
-        for name, text, room in (("maker", maker, _NAME_BYTES), ("model", model, _NAME_BYTES), ("serial", serial, 16)):
+        names = {"maker": (maker, _NAME_BYTES), "model": (model, _NAME_BYTES), "serial": (serial, _SERIAL_BYTES)}
+        for name, (text, room) in names.items():
             if not text.isascii() or not 0 < len(text) < room:
                 raise HardwareError(f"{name} is '{text}': it must have 1 to {room - 1} ASCII characters")
         self.failure: BaseException | None = None

@@ -34,7 +34,7 @@ _BUSY_MS, _IDLE_MS = 2, 20
 
 @dataclass(frozen=True)
 class StageState:
-    """What is true of the stage and the laser at this moment; ``power`` is 0 when no light comes out."""
+    """True state of the stage and the laser at this moment; ``power`` is 0 when no light comes out."""
 
     position_mm: float
     moving: bool
@@ -95,7 +95,7 @@ class GrblController:
         self.disconnect()
 
     def state(self) -> StageState:
-        """The truth, for whoever renders what the sensor sees."""
+        """The true state, from which the sensor's images are rendered."""
         with self._lock:
             lit = self._powered and not self._laser_broken and (self._port_open or not self._gated)
             power = self._firmware.laser_power() if lit else 0.0

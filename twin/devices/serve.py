@@ -22,7 +22,7 @@ _WATCH_S = 0.2
 
 @dataclass(frozen=True)
 class ServedTwin:
-    """What is served: the stage's controller, the camera, where the scene lies, and exposures in ms that suit it."""
+    """A served stage and camera, the place of the scene, and exposures in ms that suit it."""
 
     controller: GrblController
     camera: GigeCamera
@@ -31,7 +31,7 @@ class ServedTwin:
     rates: Callable[[], FrameRates]
 
     def lines(self) -> list[str]:
-        """What an operator has to know."""
+        """Ports, motion and exposures, as lines for the operator."""
         motion, start_mm = self.track.motion, self.track.start_mm
         end_mm = start_mm + (motion.count - 1) * motion.step_mm
         suited = ", ".join(f"{light} {exposure:.3f} ms" for light, exposure in self.exposure_ms.items())
@@ -126,8 +126,8 @@ class _FaultyFrames:
         self._begun = 0
 
     def join(self, controller: GrblController, camera: GigeCamera) -> None:
-        """What the faults befall."""
-        self._befallen = controller, camera
+        """Give the devices that faults are injected into."""
+        self._devices = controller, camera
         self._inject(1, ahead=True)
 
     def __call__(self, exposure_ms: float) -> np.ndarray:
@@ -140,5 +140,5 @@ class _FaultyFrames:
     def _inject(self, frame: int, *, ahead: bool) -> None:
         for fault in self._faults:
             if (fault.frame, fault.ahead) == (frame, ahead):
-                fault.inject(*self._befallen)
+                fault.inject(*self._devices)
                 self._report(f"fault: {fault}")

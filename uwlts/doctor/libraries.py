@@ -25,7 +25,7 @@ OPTIONAL = {
     "dask": "sweeps on several machines",
     "distributed": "sweeps on several machines",
 }
-"""What libraries are for without which most of the work can be done."""
+"""Optional libraries, with what they are needed for."""
 
 _LOAD_S = 120
 # What is begun last did not load, whether it raised an error or ended the process.

@@ -27,7 +27,7 @@ _WIDTH = 110
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found.
+    """Result of one examination.
 
     ``status`` is "missing" for what is required, or was asked for, and is not there or does not work; "warning" for
     what limits some of the work. Both come with ``advice``, one thing to do for each line.

@@ -33,7 +33,7 @@ _COUNTER_16_BIT = 2**16 - 1
 
 
 class FrameStatus(StrEnum):
-    """What is wrong with a frame, the worst first where several things are.
+    """Fault of a frame, the worst first where several things are.
 
     SHORT: parts of the image are missing. DUPLICATED: the previous frame once more, by its number or its time stamp.
     DROPPED: good, but frames before it are lost. LATE: good, but its time stamp is over a period later than its number
@@ -49,7 +49,7 @@ class FrameStatus(StrEnum):
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """How many frames were ok, short, duplicated or late, how many were lost, and how many triggers unanswered."""
+    """Numbers of frames that were ok, short, duplicated, lost or late, and of unanswered triggers."""
 
     ok: int = 0
     short: int = 0
@@ -153,7 +153,7 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What the camera really does; None where it has no such setting, or does not report it."""
+    """Settings in force; None where the camera has no such setting, or does not report it."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -165,7 +165,7 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class RequestedSettings:
-    """What a camera is asked to do; None leaves a setting as it is, but the region becomes the whole image."""
+    """Settings asked for; None leaves a setting as it is, but the region becomes the whole image."""
 
     exposure_ms: float | None
     gain_db: float | None
@@ -177,7 +177,7 @@ class RequestedSettings:
 
 @dataclass(frozen=True)
 class Delivered:
-    """What a driver hands over: image (H, W), or None if incomplete, and what the camera says of it."""
+    """A frame from a driver: image (H, W), None if incomplete, with what the camera reports about it."""
 
     image: np.ndarray | None
     frame_id: int

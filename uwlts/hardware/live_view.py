@@ -25,11 +25,7 @@ _LONGEST_SIDE_PX = 900
 class LivePage:
     """A page with a title. It can be seen from this machine only, unless another ``host`` is given.
 
-    Attributes
-    ----------
-    server : viser.ViserServer
-    address : str
-        Where a browser finds it; the next free port is taken where the wanted one is in use.
+    A browser finds it at its ``address``; the next free port is taken where the wanted one is in use.
     """
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 8080):
@@ -89,13 +85,12 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
     """
     frame = capture[number]
     along = capture.header.sensor.camera.stripe_along
-    none, (planned, left_s) = np.zeros((0, 3)), _outlook(capture, number)
+    points, (planned, left_s) = np.zeros((0, 3)), _outlook(capture, number)
     if not frame.laser_on:
         picture = _picture(frame.image, capture, None)
-        return Seen(number, frame.stage_mm, False, picture, 0, 0, none, (), planned, left_s)
+        return Seen(number, frame.stage_mm, False, picture, 0, 0, points, (), planned, left_s)
     stripe = extract_stripe(frame.image, stripe_along=along, saturation=capture.header.saturation_dn)
     line = stripe.lines
-    points = none
     if calibration is not None and len(line):
         stripes = FoundStripes(
             np.full(len(line), number), line, stripe.centre_px[line], stripe.amplitude[line], stripe.width_px[line], {}

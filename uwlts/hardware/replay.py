@@ -41,9 +41,8 @@ class ReplayCamera(Camera):
     def _open(self) -> CameraInfo:
         self._shown = 0
         if self._path.is_dir():
-            self._files = sorted(
-                (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES), key=_natural
-            )
+            images = (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES)
+            self._files = sorted(images, key=_natural)
             if not self._files:
                 raise HardwareError(f"the folder {self._path} holds no image ({', '.join(SUFFIXES)})")
             first = _read(self._files[0])

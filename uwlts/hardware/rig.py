@@ -22,7 +22,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.stripe import StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
-"""The brightest pixel of every line that counts is looked at; 2 % of the lines may be brighter than is wished."""
+"""The brightest pixel of every line that counts is looked at; 2 % of the lines may be brighter than wanted."""
 START_MS = 1.0
 """First exposure that is tried: in the middle of the usual range, on a logarithmic scale."""
 _FEW_SHARE = 0.01
@@ -51,7 +51,7 @@ def not_few(count: int, lines: int) -> bool:
 
 @dataclass(frozen=True)
 class Brightness:
-    """How bright an image is.
+    """Brightness of an image.
 
     ``level`` is the share of the full scale that all but 2 % of the ``counted`` lines keep to: 0 where no line counts,
     1 where it is too bright by an unknown amount. ``saturated`` of the counted lines reach the full scale.
@@ -95,7 +95,7 @@ def settled_exposure(
 
     ``take(exposure_ms)`` returns an image (H, W) in the light. The longest is the sensor's ``longest_ms``.
     """
-    wished, longest_ms = sensor.exposure.auto_level, sensor.exposure.longest_ms
+    wanted, longest_ms = sensor.exposure.auto_level, sensor.exposure.longest_ms
     exposure_ms, too_long_ms = min(start_ms, longest_ms), math.inf
     for _ in range(_STEPS):
         seen = brightness(take(exposure_ms), sensor, light)
@@ -106,7 +106,7 @@ def settled_exposure(
             # At full scale it is unknown by how much it is too bright; from below one more step is enough.
             exposure_ms = max(exposure_ms * _DOWN, _SHORTEST_MS)
             continue
-        needed_ms = math.inf if seen.dark else exposure_ms * wished / max(seen.level, 1e-6)
+        needed_ms = math.inf if seen.dark else exposure_ms * wanted / max(seen.level, 1e-6)
         if abs(needed_ms / exposure_ms - 1) < _CLOSE:
             return min(needed_ms, longest_ms)
         if exposure_ms >= longest_ms and needed_ms > longest_ms:

@@ -110,16 +110,8 @@ class LaserWatch:
 
     def _look_elsewhere(self, here: LitPlace) -> None:
         """See the stripe where it was, or somewhere; HardwareError where it is not."""
-        wanted = (
-            [self.lit]
-            if self.lit
-            else [
-                LitPlace(position, here.exposure_ms)
-                for position in spread(self._positions_mm, LOOKS)
-                if position != here.position_mm
-            ]
-        )
-        for place in wanted:
+        others = [position for position in spread(self._positions_mm, LOOKS) if position != here.position_mm]
+        for place in [self.lit] if self.lit else [LitPlace(position, here.exposure_ms) for position in others]:
             self._rig.move_to(place.position_mm)
             lit, unlit = (self._rig.image(light, place.exposure_ms)[0] for light in ("laser", "lamp"))
             if shows_laser(lit, unlit, self._sensor, difference=self._difference):
@@ -199,12 +191,7 @@ class Relief:
 
 
 class SlipWatch:
-    """Finds the earliest laser image of a scan with enough relief to show where the stage is.
-
-    Attributes
-    ----------
-    relief : Relief or None
-    """
+    """Finds the earliest laser image of a scan with enough ``relief`` to show where the stage is."""
 
     def __init__(self) -> None:
         self.relief: Relief | None = None

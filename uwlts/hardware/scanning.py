@@ -56,7 +56,7 @@ class Shot:
 
 @dataclass
 class Seen:
-    """What the images of a scan showed so far.
+    """Summary of the images of a scan so far.
 
     ``lines`` and ``found`` count the profile lines of laser images and those with a stripe, ``saturated`` and ``faint``
     the laser images on which many of the lit lines are at the full scale, or hardly reach a tenth of it; ``repeated``

@@ -1,4 +1,4 @@
-"""What both commands share on the terminal: progress bars, and errors that speak instead of tracebacks."""
+"""Progress bars and error messages of both commands on the terminal."""
 
 import os
 import sys

@@ -194,7 +194,7 @@ class _Processes(Workers):
             for connection in wait([process.connection for process, _, _ in busy.values()]) if busy else ():
                 process, number, job = busy[connection]
                 match process.message():
-                    case ("told", message):
+                    case ("message", message):
                         heard(message)
                         continue
                     case ("raised", error):
@@ -250,8 +250,8 @@ class _Process:
                 self._work = work
             self.connection.send(("job", job))
 
-    def message(self) -> tuple[Literal["told", "raised", "done"], Any] | Lost:
-        """What the job tells ("told"), its result ("done") or its error ("raised"), or that the process has ended."""
+    def message(self) -> tuple[Literal["message", "raised", "done"], Any] | Lost:
+        """A message of the job, its result ("done") or its error ("raised"), or that the process has ended."""
         try:
             return self.connection.recv()
         except (EOFError, ConnectionResetError):
@@ -335,7 +335,7 @@ def _serve(connection: Connection) -> None:
                 continue
             assert work is not None
             try:
-                result = work(content, partial(send, "told"))
+                result = work(content, partial(send, "message"))
             except (Error, OSError) as error:
                 send("raised", error)
             else:

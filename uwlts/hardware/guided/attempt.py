@@ -28,12 +28,7 @@ from uwlts.targets import TargetView
 class GuidedImages:
     """Takes images at the exposure of their light.
 
-    Parameters
-    ----------
-    dtype : dtype
-        Of the images.
-    known_ms : dict
-        Exposures already settled, as those of a recording that is gone on with.
+    ``known_ms`` are exposures already settled, as those of a recording that is continued.
     """
 
     def __init__(self, rig: Rig, plan: RigPlan, sensor: Sensor, *, dtype: np.dtype, known_ms: dict[Light, float]):
@@ -135,13 +130,7 @@ Attempt = Refused | Accepted
 
 
 class PoseJudge:
-    """Judges images of the target, taken now or read from a recording.
-
-    Parameters
-    ----------
-    full_dn : int
-        Grey value at which pixels clip.
-    """
+    """Judges images of the target, taken now or read from a recording; pixels clip at the grey value ``full_dn``."""
 
     def __init__(self, setting: Setting, wanted: Wanted, *, full_dn: int):
         self._setting, self._wanted, self._full = setting, wanted, full_dn

@@ -19,14 +19,8 @@ _LOOK_S = 0.1
 class Operator:
     """Says lines and reads answers, without stopping what goes on meanwhile.
 
-    Parameters
-    ----------
-    say : callable
-        Called with every line.
-    button : callable
-        Whether the page's button was pressed since it was last asked.
-    answers : file descriptor or None
-        Where lines come from; standard input unless given.
+    ``say`` is called with every line; ``button`` returns whether the page's button was pressed since the last call.
+    ``answers`` is the file descriptor that lines are read from, standard input unless given.
     """
 
     def __init__(self, say: Callable[[str], None], *, button: Callable[[], bool], answers: int | None = None):

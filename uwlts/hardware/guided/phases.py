@@ -138,25 +138,25 @@ class TargetPhase:
 
     def _free(self, state: State) -> State:
         watch = _Watch(self._plan.still_s, self._session.clock)
-        wish: PoseAdvice | None = None
+        advice: PoseAdvice | None = None
         refused: list[TargetView] = []
         while still_missing(state) and len(state.recorded) < self._plan.most_images:
             found = self._attempts.look()
-            wish = wish or best_pose(state, spin_rad=_spin(found.usable, state))
+            advice = advice or best_pose(state, spin_rad=_spin(found.usable, state))
             answer = self._operator.answer()
             if answer == "done":
                 break
             watch.see(found.view)
             self._improve_light(found.reasons)
-            reasons = self._why_wait(found, state, wish, [*(p.view for p in state.recorded), *refused])
-            self._lead(found, state, wish, reasons)
+            reasons = self._why_wait(found, state, advice, [*(p.view for p in state.recorded), *refused])
+            self._lead(found, state, advice, reasons)
             if answer is None and (reasons or not watch.still):
                 continue
             attempt = self._attempts.attempt(state, _NUMBER_MM * self._next_number(state))
             state = self._done(attempt, state, f"image {len(state.recorded) + 1}")
             watch.see(None)
             if isinstance(attempt, Accepted):
-                wish = None
+                advice = None
             else:
                 refused = [] if attempt.found.view is None else [attempt.found.view]
         return state
@@ -165,27 +165,27 @@ class TargetPhase:
         return 1 + max((round(pose.stage_mm / _NUMBER_MM) for pose in state.recorded), default=0)
 
     def _why_wait(
-        self, found: Found, state: State, wish: PoseAdvice | None, known: list[TargetView]
+        self, found: Found, state: State, advice: PoseAdvice | None, known: list[TargetView]
     ) -> tuple[str, ...]:
         """Why the target as it stands need not be taken."""
         view = found.usable
         if view is None:
             return found.reasons
         reasons = judge_novelty(view, known, self._attempts.limits)
-        if reasons or wish is None or missing_sheet(state):
+        if reasons or advice is None or missing_sheet(state):
             return reasons
         gain = gain_of(state, view, pose_of(view, state.camera))
-        return () if gain >= _USEFUL * wish.gain else ("adds little to what there is",)
+        return () if gain >= _USEFUL * advice.gain else ("adds little to what there is",)
 
-    def _lead(self, found: Found, state: State, wish: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
+    def _lead(self, found: Found, state: State, advice: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
         """Show the image, and say what to do next."""
         pose = None if found.usable is None else pose_of(found.usable, state.camera)
         sheet = missing_sheet(state)
-        request = "move the target" if wish is None else format_pose_advice(wish, state, pose)
+        request = "move the target" if advice is None else format_pose_advice(advice, state, pose)
         if sheet and not missing(state):
             request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
         self._page.request(request if reasons else "hold it still")
-        self._operator.hint(f"next: {request if wish is None or sheet else format_pose_advice(wish, state, None)}")
+        self._operator.hint(f"next: {request if advice is None or sheet else format_pose_advice(advice, state, None)}")
         points = None if found.view is None else found.view.pixels
         self._session.show(found.image, "; ".join(reasons) or "good", points=points)
 
@@ -308,7 +308,7 @@ class StepPhase:
         if any(isinstance(reason, LaserFault) for reason in quality.reasons) and self._images.resettle("laser"):
             image, exposure_ms = self._images.take("laser")
             quality = self._judge.judge(image)
-        # Whoever moves the standard must not have the laser before him.
+        # Nobody moves the standard while the laser is on.
         self._images.unlit()
         depth_mm, reasons = quality.depth_mm, quality.reasons
         if depth_mm is not None and not reasons:
