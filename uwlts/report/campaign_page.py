@@ -2,6 +2,7 @@
 
 import json
 import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +28,7 @@ from uwlts.report.page_toolkit import (
     svg_of,
     write_page,
 )
-from uwlts.report.pictures import cloud_png, stripe_png, write_pictures
+from uwlts.report.pictures import MeasurementPictures, draw_pictures, write_pictures
 from uwlts.report.summary_file import TruthSummary, summary, write_summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table, true_window_distance
 
@@ -93,18 +94,21 @@ def write_report(
     page = Path(out or campaign.folder / "report.html")
     report = Report(page, page.with_name("summary.json"), campaign, published)
     write_summary(report.summary, campaign, published, overwrite=overwrite)
-    write_page(page, report_page(campaign, published), overwrite=overwrite)
+    drawn = draw_pictures(campaign)
+    write_page(page, report_page(campaign, published, pictures=drawn), overwrite=overwrite)
     if pictures:
         try:
             Path(pictures).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"cannot make the folder {pictures}: {error.strerror}") from error
-        write_pictures(pictures, campaign, overwrite=overwrite)
+        write_pictures(pictures, drawn, overwrite=overwrite)
     return report
 
 
-def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
-    """The page as text."""
+def report_page(
+    campaign: Campaign, reference: Reference | None = None, *, pictures: Sequence[MeasurementPictures] | None = None
+) -> str:
+    """The page as text; ``pictures`` are those of `draw_pictures`, drawn unless given."""
     collected = FigureCollector()
     rows = summary_table(campaign, reference)
     return render_page(
@@ -117,7 +121,10 @@ def report_page(campaign: Campaign, reference: Reference | None = None) -> str:
         groups=_grouped(rows),
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
-        measurements=[_measurement(measurement, collected) for measurement in campaign.measurements],
+        measurements=[
+            _measurement(measurement, drawn, collected)
+            for measurement, drawn in zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)
+        ],
         calibration=_calibrations(campaign),
         true_window=true_window_distance(campaign) is not None,
         seconds=svg_of(plot.seconds(campaign.seconds)) if campaign.seconds else None,
@@ -161,18 +168,19 @@ class _CalibrationSection:
     groups: list[_ResidualPlots]
 
 
-def _measurement(measurement: Measurement, collected: FigureCollector) -> _MeasurementSection:
+def _measurement(
+    measurement: Measurement, pictures: MeasurementPictures, collected: FigureCollector
+) -> _MeasurementSection:
     cloud, judged, capture = measurement.cloud, measurement.judged, measurement.capture
     coloured = cloud is not None and cloud.deviation_mm is not None and bool(np.isfinite(cloud.deviation_mm).any())
-    stripe, still = stripe_png(measurement), cloud_png(measurement)
     shown = None
-    if cloud is not None and still is not None:
+    if cloud is not None and pictures.cloud is not None:
         figure, caption = plot.interactive_cloud(cloud)
-        shown = collected.add(figure, caption, webgl=True, still=png_data_uri(still))
+        shown = collected.add(figure, caption, webgl=True, still=png_data_uri(pictures.cloud))
     return _MeasurementSection(
         name=measurement.name,
         facts=_facts(measurement),
-        stripe=None if stripe is None else png_data_uri(stripe),
+        stripe=None if pictures.stripe is None else png_data_uri(pictures.stripe),
         no_stripe="no image of its capture shows a stripe" if capture else "its capture is not in the folder",
         cloud=shown,
         histogram=svg_of(plot.deviation_histogram(cloud)) if cloud is not None and coloured else None,
@@ -199,8 +207,8 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
         found = judged.evaluation
         share = found.points_rejected / max(1, found.points_used + found.points_rejected)
         allowed = "within" if found.within_vdi_outliers else "more than"
-        stray = f"{100 * share:.2f} %, {allowed} the 0.3 % of VDI/VDE 2634"
-        text = f"{found.points_used:,}, and {found.points_rejected:,} left out as stray ({stray})"
+        outliers = f"{100 * share:.2f} %, {allowed} the 0.3 % of VDI/VDE 2634"
+        text = f"{found.points_used:,}, and {found.points_rejected:,} left out as outliers ({outliers})"
         facts.append(("points evaluated", text))
     if measurement.digest is not None:
         known = measurement.calibration
@@ -320,12 +328,12 @@ _TILES = {
 _EXPLANATIONS = {
     "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free "
     "(VDI/VDE 2634: SSE is its error).",
-    "probing error PE": "Range of the points' distances from the fitted sphere without stray points, of which "
+    "probing error PE": "Range of the points' distances from the fitted sphere without outliers, of which "
     "VDI/VDE 2634 allows 0.3 %; of several spheres the worst.",
     "range error RE": "Range of the points' distances from the fitted plane.",
     "deviations STD": "Standard deviation of the points' distances from the fitted surface; of several the largest.",
     "deviations range": "Largest less smallest distance of the points from the fitted surface.",
-    "step height": "Mean distance of one tread's points from the plane fitted to the other tread.",
+    "step height": "Mean distance of one face's points from the plane fitted to the other face.",
     "pipe diameter": "Diameter of the fitted cylinder.",
     "within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
     "rms distance": "Root mean square of those distances. Only rendered captures have a true surface. A best fit turns "
@@ -415,7 +423,7 @@ def introduction(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def explanations(rows: list[Row], reference: Reference | None) -> list[tuple[str, str]]:
-    """What the quantities of a table mean."""
+    """Explanations of a table's quantities."""
     found = [
         (start, text) for start, text in _EXPLANATIONS.items() if any(row.quantity.startswith(start) for row in rows)
     ]

@@ -230,10 +230,19 @@ def svg_of(drawn: Drawn) -> Markup:
     return Markup(text[text.index("<svg") :].replace("xlink:href", "href"))
 
 
-def png_of(drawn: Drawn, *, dpi: int = 100) -> bytes:
-    """A matplotlib figure, or that of axes, as PNG."""
+def png_of(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
+    """A matplotlib figure, or that of axes, as PNG; with ``few_colours`` of 256 colours, in a third of the room."""
     # The software's name with its version would change the file.
-    return _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
+    data = _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
+    if few_colours:
+        from PIL import Image
+
+        with Image.open(io.BytesIO(data)) as picture, io.BytesIO() as smaller:
+            # Of Pillow's methods the octree takes a fifth of the others' time.
+            reduced = picture.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+            reduced.save(smaller, "png")
+            return smaller.getvalue()
+    return data
 
 
 def _saved(drawn: Drawn, **options: Any) -> bytes:

@@ -1,5 +1,6 @@
 """Pictures of a campaign's measurements as PNG: the stripe in one image, and the cloud."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,8 +63,25 @@ def stripe_picture(view: StripeView) -> Figure:
     return figure
 
 
-def stripe_png(measurement: Measurement) -> bytes | None:
-    """Stripe image of a measurement; None without a capture, or where no image shows a stripe."""
+@dataclass(frozen=True)
+class MeasurementPictures:
+    """A measurement's stripe and cloud as PNG; None without a capture that shows a stripe, or without a cloud."""
+
+    name: str
+    stripe: bytes | None
+    cloud: bytes | None
+
+
+def draw_pictures(campaign: Campaign) -> list[MeasurementPictures]:
+    """The pictures of a campaign's measurements, in order; CaptureError where an image of a capture is damaged."""
+    return [MeasurementPictures(each.name, _stripe_png(each), _cloud_png(each)) for each in campaign.measurements]
+
+
+def _cloud_png(measurement: Measurement) -> bytes | None:
+    return None if measurement.cloud is None else png_of(plot.cloud(measurement.cloud), few_colours=True)
+
+
+def _stripe_png(measurement: Measurement) -> bytes | None:
     if measurement.capture is None:
         return None
     with Capture(measurement.capture.path) as capture:
@@ -71,26 +89,21 @@ def stripe_png(measurement: Measurement) -> bytes | None:
     return None if view is None else png_of(stripe_picture(view))
 
 
-def cloud_png(measurement: Measurement) -> bytes | None:
-    """Picture of a measurement's cloud; None without one."""
-    return None if measurement.cloud is None else png_of(plot.cloud(measurement.cloud))
-
-
-def write_pictures(folder: str | Path, campaign: Campaign, *, overwrite: bool = False) -> list[Path]:
+def write_pictures(
+    folder: str | Path, pictures: Sequence[MeasurementPictures], *, overwrite: bool = False
+) -> list[Path]:
     """Write ``stripe-NAME.png`` and ``cloud-NAME.png`` of every measurement that has them; returns what was written.
 
     Raises
     ------
     OutputError
         The folder is missing, or a picture exists and ``overwrite`` is not given.
-    CaptureError
-        An image of a capture is damaged.
     """
     written = []
-    for measurement in campaign.measurements:
-        for kind, picture in (("stripe", stripe_png(measurement)), ("cloud", cloud_png(measurement))):
+    for each in pictures:
+        for kind, picture in (("stripe", each.stripe), ("cloud", each.cloud)):
             if picture is not None:
-                path = Path(folder) / f"{kind}-{measurement.name}.png"
+                path = Path(folder) / f"{kind}-{each.name}.png"
                 with written_aside(path, overwrite=overwrite) as aside:
                     aside.write_bytes(picture)
                 written.append(path)

@@ -27,7 +27,7 @@ from uwlts.report.campaign_page import report_page
 from uwlts.report.gather import gather_campaign, load_reference
 from uwlts.report.numbers import as_fine_as, fixed, small_length
 from uwlts.report.page_toolkit import png_of, svg_of, write_page
-from uwlts.report.pictures import StripeView, stripe_picture, write_pictures
+from uwlts.report.pictures import StripeView, draw_pictures, stripe_picture, write_pictures
 from uwlts.report.summary_file import summary, write_summary
 from uwlts.report.tables import print_table, summary_table
 from uwlts.storage.calibration_file import write_calibration
@@ -560,7 +560,7 @@ def test_a_campaign_may_hold_a_calibration_alone(folder, tmp_path):
 
 
 def test_pictures_are_written_for_what_there_is(campaign, tmp_path):
-    written = write_pictures(tmp_path, campaign)
+    written = write_pictures(tmp_path, draw_pictures(campaign))
     spheres = ("spheres-near", "spheres-far", "spheres-one")
     names = {f"{kind}-{name}.png" for name in spheres for kind in ("stripe", "cloud")}
     assert {path.name for path in written} == names | {"cloud-step.png"}
@@ -568,7 +568,7 @@ def test_pictures_are_written_for_what_there_is(campaign, tmp_path):
         picture = cv2.imread(str(path))
         assert picture.shape[1] == 1120 and picture.std() > 5
     with pytest.raises(OutputError, match="exists already"):
-        write_pictures(tmp_path, campaign)
+        write_pictures(tmp_path, draw_pictures(campaign))
 
 
 def test_centres_are_drawn_where_the_light_is():
