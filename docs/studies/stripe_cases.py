@@ -80,7 +80,7 @@ class Frames:
     """Errors of a case by method: centre minus truth in px (F, L), NaN where either is missing.
 
     ``mm_per_px`` (F, L) is how far a point moves along its surface's normal, away from the surface, for one px, and
-    ``step_mm`` (F, L, 3) how it moves in space; ``point_mm`` (F, L, 3) is the true point; ``used`` (F, L) tells
+    ``step_mm`` (F, L, 3) how it moves in space; ``point_mm`` (F, L, 3) is the true point; ``used`` (F, L) shows
     where the surface faces the laser; ``width_px`` is the median full width at half maximum. ``crop`` is a piece of
     the first image about the middle of the stripe, with its first row and column.
     """

@@ -70,10 +70,10 @@ def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     certified = content.get("calibration")
     if not isinstance(certified, dict):
         raise CaptureError(f"{path} is damaged: it does not name its calibration")
-    if found != (told := certified.get("sha256")):
+    if found != (stated := certified.get("sha256")):
         against.append(
             f"{calibration} is not the calibration that {path} is about, or was changed since: its SHA-256 is {found}, "
-            f"the certificate's {told}"
+            f"the certificate's {stated}"
         )
     return against
 

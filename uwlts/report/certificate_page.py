@@ -274,10 +274,10 @@ def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
         panels, ("surfaces: the calibration alone", "single points"), ("calibration_mm", "point_mm"), strict=True
     ):
         for number, axis in enumerate("XYZ"):
-            known = [worth for worth in lengths if worth.axis == axis]
-            y = [1e3 * getattr(worth, name) for worth in known]
+            known = [each for each in lengths if each.axis == axis]
+            y = [1e3 * getattr(each, name) for each in known]
             if known:
-                ax.plot([worth.length_mm for worth in known], y, "o-", color=COLOURS[number], label=f"along {axis}")
+                ax.plot([each.length_mm for each in known], y, "o-", color=COLOURS[number], label=f"along {axis}")
         ax.set(title=title, xlabel="length / mm", ylabel="expanded uncertainty (k = 2) / µm")
         ax.set_ylim(bottom=0)
     legend_below(figure)

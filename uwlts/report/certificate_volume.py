@@ -90,8 +90,8 @@ def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
                         2 * float(known.std_mm(use.covariance, noise_px=use.noise_px).max()),
                     )
                 )
-    fitting = {worth.length_mm for worth in found if worth.axis != "X"}
-    return [worth for worth in found if worth.length_mm in fitting]
+    fitting = {each.length_mm for each in found if each.axis != "X"}
+    return [each for each in found if each.length_mm in fitting]
 
 
 def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:

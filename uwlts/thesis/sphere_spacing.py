@@ -149,7 +149,7 @@ def window_choices(
 
 
 def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, list[StepImage]]:
-    """Step images by place, with their faces told apart."""
+    """Step images by place, with their faces separated."""
     found = {}
     for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
         with Capture(path) as capture:
@@ -174,7 +174,7 @@ def spacing_budget(
     """Budget of the sphere spacing by the thesis's sources, as standard uncertainties and what follows from them, mm.
 
     Index: the change of the spacing when the index changes by what 5 degC do, the calibration left as it is; mean over
-    the scans. Resolution: a tenth of what a pixel is worth along Z at the stand-off. SSE: the standard deviation of the
+    the scans. Resolution: a tenth of the change of Z per pixel at the stand-off. SSE: the standard deviation of the
     scans' spacing errors, with their mean as the correction. ``deviation_mm`` enters as the thesis's PE.
 
     Parameters
