@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import least_squares, root_scalar
 
-from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile
+from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.optics.reconstruction import points_on_sheet
@@ -205,7 +205,7 @@ def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[Step
         for number, on_it, profile in zip(here, treads, np.split(points, ends[:-1]), strict=True):
             if np.isfinite(profile).all():
                 step = steps[number]
-                height = step_height_of_profile(profile, step.labels[on_it], reference=step.reference)
+                height = step_height(profile, step.labels[on_it], reference=step.reference)
                 heights[number] = height.height_mm, height.std_mm
     return heights
 

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from uwlts.measurement.evaluation_file import EvaluationRecord, write_record
+from uwlts.measurement.evaluation_file import FORMAT, VERSION, EvaluationRecord
 from uwlts.measurement.figure_uncertainty import figure_uncertainties
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.metrology.evaluation import ArtefactEvaluation, Figure, Quantity
 from uwlts.metrology.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
-from uwlts.model.errors import EvaluationError
+from uwlts.model.errors import EvaluationError, problems_of
 from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.files import write_model
 from uwlts.storage.truth import Truth, read_truth
 
 # What points from perfect images by true parameters have to keep (tests/system/test_campaign.py).
@@ -98,21 +99,20 @@ class Evaluation:
         if self.truth is not None and self.truth_after_best_fit is not None:
             content["truth"] = self.truth.as_dict() | {"after_best_fit": self.truth_after_best_fit.as_dict()}
         if found is not None:
-            known = [(figure.key.name, figure.uncertainty) for figure in self.figures if figure.uncertainty is not None]
-            content["uncertainty"] = {
-                name: {"random_mm": u.random_mm, "systematic_mm": u.systematic_mm, "expanded_mm": u.expanded_mm}
-                for name, u in known
-            }
+            known = {figure.key.name: figure.uncertainty for figure in self.figures if figure.uncertainty is not None}
+            parts = ("random_mm", "systematic_mm", "expanded_mm")
+            content["uncertainty"] = {name: {part: getattr(u, part) for part in parts} for name, u in known.items()}
         try:
             return EvaluationRecord.model_validate(content)
         except ValidationError as error:
-            details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
-            raise EvaluationError(f"the metadata of the cloud {self.source} is not valid: {details}") from error
+            raise EvaluationError(
+                f"the metadata of the cloud {self.source} is not valid: {problems_of(error)}"
+            ) from error
 
 
 def evaluate(
     cloud: PointCloud | str | Path,
-    artefact: Artefact | dict[str, Any] | str | Path | None = None,
+    artefact: Artefact | dict[str, object] | str | Path | None = None,
     truth: Truth | str | Path | None = None,
     *,
     source: str | None = None,
@@ -141,8 +141,8 @@ def evaluate(
     if not isinstance(cloud, PointCloud):
         source = source or Path(cloud).name
         cloud = read_cloud(cloud)
-    if artefact is None:
-        artefact = cloud.metadata.get("artefact")
+    if artefact is None and (named := cloud.metadata.get("artefact")) is not None:
+        artefact = parse_artefact(named)
     if isinstance(artefact, str | Path):
         artefact = read_artefact(artefact)
     elif isinstance(artefact, dict):
@@ -169,15 +169,8 @@ def _against_truth(cloud: PointCloud, truth: Truth) -> tuple[TruthComparison, Tr
     """Comparison as measured, and after the rigid motion that takes out the difference of the coordinate systems."""
 
     def compared(points: np.ndarray) -> TruthComparison:
-        return compare_with_truth(
-            points,
-            cloud.frame,
-            cloud.line,
-            point_mm=truth.point_mm,
-            normal=truth.normal,
-            status=truth.status,
-            tolerance_mm=TOLERANCE_MM,
-        )
+        true = {"point_mm": truth.point_mm, "normal": truth.normal, "status": truth.status}
+        return compare_with_truth(points, cloud.frame, cloud.line, **true, tolerance_mm=TOLERANCE_MM)
 
     plain = compared(cloud.points_mm)
     motion = best_fit_motion(plain, cloud.points_mm)
@@ -186,4 +179,4 @@ def _against_truth(cloud: PointCloud, truth: Truth) -> tuple[TruthComparison, Tr
 
 def write_evaluation(path: str | Path, evaluation: Evaluation, *, overwrite: bool = False) -> None:
     """Write an evaluation as indented JSON, whole or not at all; OutputError where that fails."""
-    write_record(path, evaluation.record(), overwrite=overwrite)
+    write_model(path, evaluation.record(), format=FORMAT, version=VERSION, overwrite=overwrite)

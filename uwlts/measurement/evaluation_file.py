@@ -1,15 +1,13 @@
 """The evaluation file: figures of a cloud's evaluation, as JSON."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from uwlts.metrology.evaluation import FigureKey, figure_keys
 from uwlts.model.artefacts import Artefact
-from uwlts.model.errors import CaptureError
-from uwlts.storage.files import read_json, written_aside
+from uwlts.storage.files import read_model
 
 FORMAT = "uwlts-evaluation"
 VERSION = 1
@@ -92,20 +90,7 @@ class EvaluationRecord(_Stored):
         return {key: value for key, value in plain(self).items() if key in self.model_fields_set}
 
 
-def write_record(path: str | Path, record: EvaluationRecord, *, overwrite: bool = False) -> None:
-    """Write an evaluation as indented JSON, whole or not at all; OutputError where that fails."""
-    content = {"format": FORMAT, "version": VERSION} | record.model_dump(mode="json")
-    with written_aside(path, overwrite=overwrite) as aside:
-        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
 def read_evaluation(path: str | Path) -> EvaluationRecord:
     """Read an evaluation file; CaptureError where it is missing, foreign, newer or damaged."""
-    content = read_json(path, called="evaluation")
-    if (content.pop("format", None), content.pop("version", None)) != (FORMAT, VERSION):
-        raise CaptureError(f"{path} is JSON but not an evaluation that this program reads (version {VERSION})")
-    try:
-        return EvaluationRecord.model_validate(content)
-    except ValidationError as error:
-        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
-        raise CaptureError(f"{path} is damaged: {details}; evaluate the cloud again") from error
+    advice = "; evaluate the cloud again"
+    return read_model(path, EvaluationRecord, format=FORMAT, version=VERSION, called="evaluation", advice=advice)

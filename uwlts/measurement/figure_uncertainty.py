@@ -12,7 +12,7 @@ from uwlts.metrology.spheres import SphereEvaluation
 from uwlts.model.artefacts import Artefact
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
-# The standard deviation of as many is right to 27 % and to 10 %.
+# The standard deviation of so many is right to 27 % and to 10 %.
 _DRAWS, _QUICK_DRAWS = 8, 50
 _SEED = 635
 
@@ -63,7 +63,7 @@ def _evaluated(cloud: PointCloud, artefact: Artefact, moves: np.ndarray) -> dict
 
 
 def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
-    """How each point moves (N, 3) for one standard deviation of its stripe centre; the sign is any."""
+    """Motion (N, 3) of each point for one standard deviation of its stripe centre; of either sign."""
     covariance = np.zeros((len(uncertainty.random_mm2), 3, 3))
     for column, (i, j) in enumerate(PAIRS):
         covariance[:, i, j] = covariance[:, j, i] = uncertainty.random_mm2[:, column]
@@ -138,9 +138,6 @@ class MovedSpheres:
             calibrated = spacing.spacing_mm - spacing.sse_mm
             apart = float(np.linalg.norm(free[number + 1][0] - free[number][0]))
             apart_known = float(np.linalg.norm(known[number + 1] - known[number]))
-            spacings.append(
-                replace(
-                    spacing, spacing_mm=apart, sse_mm=apart - calibrated, sse_known_radius_mm=apart_known - calibrated
-                )
-            )
+            errors = {"sse_mm": apart - calibrated, "sse_known_radius_mm": apart_known - calibrated}
+            spacings.append(replace(spacing, spacing_mm=apart, **errors))
         return replace(self._evaluation, spheres=tuple(spheres), spacings=tuple(spacings)).figures_mm

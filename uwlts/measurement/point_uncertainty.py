@@ -1,4 +1,4 @@
-"""How well measured points are known: by the stripe's own noise, and by the calibration that all of them share.
+"""Uncertainty of measured points: by the stripe's own noise, and by the calibration that all of them share.
 
 GUM (JCGM 100:2008), section 5: the law of propagation, linear in the stripe's centre and in the calibration's
 parameters. What the calibration leaves open moves all points together. It is kept as patterns: each moves every point
@@ -21,12 +21,12 @@ from uwlts.storage.capture_sources import sha256_of
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 
 _BLOCK = 20000
-# Patterns that together move the points by no more than this (root mean square) are not worth their room.
+# Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
 
 # Rendered spheres show 0.2 to 0.5 of what blur may do, by how the light is spread in it, and that what comes from
-# beside the sheet is right to a tenth; how thick the sheet is a description tells less well.
+# beside the sheet is right to a tenth; the described thickness of the sheet is less certain.
 _BLUR_SHARE, _BESIDE_SHARE = 0.3, 0.2
 
 
@@ -42,7 +42,7 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
     off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
     if len(off) < _FEWEST_NEIGHBOURS:
-        raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: their noise cannot be told")
+        raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: too few to measure their noise")
     scale = MAD_TO_STD / np.sqrt(1.5)
     noise = np.full(int(frame.max()) + 1, scale * np.median(off))
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1]])
@@ -118,7 +118,7 @@ def _made_from(calibration: Calibration, capture: Capture) -> bool:
 
 
 def _shared_by_neighbours(calibration: Calibration) -> float:
-    """How much larger the noise is than neighbours tell, as those err together."""
+    """Factor of the noise over what neighbours show, as these err together."""
     return float(np.sqrt(require_joint(calibration).shared_variance.get(STRIPE, 1.0)))
 
 
@@ -156,7 +156,7 @@ def _patterns(moved: np.ndarray) -> np.ndarray:
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:
-    """How independent parts move a point (R + E, 3) for each mm that the stage has gone; OCS.
+    """Motion of a point (R + E, 3) by independent parts for each mm that the stage has gone; OCS.
 
     What the estimate knows of the stage goes with its own parts, ``root`` (P, R). The others are as the sensor's
     description says, and the scale that was found, as it is not applied to scans.

@@ -92,9 +92,8 @@ def reconstruct_stripes(
     """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
 
     ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` adds the
-    uncertainty of the points by a joint calibration. Without a window in the light's way
-    the calibration's window is left out. Points that a calibration by polynomials does not reach are left out and
-    counted in ``rays_by_status``.
+    uncertainty of the points by a joint calibration. Without a mounted window the calibration's is left out. Points
+    that a calibration by polynomials does not reach are left out and counted in ``rays_by_status``.
 
     By a joint calibration points are taken where the light comes from, beside the sheet's middle where the surface
     shines brighter there (`uwlts.optics.brightness`), and lines are left out, counted as ``blurred``, where blur may
@@ -171,20 +170,10 @@ def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, i
     """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
     if np.isfinite(capture.pose).any():
         return np.zeros((len(stripes.line), 3))
-    slopes = slopes_of_brightness(
-        stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm[:], capture.exposure_ms[:]
-    )
-    header = capture.header
-    return beside_sheet(
-        calibration,
-        header.sensor,
-        stripes.line,
-        stripes.centre_px,
-        stripes.width_px,
-        slopes,
-        medium_index=index,
-        stage_direction=header.stage_direction,
-    )
+    slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms)
+    where = (capture.header.sensor, stripes.line, stripes.centre_px, stripes.width_px, slopes)
+    direction = capture.header.stage_direction
+    return beside_sheet(calibration, *where, medium_index=index, stage_direction=direction)
 
 
 def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:

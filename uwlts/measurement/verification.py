@@ -17,16 +17,10 @@ from uwlts.storage.capture import Capture, opened_capture
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One calibrated quantity, measured.
+    """One calibrated quantity, measured, mm.
 
-    Attributes
-    ----------
-    quantity : str
-    calibrated_mm, measured_mm : float
-    calibrated_expanded_mm, measured_expanded_mm : float or None
-        Expanded uncertainties (k = 2) of the calibrated and of the measured value; None where not known.
-    limit_mm : float or None
-        Largest permissible error.
+    The ``expanded`` values are uncertainties (k = 2), None where not known; ``limit_mm`` is the largest permissible
+    error, if any.
     """
 
     quantity: str
@@ -94,12 +88,7 @@ def verify(
 ) -> Verification:
     """Measure the artefact that a capture shows and compare it with its calibrated values.
 
-    Parameters
-    ----------
-    capture : Capture or path
-    calibration : Calibration, PolynomialCalibration or path
-    limit_mm : float, optional
-        Largest permissible error, mm.
+    ``limit_mm`` is the largest permissible error.
 
     Raises
     ------
@@ -125,21 +114,18 @@ def verify(
         cloud = reconstruct(scan, calibration)
     evaluation = evaluate_cloud(cloud, artefact)
     known = figure_uncertainties(cloud, evaluation)
-    verdicts = []
-    for figure in evaluation.figures:
-        calibrated = figure.key.calibrated
-        if calibrated is None or figure.key.is_detail:
-            continue
-        verdicts.append(
-            Verdict(
-                quantity=calibrated.name,
-                calibrated_mm=calibrated.value_mm,
-                measured_mm=figure.measured_mm,
-                calibrated_expanded_mm=calibrated.uncertainty_mm,
-                measured_expanded_mm=known[figure.key.name].expanded_mm if figure.key.name in known else None,
-                limit_mm=limit_mm,
-            )
+    verdicts = tuple(
+        Verdict(
+            quantity=calibrated.name,
+            calibrated_mm=calibrated.value_mm,
+            measured_mm=figure.measured_mm,
+            calibrated_expanded_mm=calibrated.uncertainty_mm,
+            measured_expanded_mm=known[figure.key.name].expanded_mm if figure.key.name in known else None,
+            limit_mm=limit_mm,
         )
+        for figure in evaluation.figures
+        if (calibrated := figure.key.calibrated) is not None and not figure.key.is_detail
+    )
     if not verdicts:
         raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size to verify by")
-    return Verification(tuple(verdicts))
+    return Verification(verdicts)

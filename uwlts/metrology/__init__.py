@@ -1,1 +1,1 @@
-"""What a cloud is worth: fitted shapes, artefacts with calibrated sizes, comparison with ground truth."""
+"""Evaluation of point clouds: fitted shapes, artefacts with calibrated sizes, comparison with ground truth."""

@@ -1,4 +1,4 @@
-"""Evaluation of clouds against artefacts: planes, pipes and steps here, spheres in `sphere_evaluation`."""
+"""Evaluation of clouds against artefacts: planes, pipes and steps; spheres by `uwlts.metrology.spheres`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,25 +12,23 @@ from uwlts.metrology.flat_fits import PlaneFit, fit_plane
 from uwlts.metrology.least_squares import RobustFit, fit_robustly
 from uwlts.metrology.round_fits import CylinderFit, fit_cylinder
 from uwlts.metrology.spheres import evaluate_spheres
-from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile, step_height_of_scan
+from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
 from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
 
-_MOST_REJECTED = 0.1
-_DIAMETER_TOLERANCE = 0.2
-_LEAST_ARC = np.pi
-_SECTORS = 72
+# A larger share of outliers is another surface; a diameter that differs by more is another pipe.
+_MOST_REJECTED, _DIAMETER_TOLERANCE = 0.1, 0.2
+# Arc in rad that must be seen for the ovality, counted in sectors of 5 deg.
+_LEAST_ARC, _SECTORS = np.pi, 72
+# Points on each face for the height of one profile; a line through fewer is uncertain by its own noise.
 _LEAST_OF_PROFILE = 5
 
 
 def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
     """Measure the artefact in the cloud and compare it with its calibrated sizes.
 
-    Raises
-    ------
-    EvaluationError
-        The cloud does not show what the artefact's description says; the message says what was found.
+    EvaluationError where the cloud does not show what the artefact's description says, with what was found.
     """
     match artefact:
         case SphereStandard():
@@ -94,10 +92,7 @@ class PipeEvaluation(ArtefactEvaluation):
 def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluation:
     """Range and standard deviation about the best plane of points (N, 3), mm, OCS.
 
-    Raises
-    ------
-    EvaluationError
-        Too few points, or a tenth of them away from the plane.
+    EvaluationError for too few points, or a tenth of them away from the plane.
     """
     robust = _fitted(partial(fit_plane, towards=TOWARDS_SENSOR), points, artefact.kind)
     return PlaneEvaluation(
@@ -113,11 +108,8 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
 def evaluate_pipe(points: np.ndarray, artefact: Pipe) -> PipeEvaluation:
     """Diameter and form of the best cylinder of points (N, 3), mm, OCS.
 
-    Raises
-    ------
-    EvaluationError
-        Too few points, a tenth of them away from the cylinder, a patch that leaves the cylinder open, or a diameter
-        that is not the artefact's within a fifth.
+    EvaluationError for too few points, a tenth of them away from the cylinder, a patch that leaves the cylinder open,
+    or a diameter that is not the artefact's within a fifth.
     """
     robust = _fitted(fit_cylinder, points, artefact.kind)
     fit = robust.fit
@@ -215,14 +207,11 @@ class StepEvaluation(ArtefactEvaluation):
 def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard, *, seed: int = 0) -> StepEvaluation:
     """Find the faces in points (N, 3), mm, OCS, of the images `frame` (N,) and measure their distance.
 
-    Raises
-    ------
-    EvaluationError
-        No two faces at this height.
+    EvaluationError where there are no two faces at this height.
     """
     labels = label_step_faces(points, height_mm=artefact.height_mm, edge_mm=artefact.edge_mm, seed=seed)
     lower, upper = (_step_face(points, labels, face) for face in (StepFace.LOWER, StepFace.UPPER))
-    height = step_height_of_scan(points, labels, reference=artefact.reference)
+    height = step_height(points, labels, reference=artefact.reference)
     base, direction = (lower, 1.0) if artefact.reference == "lower" else (upper, -1.0)
     other = StepFace.UPPER if artefact.reference == "lower" else StepFace.LOWER
     # The sheet cuts the step at an angle to its normal, where it is longer by one over the cosine.
@@ -267,6 +256,6 @@ def _heights_by_profile(
         profile = frame == number
         counts = [np.count_nonzero(labels[profile] == face) for face in (StepFace.LOWER, StepFace.UPPER)]
         if min(counts) >= _LEAST_OF_PROFILE:
-            height = step_height_of_profile(points[profile, 1:], labels[profile], reference=reference)
+            height = step_height(points[profile, 1:], labels[profile], reference=reference)
             heights.append(height.height_mm)
     return np.array(heights)

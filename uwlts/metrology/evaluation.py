@@ -16,7 +16,7 @@ TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 
 
 class Quantity(StrEnum):
-    """What a figure is; PE, RE and SSE are the probing, range and sphere spacing errors of VDI/VDE 2634."""
+    """Kind of a figure; PE, RE and SSE are the probing, range and sphere spacing errors of VDI/VDE 2634."""
 
     PROBING_ERROR = "PE"
     RANGE_ERROR = "RE"
@@ -47,15 +47,9 @@ class CalibratedQuantity:
 class FigureKey:
     """Which figure of an artefact is meant.
 
-    Attributes
-    ----------
-    quantity : Quantity
-    name : str
-        In evaluation files and on pages.
-    spheres : tuple of int
-        Numbers, from 1, of the spheres the figure belongs to; empty where it belongs to the whole artefact.
-    calibrated : CalibratedQuantity or None
-        The quantity whose error the figure is; None for figures that are no error of one.
+    ``name`` stands in evaluation files and on pages. ``spheres`` are the numbers, from 1, of the spheres the figure
+    belongs to, empty where it belongs to the whole artefact. ``calibrated`` is the quantity whose error the figure is,
+    None for figures that are no error of one.
     """
 
     quantity: Quantity
@@ -163,16 +157,9 @@ def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
 class ArtefactEvaluation(ABC):
     """Figures of an artefact and the numbers of points.
 
-    Attributes
-    ----------
-    artefact : Artefact
-    points_used : int
-        Points on which the figures rest.
-    points_rejected : int
-        Outliers on the artefact that were left out (`fit_robustly`); other points of the cloud, which do not
-        belong to the artefact, are in neither number.
-    deviation_mm : (N,)
-        Signed deviation of every used point of the cloud; NaN for all others.
+    ``points_rejected`` are the outliers on the artefact that were left out (`fit_robustly`); points of the cloud that
+    do not belong to the artefact are in neither number. ``deviation_mm`` (N,) is the signed deviation of every used
+    point of the cloud, NaN for all others.
     """
 
     kind: ClassVar[str]

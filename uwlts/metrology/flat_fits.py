@@ -75,12 +75,7 @@ class LineFit:
 
 
 def fit_plane(points: Any, towards: Any = None) -> PlaneFit:
-    """Least-squares plane through points (N, 3), mm.
-
-    Parameters
-    ----------
-    towards : (3,), optional
-        The normal is turned to this side; without it its largest component is positive.
+    """Least-squares plane through points (N, 3), mm, its normal turned ``towards`` (3,) or its largest part positive.
 
     Raises
     ------

@@ -12,20 +12,17 @@ from uwlts.model.errors import EvaluationError
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
-
 VDI_OUTLIER_SHARE = 0.003
 """VDI/VDE 2634 lets at most 3 permille of the points be left out."""
 
-
 DEFAULT_K = 5.0
 """Of normal noise 6 points in ten million lie farther out than 5 standard deviations."""
-
 
 _RETURNING_ROUNDS = 20
 
 
 class Fit(Protocol):
-    """What `fit_robustly` needs of a fitted shape."""
+    """A fitted shape, as `fit_robustly` needs it."""
 
     @property
     def residuals_mm(self) -> np.ndarray: ...
@@ -114,9 +111,7 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
 # Singular values this much smaller than the largest one are rounding noise of coordinates of size one.
 _SINGULAR = 1e-9
 
-
 _STEPS = 300
-
 
 LARGEST_RELATIVE_STD = 0.2
 """A radius that is uncertain by more than this share of itself may as well be infinite: the shape may be a plane."""
@@ -132,15 +127,7 @@ class Normalised:
 
 
 def accepted_points(points: Any, *, least: int, what: str, dimensions: tuple[int, ...] = (3,)) -> np.ndarray:
-    """Refuse what no fit can use.
-
-    Raises
-    ------
-    EvaluationError
-        Fewer than `least` points, or points that are not finite.
-    ValueError
-        Not an (N, D) array with D in `dimensions`.
-    """
+    """Points (N, D) for a fit; EvaluationError for fewer than `least` or not finite, ValueError for another shape."""
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] not in dimensions:
         raise ValueError(f"points of the shape (N, {' or '.join(map(str, dimensions))}) expected, not {points.shape}")
@@ -167,12 +154,7 @@ def prepared_round(
 ) -> tuple[np.ndarray, Normalised, float | None]:
     """Points (N, 3) for a fit of a round surface, the same normalised, and the known radius in their unit, if any.
 
-    A known radius saves one of the ``least`` points.
-
-    Raises
-    ------
-    EvaluationError
-        Too few points, points that are not finite, or all in one plane.
+    A known radius saves one of the ``least`` points. EvaluationError as `accepted_points`, and for points in one plane.
     """
     points = accepted_points(points, least=least if radius_mm is None else least - 1, what=what)
     if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
@@ -211,16 +193,8 @@ def minimised(
 
     The sum is infinite where the search does not converge, so that the best of several starts can be taken.
     """
-    solution = least_squares(
-        residuals,
-        start,
-        jac=jacobian,  # pyright: ignore[reportArgumentType]
-        method="lm",
-        xtol=1e-13,
-        ftol=1e-15,
-        gtol=1e-15,
-        max_nfev=_STEPS,
-    )
+    limits: dict[str, Any] = {"xtol": 1e-13, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": _STEPS}
+    solution = least_squares(residuals, start, jac=jacobian, method="lm", **limits)  # pyright: ignore[reportArgumentType]
     converged = solution.success and np.isfinite(solution.x).all()
     return solution.x, 2.0 * float(solution.cost) if converged else np.inf
 

@@ -17,10 +17,10 @@ from uwlts.metrology.least_squares import (
 )
 from uwlts.model.errors import EvaluationError
 
-_THINNED = 600
-_NEIGHBOURS = 12
-_DIRECTIONS = 80
-_TRIED = 5
+# The search for a cylinder's axis: points, neighbours for a local normal, directions on the half sphere (some 15 deg
+# apart), and how many of the best are refined.
+_THINNED, _NEIGHBOURS, _DIRECTIONS, _TRIED = 600, 12, 80, 5
+# Standard uncertainty of the axis's slope from which the direction is open: 11 deg.
 _LARGEST_SLOPE_STD = 0.2
 
 
@@ -53,12 +53,7 @@ class SphereFit:
 
 
 def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
-    """Least-squares sphere through points (N, 3), mm; a cap is enough.
-
-    Parameters
-    ----------
-    radius_mm : float, optional
-        Known radius; without it the radius is fitted.
+    """Least-squares sphere through points (N, 3), mm, with free or known radius; a cap is enough.
 
     Raises
     ------
@@ -68,10 +63,15 @@ def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
     """
     what = "a sphere fit"
     points, unit, known = prepared_round(points, radius_mm, least=5, what=what)
+    if known is None:
+        centre, radius = algebraic_centres(unit.points)
+        start = np.array([*centre, radius])
+    else:
+        start = centre_of_known_radius(unit.points, known)
     parameters, cost = minimised(
-        lambda x: _sphere_residuals(x, unit.points, known),
+        lambda x: np.linalg.norm(unit.points - x[:3], axis=1) - (x[3] if known is None else known),
         lambda x: _sphere_jacobian(x, unit.points),
-        _sphere_start(unit.points, known),
+        start,
     )
     require_convergence(cost, what=what)
     covariance, std = covariance_of(_sphere_jacobian(parameters, unit.points), cost, what="a sphere")
@@ -88,11 +88,6 @@ def fit_sphere(points: Any, radius_mm: float | None = None) -> SphereFit:
     return SphereFit(centre, float(radius), residuals, std * unit.scale_mm, covariance * unit.scale_mm**2)
 
 
-def _sphere_residuals(parameters: np.ndarray, points: np.ndarray, known: float | None) -> np.ndarray:
-    radius = parameters[3] if known is None else known
-    return np.linalg.norm(points - parameters[:3], axis=1) - radius
-
-
 def _sphere_jacobian(parameters: np.ndarray, points: np.ndarray) -> np.ndarray:
     """d|p - c| / dc is minus the unit vector from the centre; d/dr is -1."""
     away = points - parameters[:3]
@@ -100,13 +95,6 @@ def _sphere_jacobian(parameters: np.ndarray, points: np.ndarray) -> np.ndarray:
     jacobian = np.full((len(points), len(parameters)), -1.0)
     np.negative(away, out=jacobian[:, :3])
     return jacobian
-
-
-def _sphere_start(points: np.ndarray, known: float | None) -> np.ndarray:
-    if known is not None:
-        return centre_of_known_radius(points, known)
-    centre, radius = algebraic_centres(points)
-    return np.array([*centre, radius])
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +135,10 @@ class CylinderFit:
 
 
 def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = None) -> CylinderFit:
-    """Least-squares cylinder through points (N, 3), mm.
+    """Least-squares cylinder through points (N, 3), mm, with free or known radius.
 
     Parameters
     ----------
-    radius_mm : float, optional
-        Known radius; without it the radius is fitted.
     axis_start : (3,), optional
         Approximate direction of the axis. Without it the direction is searched: the principal axes of the points, the
         direction most nearly normal to all local surface normals, and an even grid over the half sphere are judged by
@@ -167,9 +153,7 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
     what = "a cylinder fit"
     points, unit, known = prepared_round(points, radius_mm, least=6, what=what)
     thinned = evenly_thinned(unit.points, _THINNED)
-    trials = [
-        _refined_cylinder(thinned, frame, start, known) for frame, start in _cylinder_starts(thinned, known, axis_start)
-    ]
+    trials = [_refined_cylinder(thinned, *start, known) for start in _cylinder_starts(thinned, known, axis_start)]
     frame, start, _ = min(trials, key=lambda trial: trial[2])
     frame, parameters, cost = _refined_cylinder(unit.points, frame, start, known)
     require_convergence(cost, what=what)
@@ -198,7 +182,9 @@ def fit_cylinder(points: Any, radius_mm: float | None = None, axis_start: Any = 
     )
 
 
-def _cylinder_geometry(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray):
+def _cylinder_geometry(
+    parameters: np.ndarray, points: np.ndarray, frame: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Radial vectors (N, 3), positions along the axis (N,), stretch of the direction a + s u + t v."""
     direction = frame[2] + parameters[2:4] @ frame[:2]
     stretch = float(np.linalg.norm(direction))
@@ -206,13 +192,6 @@ def _cylinder_geometry(parameters: np.ndarray, points: np.ndarray, frame: np.nda
     away = points - parameters[:2] @ frame[:2]
     along = away @ direction
     return away - along[:, None] * direction, along, stretch
-
-
-def _cylinder_residuals(
-    parameters: np.ndarray, points: np.ndarray, frame: np.ndarray, known: float | None
-) -> np.ndarray:
-    radial, _, _ = _cylinder_geometry(parameters, points, frame)
-    return np.linalg.norm(radial, axis=1) - (parameters[4] if known is None else known)
 
 
 def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.ndarray) -> np.ndarray:
@@ -226,10 +205,14 @@ def _cylinder_jacobian(parameters: np.ndarray, points: np.ndarray, frame: np.nda
     return jacobian
 
 
-def _refined_cylinder(points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None):
+def _refined_cylinder(
+    points: np.ndarray, frame: np.ndarray, start: np.ndarray, known: float | None
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Solution as (frame, parameters, cost) with the frame turned so that both slopes are zero."""
     parameters, cost = minimised(
-        lambda x: _cylinder_residuals(x, points, frame, known), lambda x: _cylinder_jacobian(x, points, frame), start
+        lambda x: np.linalg.norm(_cylinder_geometry(x, points, frame)[0], axis=1) - (x[4] if known is None else known),
+        lambda x: _cylinder_jacobian(x, points, frame),
+        start,
     )
     turned = _frame(frame[2] + parameters[2:4] @ frame[:2])
     foot = turned[:2] @ (parameters[:2] @ frame[:2])

@@ -17,45 +17,15 @@ from uwlts.model.errors import EvaluationError
 LEAST_POINTS = 50
 """A sphere is judged by at least so many points."""
 
-
-# All shares are of the known radius.
-_SEARCH_LIMIT = 0.05
-
-
-_LARGEST_LIMIT = 0.1
-
-
-_SMALLEST_LIMIT = 1e-4
-
-
-_RADIUS_TOLERANCE = 0.1
-
-
-_CELL = 0.12
-
-
-_THINNING = 1 / 15
-
-
-_THINNED = 4000
-
-
-_SCREENED = 1000
-
-
-_SEEDS = 2000
-
-
-_KEPT = (150, 8)
-
-
-_ATTEMPTS = 3
-
-
-_OUTER_SHARE = 0.1
-
-
-_OUTER_COUNT = 2
+# Shares of the known radius: band in which support is counted, limits of the band of points, and the largest error of
+# a fitted radius by which points are still taken for the sphere's.
+_SEARCH_LIMIT, _LARGEST_LIMIT, _SMALLEST_LIMIT, _RADIUS_TOLERANCE = 0.05, 0.1, 1e-4, 0.1
+# Cells, in radii: of the patches in which other surfaces are noticed, and of the thinning.
+_CELL, _THINNING = 0.12, 1 / 15
+# Points and proposed centres that are judged; more take longer without finding more.
+_THINNED, _SCREENED, _SEEDS, _KEPT, _ATTEMPTS = 4000, 1000, 2000, (150, 8), 3
+# Least number and share of points beyond the limit, where noise alone puts 6 in ten million.
+_OUTER_SHARE, _OUTER_COUNT = 0.1, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,13 +119,8 @@ def _proposed_centres(points: np.ndarray, radius: float, rng: np.random.Generato
     seeds = rng.integers(len(points), size=_SEEDS)
     balls = KDTree(points).query_ball_point(points[seeds], radius)
     picks = rng.random((_SEEDS, 2))
-    triples = np.array(
-        [
-            (seed, *(ball[int(pick * len(ball))] for pick in pair))
-            for seed, ball, pair in zip(seeds, balls, picks, strict=True)
-        ]
-    )
-    first, second, third = points[triples[:, 0]], points[triples[:, 1]], points[triples[:, 2]]
+    pairs = [[ball[int(pick * len(ball))] for pick in pair] for ball, pair in zip(balls, picks, strict=True)]
+    first, (second, third) = points[seeds], points[np.array(pairs).T]
     # Circumcentre of a triangle with the sides a, b from its first corner: ((|a|2 b - |b|2 a) x (a x b)) / 2 |a x b|2.
     a, b = second - first, third - first
     normal = np.cross(a, b)
@@ -366,15 +331,12 @@ def _found_spheres(points: np.ndarray, artefact: SphereStandard, rng: np.random.
     for diameter in artefact.diameters_mm:
         sphere = find_sphere(points, diameter / 2, usable=usable, rng=rng)
         if sphere is None:
-            places = [
-                "{:.2f} mm at ({:.1f}, {:.1f}, {:.1f}) with {} points".format(
-                    2 * other.robust.fit.radius_mm, *other.robust.fit.centre_mm, len(other.used)
-                )
-                for other in found
-            ]
+            place = "{:.2f} mm at ({:.1f}, {:.1f}, {:.1f}) with {} points".format
+            fits = [(other.robust.fit, len(other.used)) for other in found]
+            places = ", ".join(place(2 * fit.radius_mm, *fit.centre_mm, count) for fit, count in fits)
             raise EvaluationError(
                 f"{len(found)} of {len(artefact.diameters_mm)} spheres found among {len(points)} points"
-                f"{': ' + ', '.join(places) if places else ''}; no other surface has a diameter near {diameter:g} mm "
+                f"{places and ': ' + places}; no other surface has a diameter near {diameter:g} mm "
                 f"on at least {LEAST_POINTS} points. Scan all spheres of the artefact, or correct its description"
             )
         found.append(sphere)
@@ -387,18 +349,10 @@ def _in_order(found: list[FoundSphere], artefact: SphereStandard) -> list[FoundS
     centres = np.array([sphere.robust.fit.centre_mm for sphere in found])
     diameters = np.array([2 * sphere.robust.fit.radius_mm for sphere in found])
     along = int(np.ptp(centres[:, 1]) >= np.ptp(centres[:, 0]))
-    orders = [list(order) for order in permutations(range(len(found)))]
-    misfits = np.array(
-        [
-            max(
-                np.abs(diameters[order] - artefact.diameters_mm).max(),
-                np.abs(np.linalg.norm(np.diff(centres[order], axis=0), axis=1) - np.array(artefact.spacings_mm)).max(
-                    initial=0.0
-                ),
-            )
-            for order in orders
-        ]
-    )
+    orders = np.array(list(permutations(range(len(found)))))
+    spacings = np.linalg.norm(np.diff(centres[orders], axis=1), axis=2)
+    sizes, calibrated = np.hstack([diameters[orders], spacings]), [*artefact.diameters_mm, *artefact.spacings_mm]
+    misfits = np.abs(sizes - np.array(calibrated)).max(axis=1)
     equal = np.flatnonzero(misfits <= misfits.min() + _SAME_SIZE * min(artefact.diameters_mm))
     best = max(equal, key=lambda number: centres[orders[number][-1], along] - centres[orders[number][0], along])
     return [found[position] for position in orders[best]]

@@ -14,16 +14,11 @@ from uwlts.metrology.flat_fits import LineFit, PlaneFit, fit_line, fit_plane
 from uwlts.metrology.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
 from uwlts.model.errors import EvaluationError
 
-# Shares of the height.
-_SEARCH_LIMIT = 0.05
-_HEIGHT_TOLERANCE = 0.25
-_LIMITS = (0.01, 0.3)
-_LARGEST_STD = 0.125
-
-_PROPOSALS = 500
-_THINNED = 800
-_SMALLEST_FACE = 0.02
-_ROUNDS = 5
+# Shares of the height: band in which support is counted, error of the described height, limits of a face's band, and
+# the largest standard deviation of a face: a slope that fills the widest band has 0.17.
+_SEARCH_LIMIT, _HEIGHT_TOLERANCE, _LIMITS, _LARGEST_STD = 0.05, 0.25, (0.01, 0.3), 0.125
+# Pairs (triples) of points tried, points on which they are judged, least share of these on a face, and refinements.
+_PROPOSALS, _THINNED, _SMALLEST_FACE, _ROUNDS = 500, 800, 0.02, 5
 
 
 class StepFace(IntEnum):
@@ -89,39 +84,30 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     return labels
 
 
-def step_height_of_profile(
-    points_yz: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
+def step_height(
+    points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
 ) -> StepHeight:
-    """Mean distance of one face's points to the line through the other's, in one profile (thesis, section 3.2.2).
+    """Mean distance of one face's points to the line (profile) or plane (scan) through the other's.
 
-    Where the sheet does not cut the step along its normal this is the height over the cosine of the angle between.
+    Thesis, section 3.2.2. In a profile whose sheet does not cut the step along its normal this is the height over the
+    cosine of the angle between.
 
     Parameters
     ----------
-    points_yz : (N, 2), mm
+    points : (N, 2) or (N, 3), mm
     labels : (N,)
         From `label_step_faces`. While points move a little, as in a calibration, the labels can stay.
     reference : str
-        The face to which the line is fitted.
+        The face to which the line or plane is fitted.
 
     Raises
     ------
     EvaluationError
         Too few points on a face.
     """
-    return _step_height(points_yz, labels, reference, fit_line)
-
-
-def step_height_of_scan(
-    points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
-) -> StepHeight:
-    """The same in a whole scan (N, 3), mm: mean distance to the plane through the other face's points."""
-    return _step_height(points, labels, reference, fit_plane)
-
-
-def _step_height(points: np.ndarray, labels: np.ndarray, reference: str, fit) -> StepHeight:
     base, other = (StepFace.LOWER, StepFace.UPPER) if reference == "lower" else (StepFace.UPPER, StepFace.LOWER)
     points = np.asarray(points, dtype=np.float64)
+    fit = fit_line if points.shape[1] == 2 else fit_plane
     surface: LineFit | PlaneFit = fit(points[labels == base])
     across = accepted_points(points[labels == other], least=2, what="a step face", dimensions=(2, 3))
     distances = surface.distances_mm(across)
@@ -134,22 +120,19 @@ def _step_height(points: np.ndarray, labels: np.ndarray, reference: str, fit) ->
 def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
     """Two levels at the right distance, each with enough points and narrow: a slope or curve fills its whole band."""
     lower, upper = heights[labels == StepFace.LOWER], heights[labels == StepFace.UPPER]
+    found, advice = f"no two step faces about {height:g} mm apart", "show both faces, or correct the height"
     if min(len(lower), len(upper)) < least:
-        raise EvaluationError(
-            f"no two step faces about {height:g} mm apart: {len(lower)} points on the lower level, {len(upper)} on the "
-            f"upper one, at least {least} needed on each; show both faces, or correct the height"
+        counts = (
+            f"{len(lower)} points on the lower level, {len(upper)} on the upper one, at least {least} needed on each"
         )
+        raise EvaluationError(f"{found}: {counts}; {advice}")
     widest = max(float(lower.std()), float(upper.std()))
     if widest > _LARGEST_STD * height:
-        raise EvaluationError(
-            f"no two step faces about {height:g} mm apart: what lies at these levels scatters by {widest:.2g} mm "
-            f"(standard deviation) and is sloping or curved; show both faces, or correct the height"
-        )
+        scatter = f"what lies at these levels scatters by {widest:.2g} mm (standard deviation)"
+        raise EvaluationError(f"{found}: {scatter} and is sloping or curved; {advice}")
     distance = float(upper.mean() - lower.mean())
     if abs(distance - height) > _HEIGHT_TOLERANCE * height:
-        raise EvaluationError(
-            f"the step faces found are {distance:.2f} mm apart; the step is described with {height:g} mm"
-        )
+        raise EvaluationError(f"the step faces are {distance:.2f} mm apart; the step is described with {height:g} mm")
 
 
 def _best_proposal(

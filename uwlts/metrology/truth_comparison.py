@@ -84,26 +84,23 @@ def compare_with_truth(
         Points without frame and line, or with ones beyond the truth; truth that is not finite or has no unit normals
         where it says visible; no point matches.
     """
-    points = np.asarray(points, dtype=np.float64)
+    points, point_mm, normal = (np.asarray(values, dtype=np.float64) for values in (points, point_mm, normal))
     frame, line = np.asarray(frame), np.asarray(line)
     visible = np.asarray(status) == TruthStatus.VISIBLE
     if points.shape != (len(points), 3) or frame.shape != (len(points),) or line.shape != frame.shape:
         raise ValueError(f"(N, 3) points and (N,) indices expected: {points.shape}, {frame.shape}, {line.shape}")
-    if np.shape(point_mm) != (*visible.shape, 3) or np.shape(normal) != (*visible.shape, 3) or visible.ndim != 2:
-        raise ValueError(
-            f"truth of the shapes (F, L, 3), (F, L, 3), (F, L) expected: {np.shape(point_mm)}, {np.shape(normal)}, "
-            f"{visible.shape}"
-        )
-    _require_proper(points, frame, line, np.asarray(point_mm), np.asarray(normal), visible)
-
+    shapes = point_mm.shape, normal.shape, visible.shape
+    if visible.ndim != 2 or shapes[:2] != ((*visible.shape, 3),) * 2:
+        raise ValueError(f"truth of the shapes (F, L, 3), (F, L, 3), (F, L) expected: {shapes}")
+    _require_proper(points, frame, line, point_mm, normal, visible)
     matched = visible[frame, line]
     if not matched.any():
         raise EvaluationError(f"none of the {len(points)} points lies on a frame and line with a visible true stripe")
     error = np.full(points.shape, np.nan)
     distance = np.full(len(points), np.nan)
     at = frame[matched], line[matched]
-    error[matched] = points[matched] - np.asarray(point_mm, dtype=np.float64)[at]
-    distance[matched] = np.sum(error[matched] * np.asarray(normal, dtype=np.float64)[at], axis=1)
+    error[matched] = points[matched] - point_mm[at]
+    distance[matched] = np.sum(error[matched] * normal[at], axis=1)
     found = np.zeros_like(visible)
     found[at] = True
 
@@ -158,5 +155,5 @@ def _require_proper(
     if not np.isfinite(truth[visible]).all():
         raise EvaluationError("the truth is not finite on lines whose stripe it calls visible")
     # Normals may come in single precision (1e-7); a wrong length would scale every distance.
-    if not np.allclose(np.sum(np.square(normal[visible], dtype=np.float64), axis=1), 1.0, rtol=0, atol=1e-5):
+    if not np.allclose(np.sum(np.square(normal[visible]), axis=1), 1.0, rtol=0, atol=1e-5):
         raise EvaluationError("the truth has normals that are not of unit length on lines it calls visible")

@@ -48,8 +48,9 @@ class Source:
 
     def __post_init__(self) -> None:
         if self.distribution not in _DIVISORS:
-            known = ", ".join(_DIVISORS)
-            raise RangeError(f"{self.name}: unknown distribution '{self.distribution}'; known are {known}")
+            raise RangeError(
+                f"{self.name}: unknown distribution '{self.distribution}'; known are {', '.join(_DIVISORS)}"
+            )
         if not (math.isfinite(self.sensitivity) and math.isfinite(self.correction)):
             numbers = f"sensitivity {self.sensitivity:g} and correction {self.correction:g}"
             raise RangeError(f"{self.name}: {numbers}; both must be finite")
@@ -71,7 +72,7 @@ class Source:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """What the sources give together, in the unit of the result.
+    """Combined uncertainty of all sources, in the unit of the result.
 
     Attributes
     ----------

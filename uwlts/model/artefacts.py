@@ -2,11 +2,11 @@
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError
+from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, problems_of
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6
@@ -69,22 +69,18 @@ class Pipe(Description):
 Artefact = Annotated[SphereStandard | PlaneStandard | StepStandard | Pipe, Field(discriminator="kind")]
 
 
-def parse_artefact(table: dict[str, Any]) -> Artefact:
+def parse_artefact(table: object) -> Artefact:
     """An artefact's description; EvaluationError naming what is wrong with it."""
     try:
         return TypeAdapter(Artefact).validate_python(table)
     except ValidationError as error:
-        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors())
-        raise EvaluationError(f"the artefact's description is not valid: {details}") from error
+        raise EvaluationError(f"the artefact's description is not valid: {problems_of(error)}") from error
 
 
 def read_artefact(path: str | Path) -> Artefact:
     """An artefact's description from a TOML file.
 
-    Raises
-    ------
-    CaptureError, DescriptionError, EvaluationError
-        The file cannot be read, is no TOML, or does not describe an artefact.
+    CaptureError, DescriptionError or EvaluationError where it cannot be read, is no TOML, or describes no artefact.
     """
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))

@@ -4,6 +4,14 @@ Messages say what was found, what was expected and what to do. The commands prin
 with code 2.
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+_MOST_PROBLEMS = 5
+"""Problems named in a message; a damaged table would be reported number by number."""
+
 
 class Error(Exception):
     """Base of all errors caused by input, files or the machine rather than by a bug."""
@@ -51,3 +59,8 @@ class SetupError(Error):
 
 class HardwareError(Error):
     """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""
+
+
+def problems_of(error: "ValidationError") -> str:
+    """The first problems that a validation found, each with the place where it is."""
+    return "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()[:_MOST_PROBLEMS])

@@ -101,23 +101,10 @@ def _explained(problem: Any) -> str:
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:
-    """Read a sensor description.
+    """Read a sensor description: a shipped one by name, such as "thesis", or a TOML file, which may name a ``base``.
 
-    Parameters
-    ----------
-    name_or_path : str or Path
-        Name of a shipped sensor, such as "thesis", or path of a TOML file, which may name a ``base``.
-
-    Returns
-    -------
-    Sensor
-        The nominal data of camera, laser, windows, detector, stage, measuring volume and media; validated, frozen.
-
-    Raises
-    ------
-    DescriptionError
-        No sensor has this name, or the file is missing, not TOML, or has an unknown or wrong key; the message lists
-        what was found and what is expected.
+    Returns the nominal data of camera, laser, windows, detector, stage, measuring volume and media. DescriptionError
+    where no sensor has this name, or the file is missing, not TOML, or has an unknown or wrong key.
 
     Examples
     --------

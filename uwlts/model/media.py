@@ -24,12 +24,7 @@ def check_range(name: str, value: float, lowest: float, highest: float, source: 
 def water_index(*, wavelength_nm: float, temperature_c: float, salinity_g_kg: float = 0.0) -> float:
     """Refractive index of fresh or sea water relative to air.
 
-    Quan and Fry 1995, Applied Optics 34:3477, Eq. 3, valid for 0-30 degC, 0-35 g/kg and 400-700 nm.
-
-    Raises
-    ------
-    RangeError
-        Outside the fitted range.
+    Quan and Fry 1995, Applied Optics 34:3477, Eq. 3, valid for 0-30 degC, 0-35 g/kg and 400-700 nm; RangeError outside.
     """
     source = "the formula of Quan and Fry (1995)"
     check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, source)

@@ -133,12 +133,7 @@ class FournierForand(PhaseFunction):
         """The function that scatters a share of the light backwards.
 
         Index and slope go together by index = 1.01 + 0.1542 (slope - 3) (Mobley, Sundman and Boss 2002, Applied Optics
-        41:1035; recalled, it meets the published pairs of shares from 1e-4 to 0.1).
-
-        Raises
-        ------
-        RangeError
-            The share is outside 1e-4..0.1.
+        41:1035; recalled, it meets the published pairs of shares from 1e-4 to 0.1); RangeError outside that range.
         """
         check_range("backscatter_share", share, 1e-4, 0.1, "the line of Mobley, Sundman and Boss (2002)")
         # Slopes that give less than the least and more than the greatest share.

@@ -1,4 +1,4 @@
-"""Where camera, laser and sheet nominally stand to each other, and whether such a sensor can work at all."""
+"""Nominal placement of camera, laser and sheet, and checks that such a sensor can work."""
 
 import math
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ def camera_from_object(sensor: Sensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class View:
-    """What the camera sees of the sheet: line length at the stand-off and the depth range outside the window, mm."""
+    """View of the sheet by the camera: line length at the stand-off and the depth range outside the window, mm."""
 
     standoff_mm: float
     line_length_mm: float
@@ -83,7 +83,7 @@ class View:
 
 
 def _half_width_mm(
-    camera: Camera, medium_index: float, wavelength_nm: float, side_px: int, depth_mm: np.ndarray
+    camera: Camera, medium_index: float, wavelength_nm: float, side_px: float, depth_mm: np.ndarray
 ) -> np.ndarray:
     """Half the width of the view of an image side at depths outside an untilted window, by Snell's law."""
     window = camera.window
@@ -131,10 +131,9 @@ def check_design(sensor: Sensor, medium: Medium) -> View:
     camera, laser = sensor.camera, sensor.laser
     window = camera.window
     if window.mounted:
-        corner = math.hypot(camera.width_px, camera.height_px) / 2 / camera.focal_length_px()
-        pupil = camera.focal_length_mm / camera.f_number
-        sine = math.sin(math.atan(corner)) / window.index(laser.wavelength_nm)
-        needed = 2 * (corner * window.distance_mm + window.thickness_mm * sine / math.sqrt(1 - sine**2)) + pupil
+        diagonal, at_window = math.hypot(camera.width_px, camera.height_px), np.zeros(1)
+        half = _half_width_mm(camera, 1.0, laser.wavelength_nm, diagonal, at_window)[0]
+        needed = 2 * half + camera.focal_length_mm / camera.f_number
         if needed > window.aperture_diameter_mm:
             raise DesignError(
                 f"the camera's window opens {window.aperture_diameter_mm:.1f} mm, but the cone of view is "

@@ -276,7 +276,7 @@ class Medium(Description):
         return sum((part.coefficient_per_mm for part in self.scatterers(wavelength_nm)), 0.0)
 
     def scatterers(self, wavelength_nm: float) -> tuple[phase_functions.Scatterer, ...]:
-        """What scatters, with its part of b and its phase function; RangeError outside the tables."""
+        """The kinds of scatterers, each with its part of b and its phase function; RangeError outside the tables."""
         if self.scattering_per_m is not None:
             parts = [(self.scattering_per_m, self._phase_function())]
         elif self._is_water():
@@ -425,8 +425,8 @@ class Uncertainty(Description):
     follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
     medium whose index is given. Of the stage: each position, the scale of
     all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
-    its plane when it bends like a dish, and the height of the steps. What is said to be zero is not estimated but
-    held as described.
+    its plane when it bends like a dish, and the height of the steps. An uncertainty of zero means that the quantity is
+    not estimated but taken as described.
     """
 
     window_distance_mm: NotNegative = 5.0

@@ -31,7 +31,7 @@ _SCATTERING_EXPONENT = 1.0
 
 @dataclass(frozen=True)
 class Particles:
-    """What particles and dissolved matter add to pure water's absorption and scattering, in 1/m.
+    """Absorption and scattering by particles and dissolved matter, beyond those of pure water, in 1/m.
 
     The absorption may be slightly negative where a water's table takes pure water to absorb less than ours.
     """
@@ -116,27 +116,15 @@ def named_water(name: str) -> NaturalWater:
 
 
 def particles_of(water: str, *, wavelength_nm: float) -> Particles:
-    """What a named water adds to pure water.
-
-    Raises
-    ------
-    DescriptionError
-        The name is unknown.
-    RangeError
-        Outside 400-700 nm, unless the water is pure.
-    """
+    """Particles of a named water; DescriptionError where it is unknown, RangeError outside 400-700 nm unless pure."""
     return named_water(water).particles(wavelength_nm)
 
 
 def particles_at(turbidity: float, *, wavelength_nm: float) -> Particles:
-    """What water of a turbidity adds to pure water: 0 is "pure", 1 "clear", 2 "coastal", 3 "harbour".
+    """Particles of water of a turbidity: 0 is "pure", 1 "clear", 2 "coastal", 3 "harbour".
 
-    Between 0 and 1 it grows in proportion, from 1 on geometrically: equal steps multiply by equal factors.
-
-    Raises
-    ------
-    RangeError
-        The turbidity is outside 0..3, or the wavelength outside 400-700 nm.
+    Between 0 and 1 they grow in proportion, from 1 on geometrically: equal steps multiply by equal factors. RangeError
+    where the turbidity is outside 0..3, or the wavelength outside 400-700 nm.
     """
     check_range("turbidity", turbidity, 0.0, 3.0, "the scale from pure water to a harbour's")
     if turbidity <= 1:

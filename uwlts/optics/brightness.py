@@ -1,4 +1,4 @@
-"""What brightness that varies over a surface does to a stripe's centre.
+"""Shift of a stripe's centre where the brightness varies over the surface, and by blur.
 
 The sheet has a thickness. Where the surface under it shines brighter on one side, most of the light that is seen comes
 from there and not from the sheet's middle: for a sheet of Gaussian profile with the standard deviation s, from s^2
@@ -23,24 +23,22 @@ from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
 
 _MOST_BLUR_PX = 0.1
-"""Where blur may move a centre by more, which is as much as speckle does, it is not worth using."""
+"""Centres that blur may move by more, which is as much as speckle does, are left out."""
 
 _REACH_MM = 2.0
-"""Images taken within this way of the stage tell of the brightness at a point."""
+"""The brightness at a point is taken from images within this way of the stage."""
 
 _LEAST_APART_MM = 0.05
 """Least standard deviation of the positions of images for their brightness to be compared: a third of a sheet."""
 
-_LINES = 12
-_BEND_LINES = 6
-_LEAST_SHARE = 0.2
+# Neighbouring lines on either side for slopes of brightness and of the stripe; the share of them that must show it.
+_LINES, _BEND_LINES, _LEAST_SHARE = 12, 6, 0.2
 
 _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
 
-_MOVED_MM = 0.05
-_MOVED_PX = 0.5
-"""So far sheet and pixel are moved to find which ways the points go."""
+_MOVED_MM, _MOVED_PX = 0.05, 0.5
+"""Steps of sheet and pixel for the derivatives of the points: some sigma of the sheet, within one pixel."""
 
 
 def beside_sheet(
@@ -57,19 +55,8 @@ def beside_sheet(
     """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
 
     The sheet is as thick as described, but no thicker than the stripes would make it on a surface square to the laser.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    sensor : Sensor
-        As described: how thick the sheet is.
-    line, centre_px, width_px : (N,)
-        Stripe centres, and full widths at half maximum.
-    slopes : (N,)
-        Of the brightness; see `slopes_of_brightness`.
-    medium_index : float
-    stage_direction : (3,)
-        As the capture describes it.
+    ``width_px`` (N,) is the stripe's full width at half maximum, ``slopes`` (N,) those of `slopes_of_brightness`,
+    ``stage_direction`` as the capture describes it.
     """
     direction = np.array(calibration.stage_direction_of(stage_direction))
     frame = calibration.object_transform()
@@ -102,19 +89,11 @@ def beside_sheet(
 def slopes_of_brightness(
     frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray, exposure_ms: np.ndarray
 ) -> np.ndarray:
-    """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where neighbours do not tell it.
+    """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where it is unknown.
 
     A plane is fitted to the logarithms of all neighbours, so that noise and speckle of the single ones hardly count.
-
-    Parameters
-    ----------
-    frame, line : (N,) int
-    amplitude : (N,)
-        Positive.
-    stage_mm : (F,)
-        Position of every image, in any order; several may be taken at one.
-    exposure_ms : (F,)
-        Of every image; where that is not known of all, they are taken for exposed alike.
+    ``amplitude`` (N,) is positive, ``stage_mm`` and ``exposure_ms`` (F,) are those of every image, in any order; where
+    an exposure is not known, all are taken as equal.
     """
     order = np.argsort(stage_mm, kind="stable")
     rank = np.empty(len(order), np.intp)
@@ -146,7 +125,7 @@ def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float
 def moved_by_blur_px(
     frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, width_px: np.ndarray
 ) -> np.ndarray:
-    """How far blur may move stripe centres (N,), px, by their neighbours in the same image.
+    """Shift (N,) of stripe centres that blur may cause, px, by their neighbours in the same image.
 
     A stripe y(x), blurred by the standard deviation b in all directions, is seen at E[y(x - e) A(x - e)] / E[A(x - e)]
     with e of that deviation: beside y(x) by b^2 (y' (ln A)' + y'' / 2) to second order. The stripe's width squared,
@@ -191,7 +170,7 @@ def _slopes(
     ss, xx, sx = mean(s * s) - ms * ms, mean(x * x) - mx * mx, mean(s * x) - ms * mx
     sz, xz = mean(s * z) - ms * mz, mean(x * z) - mx * mz
     wide = (share > _LEAST_SHARE) & (xx > 1.0)
-    # Neighbours in a row, or in images taken nearly at one place, tell nothing of the slope across it.
+    # Neighbours in a row, or in images taken nearly at one place, do not show the slope across it.
     step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
     least = max(0.15 * step**2, _LEAST_APART_MM**2)
     deep = wide & (ss > least) & (ss < _REACH_MM**2) & (ss * xx - sx * sx > 1e-3 * ss * xx)

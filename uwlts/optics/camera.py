@@ -151,14 +151,9 @@ def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
-def _largest_square(d: Distortion) -> float:
-    """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it."""
-    return _one_to_one_square(d.k1, d.k2, d.k3, d.p1, d.p2)
-
-
 @lru_cache(maxsize=16)
-def _one_to_one_square(k1: float, k2: float, k3: float, p1: float, p2: float) -> float:
-    """As `_largest_square`.
+def _largest_square(d: Distortion) -> float:
+    """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it.
 
     The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
     have the same image. With g(r) = 1 + k1 r^2 + k2 r^4 + k3 r^6 the radial terms give it the eigenvalues g and
@@ -166,9 +161,9 @@ def _one_to_one_square(k1: float, k2: float, k3: float, p1: float, p2: float) ->
     first reaches 6 r |(p1, p2)|, which is the exact edge for a barrel. Solved for 1 / r, as then the polynomials lead
     with 1; an edge farther than `_WIDEST` is none.
     """
-    tangential = 6.0 * math.hypot(p1, p2)
-    across = np.roots([1.0, -tangential, k1, 0.0, k2, 0.0, k3])
-    along = np.roots([1.0, -tangential, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3])
+    tangential = 6.0 * math.hypot(d.p1, d.p2)
+    across = np.roots([1.0, -tangential, d.k1, 0.0, d.k2, 0.0, d.k3])
+    along = np.roots([1.0, -tangential, 3.0 * d.k1, 0.0, 5.0 * d.k2, 0.0, 7.0 * d.k3])
     roots = np.concatenate([across, along])
     ends = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / _WIDEST)]
     return float(ends.max() ** -2) if len(ends) else math.inf

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from uwlts.model.errors import DesignError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -26,7 +27,7 @@ CLAMPED, UNCLAMPED = 0.75, 1.125
 
 @dataclass(frozen=True, kw_only=True)
 class FlatWindow:
-    """What lies before the camera: pupil to inner face, glass, medium; indices relative to air. Default: air alone.
+    """Layers before the camera: pupil to inner face, glass, medium; indices relative to air. Default: air alone.
 
     ``paraxial`` sets slopes in a medium to those in air over the index.
     """
@@ -49,18 +50,20 @@ class FlatWindow:
         """Pupil to outer face."""
         return self.distance_mm + self.thickness_mm
 
-    def slope(self, index: float, slope_squared: np.ndarray) -> np.ndarray:
+    def slope(self, index: float, slope_squared: np.ndarray | float) -> np.ndarray:
         """Slope in a layer over the slope in air, whose square is given."""
-        return 1 / (index if self.paraxial else np.sqrt(index**2 + (index**2 - 1) * slope_squared))
+        squared = np.asarray(slope_squared, dtype=float)
+        return 1 / np.sqrt(index**2 + (0.0 if self.paraxial else index**2 - 1) * squared)
 
-    def layers(self, depth_mm: np.ndarray) -> tuple[tuple[np.ndarray, float], ...]:
+    def layers(self, depth_mm: np.ndarray | float) -> tuple[tuple[np.ndarray, float], ...]:
         """Extent along the axis and index of air, glass, and medium up to a depth."""
-        medium = (depth_mm - self.outer_mm, self.medium_index)
-        return (self.distance_mm, 1.0), (self.thickness_mm, self.glass_index), medium
+        extents = self.distance_mm, self.thickness_mm, depth_mm - self.outer_mm
+        return tuple(zip(map(np.asarray, extents), (1.0, self.glass_index, self.medium_index), strict=True))
 
-    def reach_mm(self, depth_mm: np.ndarray, slope_squared: np.ndarray = 0.0) -> np.ndarray:
+    def reach_mm(self, depth_mm: np.ndarray | float, slope_squared: np.ndarray | float = 0.0) -> np.ndarray:
         """Way of a ray across the axis, up to a depth, over its slope in air; for slope 0 the apparent distance."""
-        return sum(extent * self.slope(index, slope_squared) for extent, index in self.layers(depth_mm))
+        ways = [extent * self.slope(index, slope_squared) for extent, index in self.layers(depth_mm)]
+        return ways[0] + ways[1] + ways[2]
 
 
 def thesis_factor(index: float = 1.33) -> FlatWindow:
@@ -87,7 +90,7 @@ class Triangulation:
         )
         _require_acute(self.triangulation_angle_rad)
 
-    def slopes(self, u_px: np.ndarray, v_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, u_px: ArrayLike, v_px: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Slopes p across and e along the stripe of a pixel's ray in air."""
         u, v = np.broadcast_arrays(np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64))
         if not (np.isfinite(u).all() and np.isfinite(v).all()):
@@ -95,7 +98,7 @@ class Triangulation:
         return u * self.pixel_size_mm / self.focal_length_mm, v * self.pixel_size_mm / self.focal_length_mm
 
 
-def depth_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray = 0.0) -> np.ndarray:
+def depth_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 0.0) -> np.ndarray:
     """Depth Z of the sheet at pixels, broadcast: thesis Eq. 2.8, in air Z = B f / (f tan theta_t - s u).
 
     Behind a window Z tan theta_t - B = p M(Z) with `FlatWindow.reach_mm` M, linear in Z.
@@ -111,7 +114,7 @@ def depth_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray = 0.0) -> 
     return depth
 
 
-def depth_per_pixel_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray = 0.0) -> np.ndarray:
+def depth_per_pixel_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 0.0) -> np.ndarray:
     """dZ/du in mm per pixel, broadcast: thesis Eq. 2.9, in air B f s / (f tan theta_t - s u)^2 = Z^2 s / (B f).
 
     Eq. 2.9 is the derivative of Eq. 2.8 and right. Eqs. 2.11 and 3.1 are not: their denominator subtracts s B cos
@@ -127,7 +130,7 @@ def depth_per_pixel_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray 
     return shift * setup.pixel_size_mm / setup.focal_length_mm / (math.tan(setup.triangulation_angle_rad) - p * slope)
 
 
-def pixel_of_depth(setup: Triangulation, z_mm: np.ndarray, v_px: np.ndarray = 0.0) -> np.ndarray:
+def pixel_of_depth(setup: Triangulation, z_mm: ArrayLike, v_px: ArrayLike = 0.0) -> np.ndarray:
     """Pixel u at which the sheet appears at depths Z, broadcast: the inverse of `depth_mm`.
 
     In air u = f (tan theta_t - B / Z) / s. Behind a window by Newton's method: how far a ray goes across, p M, grows
@@ -158,7 +161,7 @@ def pixel_of_depth(setup: Triangulation, z_mm: np.ndarray, v_px: np.ndarray = 0.
     )
 
 
-def position_along_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray) -> np.ndarray:
+def position_along_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike) -> np.ndarray:
     """Y along the stripe of what pixels see of the sheet, broadcast: in air Y = Z s v / f.
 
     Thesis Eq. 2.10 has f cos theta_t too much, which makes it mm^2; Z of Eq. 2.8 needs no cosine.
@@ -167,7 +170,7 @@ def position_along_mm(setup: Triangulation, u_px: np.ndarray, v_px: np.ndarray) 
     return e * setup.window.reach_mm(depth_mm(setup, u_px, v_px), p**2 + e**2)
 
 
-def line_length_mm(setup: Triangulation, z_mm: np.ndarray, *, side_px: float) -> np.ndarray:
+def line_length_mm(setup: Triangulation, z_mm: ArrayLike, *, side_px: float) -> np.ndarray:
     """Length of the stripe, on a plane square to the laser's axis, that an image side of ``side_px`` sees at depths Z.
 
     Thesis section 3.1.2 multiplies the last term of Eq. 2.11 by the number of pixels; with its cos theta_t that is 18 %
@@ -285,9 +288,8 @@ def _growth_mm(window: FlatWindow, depth_mm: np.ndarray, p: np.ndarray, e: np.nd
     """Derivative of p M(depth, p^2 + e^2) by p."""
     if window.paraxial:
         return window.reach_mm(depth_mm) + 0 * p
-    return sum(
-        extent * (n**2 + (n**2 - 1) * e**2) * window.slope(n, p**2 + e**2) ** 3 for extent, n in window.layers(depth_mm)
-    )
+    slopes = ((extent, n, window.slope(n, p**2 + e**2)) for extent, n in window.layers(depth_mm))
+    return np.sum([extent * (n**2 + (n**2 - 1) * e**2) * slope**3 for extent, n, slope in slopes], axis=0)
 
 
 def _require_positive(**values: float) -> None:

@@ -11,6 +11,7 @@ from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.window import trace_window
 
+# Rays across the fan and depths along them to which the plane is fitted.
 _RAYS, _DEPTHS = 65, 9
 
 

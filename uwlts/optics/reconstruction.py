@@ -63,23 +63,12 @@ def reconstruct_profile(
 ) -> ObjectPoints:
     """Measured points of the stripe centres of one profile, or of many joined together.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    lines : (N,)
-        Numbers of the profile lines: image columns if the stripe runs along the width, else image rows.
-    centres_px : (N,)
-        Stripe centre in each line.
-    medium_index, stage_mm, stage_direction
-        As for `reconstruct_pixels`.
+    ``lines`` (N,) are image columns if the stripe runs along the width, else image rows; ``centres_px`` (N,) is the
+    stripe's place on each. The rest is as for `reconstruct_pixels`.
     """
-    pair = (lines, centres_px) if calibration.stripe_along == "width" else (centres_px, lines)
+    pixels = np.stack((lines, centres_px) if calibration.stripe_along == "width" else (centres_px, lines), axis=1)
     return reconstruct_pixels(
-        calibration,
-        np.stack(pair, axis=1),
-        medium_index=medium_index,
-        stage_mm=stage_mm,
-        stage_direction=stage_direction,
+        calibration, pixels, medium_index=medium_index, stage_mm=stage_mm, stage_direction=stage_direction
     )
 
 
@@ -98,19 +87,9 @@ def reconstruct_pixels(
 
 
 def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_index: float) -> SheetPoints:
-    """Where the camera rays of pixels cross the laser sheet in the medium (thesis Eqs. 3.3 to 3.9).
+    """Crossings of the camera rays of pixels (N, 2), (u, v), with the sheet in the medium (thesis Eqs. 3.3 to 3.9).
 
-    Parameters
-    ----------
-    calibration : Calibration
-    pixels : (N, 2)
-        (u, v) in px; the pixels of many frames may be given at once.
-    medium_index : float
-        Refractive index of the medium relative to air; not used by a calibration without a window.
-
-    Returns
-    -------
-    SheetPoints
+    The pixels may be those of many frames. The index of the medium, relative to air, matters only behind a window.
 
     Raises
     ------
@@ -118,16 +97,13 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
         A pixel is not finite, or the index is not finite and positive.
     """
     pixels = np.asarray(pixels, dtype=float)
-    blocks = [
-        _crossings(
-            trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index),
-            sheet_surface(calibration.sheet, medium_index=medium_index),
-        )
-        for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK))
-    ]
-    return SheetPoints(
-        np.concatenate([block.points_camera_mm for block in blocks]), np.concatenate([block.status for block in blocks])
-    )
+    sheet = sheet_surface(calibration.sheet, medium_index=medium_index)
+    found = []
+    for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK)):
+        rays = trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index)
+        found.append(_crossings(rays, sheet))
+    points, status = zip(*((each.points_camera_mm, each.status) for each in found), strict=True)
+    return SheetPoints(np.concatenate(points), np.concatenate(status))
 
 
 def to_object(
@@ -135,21 +111,8 @@ def to_object(
 ) -> np.ndarray:
     """Points (N, 3) in the OCS at stage position 0, mm, from points (N, 3) in the camera frame at ``stage_mm``.
 
-    ``p_object = T_object_camera p_camera + stage_mm * stage_direction``; rows of NaN stay NaN.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    points_camera : (N, 3)
-    stage_mm : float or (N,)
-        Position of the stage, of all points or of each.
-    stage_direction : (3,)
-        Unit direction in the OCS in which the stage moves the sensor.
-
-    Raises
-    ------
-    RangeError
-        A stage position is not finite, or the direction is not a unit vector.
+    ``p_object = T_object_camera p_camera + stage_mm * stage_direction`` with a position for all points or for each, and
+    the unit direction in the OCS in which the stage moves the sensor; rows of NaN stay NaN. Raises as `stage_travel`.
     """
     travel = stage_travel(stage_mm, stage_direction)
     object_from_camera = np.linalg.inv(calibration.object_transform())
@@ -159,12 +122,9 @@ def to_object(
 
 
 def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> np.ndarray:
-    """What the stage's motion adds to points in the OCS: (3, N), or (3, 1) where all share a position.
+    """Shift of points in the OCS by the stage's motion: (3, N), or (3, 1) where all share a position.
 
-    Raises
-    ------
-    RangeError
-        A stage position is not finite, or the direction is not a unit vector.
+    RangeError where a stage position is not finite, or the direction is not a unit vector.
     """
     stage_mm, stage_direction = np.asarray(stage_mm, dtype=float), np.asarray(stage_direction, dtype=float)
     if not np.isfinite(stage_mm).all():
@@ -210,21 +170,7 @@ def reconstruct_by_polynomials(
     A centre outside the range that its line was calibrated for, or on a line that was not calibrated, has no point:
     its status is OUTSIDE_CALIBRATION.
 
-    Parameters
-    ----------
-    calibration : PolynomialCalibration
-    lines : (N,) int
-        Numbers of the profile lines: image columns if the stripe runs along the width, else image rows.
-    centres_px : (N,)
-        Stripe centre in each line.
-    stage_mm : float or (N,)
-    stage_direction : (3,)
-        Unit direction in the OCS in which the stage moves the sensor.
-
-    Raises
-    ------
-    RangeError
-        A centre or a stage position is not finite, or the direction is not a unit vector.
+    Arguments are as for `reconstruct_profile`; RangeError where a centre is not finite, or as from `stage_travel`.
     """
     lines, centres_px = np.asarray(lines), np.asarray(centres_px, dtype=float)
     if not np.isfinite(centres_px).all():

@@ -22,7 +22,7 @@ _GRAZING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class FanDistances:
-    """Distances (N,) of points from where a fan seems to begin in a medium: all, along the axis, and q.
+    """Distances (N,) of points from the apparent origin of a fan in a medium: all, along the axis, and q.
 
     ``away`` (3, N) are the points from there, and ``wet`` is the share of the distance along that is in the medium.
     """
@@ -34,7 +34,7 @@ class FanDistances:
     wet: np.ndarray
 
     def bulges(self) -> tuple[np.ndarray, np.ndarray]:
-        """What the beam's tilt and the window's turn are multiplied by, over the index: (N,), (N,)."""
+        """Factors (N,), (N,) of the beam's tilt and the window's turn, over the index."""
         return self.all - self.in_air, self.wet * (self.along - self.in_air)
 
 
@@ -42,14 +42,7 @@ class FanDistances:
 class SheetSurface:
     """Points that the sheet lights, camera frame, mm: the plane ``normal . x = offset_mm`` and the bulge of the fan.
 
-    Attributes
-    ----------
-    normal : (3,)
-    offset_mm : float
-    index : float
-        Of the medium.
-    fan : FanModel or None
-        None for a plane.
+    ``index`` is that of the medium; without a ``fan`` the surface is a plane.
     """
 
     normal: np.ndarray
@@ -75,7 +68,7 @@ class SheetSurface:
         return reach, slope
 
     def miss_mm(self, points: np.ndarray) -> np.ndarray:
-        """How far points (3, N) lie beyond the surface, (N,)."""
+        """Distances (N,) of points (3, N) beyond the surface."""
         miss = self.normal @ points - self.offset_mm
         if (fan := self.fan) is None or self.is_plane():
             return miss
@@ -105,7 +98,7 @@ def fan_distances(points: np.ndarray, fan: FanModel, *, medium_index: float) -> 
 
 
 def behind_window_mm(fan: FanModel) -> float:
-    """How far behind the window's outer face the fan begins, along its axis."""
+    """Distance from the fan's origin to the window's outer face, along its axis."""
     return float(np.array(fan.axis) @ (np.array(fan.pivot_mm) - np.array(fan.apex_mm)))
 
 

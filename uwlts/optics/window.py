@@ -14,7 +14,7 @@ from uwlts.model.errors import RangeError
 
 
 class RayStatus(IntEnum):
-    """What became of a camera ray; anything but OK has no point.
+    """Result for a camera ray; anything but OK has no point.
 
     NO_DIRECTION: the lens model has no inverse at the pixel. BEHIND_WINDOW: the ray never reaches the window going
     forward. TOTAL_REFLECTION: a face of the window lets nothing through. NO_CROSSING: the ray runs parallel to the
@@ -73,18 +73,13 @@ def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tupl
     normal : (3,) or (N, 3)
         Unit normal of the interface, for all rays or for each.
     ratio : float
-        Index before the interface over index behind it.
+        Index before the interface over index behind it; RangeError where it is not finite and positive.
 
     Returns
     -------
     refracted : (N, 3)
         Unit vectors, NaN where the ray is totally reflected.
     total_reflection : (N,) bool
-
-    Raises
-    ------
-    RangeError
-        The ratio is not finite and positive.
     """
     check_index("the ratio of refractive indices", ratio)
     rays, normal = np.asarray(directions, dtype=float).T, np.asarray(normal, dtype=float)
@@ -111,24 +106,10 @@ def trace_window(directions: np.ndarray, window: WindowModel | None, *, medium_i
     """Follow rays from the entrance pupil, the camera frame's origin, through the window into the medium.
 
     Thesis Eqs. 3.4 to 3.7 for one refraction, once more at the outer face for two. Without a window the rays stay as
-    they are. In air (``medium_index`` 1) a plate shifts the rays and a single interface does nothing.
+    they are. In air (``medium_index`` 1) a window shifts the rays and a single interface does nothing.
 
-    Parameters
-    ----------
-    directions : (N, 3)
-        Unit vectors in air, camera frame. Rows that are not finite get the status NO_DIRECTION.
-    window : WindowModel or None
-    medium_index : float
-        Refractive index of the medium relative to air.
-
-    Returns
-    -------
-    RaysInMedium
-
-    Raises
-    ------
-    RangeError
-        The index is not finite and positive, or the window's plane runs along the camera's axis.
+    ``directions`` (N, 3) are unit vectors in air, camera frame; rows that are not finite get the status NO_DIRECTION.
+    RangeError where the index is not finite and positive, or the window's plane runs along the camera's axis.
     """
     check_index("medium_index", medium_index)
     directions = np.asarray(directions, dtype=float)

@@ -7,7 +7,7 @@ from typing import assert_never
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.storage.files import described, read_json, written_aside
+from uwlts.storage.files import read_json, read_model, written_aside
 
 FORMAT, VERSION = "uwlts-calibration", 1
 POLYNOMIALS_FORMAT, POLYNOMIALS_VERSION = "uwlts-polynomials", 1
@@ -32,28 +32,13 @@ def write_calibration(path: str | Path, calibration: AnyCalibration, *, overwrit
 
 def read_calibration(path: str | Path) -> Calibration:
     """Read a calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    return described(
-        read_json(path, called="calibration"),
-        Calibration,
-        path=path,
-        format=FORMAT,
-        version=VERSION,
-        called="calibration",
-        foreign="not a calibration",
-    )
+    return read_model(path, Calibration, format=FORMAT, version=VERSION, called="calibration")
 
 
 def read_polynomials(path: str | Path) -> PolynomialCalibration:
     """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    return described(
-        read_json(path, called="calibration"),
-        PolynomialCalibration,
-        path=path,
-        format=POLYNOMIALS_FORMAT,
-        version=POLYNOMIALS_VERSION,
-        called="polynomial calibration",
-        foreign="no polynomial calibration",
-    )
+    called, format = "polynomial calibration", POLYNOMIALS_FORMAT
+    return read_model(path, PolynomialCalibration, format=format, version=POLYNOMIALS_VERSION, called=called)
 
 
 def load_calibration(path: str | Path) -> AnyCalibration:

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Annotated
 
 import h5py
 import hdf5plugin
@@ -37,11 +37,20 @@ _MARGIN_BYTES = 2**18
 
 
 class CaptureHeader(Description):
-    """What holds for all frames of a capture.
+    """Description that holds for all frames of a capture.
 
-    ``stage_direction`` is the nominal unit direction in which the stage moves the sensor, in the OCS; ``target`` and
-    ``artefact`` describe what was before the sensor, as known to whoever recorded it; ``saturation_dn`` is the grey
-    value at which pixels clip.
+    Attributes
+    ----------
+    name, sensor, medium_name, medium
+        Of the capture, the sensor as described, and the medium it was in, by its name in that description.
+    stage_direction : (3,)
+        Nominal unit direction, in the OCS, in which the stage moves the sensor.
+    saturation_dn : int
+        Grey value at which pixels clip.
+    target, artefact : dict or None
+        Description of what was before the sensor (`parse_target`, `parse_artefact`); checked when it is used.
+    provenance : dict
+        What recorded the capture, and how; JSON.
     """
 
     name: str
@@ -50,9 +59,9 @@ class CaptureHeader(Description):
     medium: Medium
     stage_direction: Vector
     saturation_dn: Annotated[int, Field(gt=0)]
-    target: dict[str, Any] | None = None
-    artefact: dict[str, Any] | None = None
-    provenance: dict[str, Any] = {}
+    target: dict[str, object] | None = None
+    artefact: dict[str, object] | None = None
+    provenance: dict[str, object] = {}
 
     @field_validator("stage_direction")
     @classmethod
@@ -64,7 +73,7 @@ class CaptureHeader(Description):
 
 @dataclass(frozen=True)
 class Frame:
-    """One image (H, W) with its stage position in mm, light, exposure in ms, time in s, and pose (4, 4) if known."""
+    """One image (H, W) with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known."""
 
     image: np.ndarray
     stage_mm: float
@@ -396,27 +405,10 @@ class Capture:
 
 
 def open_capture(path: str | Path) -> Capture:
-    """Open a capture for reading.
+    """Open a capture file (HDF5) for reading; CaptureError as from `Capture`.
 
-    Per-frame values are read at once, images when they are asked for. A recording that is still being written can be
-    opened by its name ``NAME.part``; it has the frames that were complete when it was opened.
-
-    Parameters
-    ----------
-    path : str or Path
-        Capture file (HDF5).
-
-    Returns
-    -------
-    Capture
-        A context manager and a sequence of frames: ``capture[12]`` has ``image`` (H, W), ``stage_mm``, ``laser_on``,
-        ``exposure_ms``, ``time_s`` and ``pose``; the arrays ``capture.stage_mm`` (N,), ``capture.laser_on`` (N,) and so
-        on hold the values of all frames, ``capture.header`` the sensor and the medium.
-
-    Raises
-    ------
-    CaptureError
-        The file is missing, foreign, truncated, of a newer version, or contradicts itself.
+    Per-frame values are read at once, images when they are asked for: ``capture[12]`` is a `Frame`. A recording that is
+    still being written can be opened by its name ``NAME.part``; it has the frames that were complete then.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What a calibration's file tells of the captures it was made from, so that they can be found and proven the same."""
+"""Identity of the captures that a calibration was made from, as its file holds it: names, hashes, numbers of images."""
 
 import hashlib
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from uwlts.storage.capture import Capture
 
 
 def captures_in(provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The captures, as `source_of` tells of them, that a provenance names: of targets, steps and scans."""
+    """The captures, as from `source_of`, that a provenance names: of targets, steps and scans."""
     return [source for kind in ("air", "step", "scan") for source in provenance.get(f"{kind}_captures", [])]
 
 
@@ -20,7 +20,7 @@ def source_of(capture: Capture) -> dict[str, Any]:
     """Name, SHA-256 and number of images of a capture, what it was taken through, and of what."""
     header, laser = capture.header, int(np.count_nonzero(capture.laser_on))
     medium = header.medium
-    told: dict[str, Any] = {
+    source: dict[str, Any] = {
         "file": capture.path.name,
         "name": header.name,
         "sha256": sha256_of(capture.path),
@@ -30,8 +30,8 @@ def source_of(capture: Capture) -> dict[str, Any]:
         "window": header.sensor.camera.window.mounted,
     }
     if medium.kind in ("fresh", "sea"):
-        told |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
-    return told | {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}
+        source |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
+    return source | {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}
 
 
 def sha256_of(path: str | Path) -> str:

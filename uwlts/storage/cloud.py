@@ -3,15 +3,16 @@
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
+from pydantic import JsonValue
 
 from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Description
@@ -92,7 +93,7 @@ class PointCloud:
     uncertainty : PointUncertainty or None
         How well the points are known.
     metadata : dict
-        What JSON can hold: medium, sensor, artefact, capture, digest of the calibration.
+        Medium, sensor, artefact, capture, digest of the calibration; of a foreign cloud anything that JSON can hold.
 
     Raises
     ------
@@ -106,7 +107,7 @@ class PointCloud:
     line: np.ndarray
     deviation_mm: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
-    metadata: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, JsonValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         points = _read_only(self.points_mm, np.float64)
@@ -153,29 +154,14 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         The file exists and `overwrite` is not set, the folder is missing, the disk is full.
     """
     if _in_hdf5(path):
-        _write_arrays(path, _arrays(cloud), cloud.metadata, overwrite=overwrite)
+        _write_hdf5(path, cloud, overwrite=overwrite)
         return
-    vertices = np.empty(
-        len(cloud),
-        dtype=[
-            ("x", "<f8"),
-            ("y", "<f8"),
-            ("z", "<f8"),
-            ("intensity", "<f4"),
-            ("deviation", "<f4"),
-            ("frame", "<i4"),
-            ("line", "<i4"),
-            *((name, "<f4") for name in _uncertainty_names(cloud.uncertainty)),
-        ],
-    )
-    vertices["x"], vertices["y"], vertices["z"] = cloud.points_mm.T
-    vertices["intensity"] = cloud.intensity
-    vertices["deviation"] = np.nan if cloud.deviation_mm is None else cloud.deviation_mm
-    vertices["frame"] = cloud.frame
-    vertices["line"] = cloud.line
-    if cloud.uncertainty is not None:
-        for name, column in zip(_uncertainty_names(cloud.uncertainty), _columns(cloud.uncertainty), strict=True):
-            vertices[name] = column
+    deviation = np.full(len(cloud), np.nan, np.float32) if cloud.deviation_mm is None else cloud.deviation_mm
+    columns = dict(zip("xyz", cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity, "deviation": deviation}
+    columns |= {"frame": cloud.frame, "line": cloud.line} | _uncertainty_columns(cloud.uncertainty)
+    vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertices[name] = values
     ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
     with written_aside(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
@@ -194,7 +180,7 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     """
     path = Path(path)
     if _in_hdf5(path):
-        return _from_hdf5(path)
+        return _read_hdf5(path)
     vertices, comments = _read_ply(path)
     names = vertices.dtype.names or ()
     missing = [axis for axis in "xyz" if axis not in names]
@@ -231,53 +217,22 @@ def _in_hdf5(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == ".h5"
 
 
-def _arrays(cloud: PointCloud) -> dict[str, np.ndarray]:
-    arrays = {name: getattr(cloud, name) for name in _PER_POINT}
-    if cloud.deviation_mm is not None:
-        arrays["deviation_mm"] = cloud.deviation_mm
-    if cloud.uncertainty is not None:
-        arrays |= {part.name: getattr(cloud.uncertainty, part.name) for part in fields(PointUncertainty)}
-        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
-    return arrays
-
-
-def _from_hdf5(path: Path) -> PointCloud:
-    arrays, metadata = _read_arrays(path)
-    names = [part.name for part in fields(PointUncertainty)]
-    wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
-    missing = [name for name in wanted if name not in arrays]
-    if missing:
-        raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    known = PointUncertainty(**{name: arrays[name] for name in names}) if names[0] in arrays else None
-    try:
-        return PointCloud(
-            **{name: arrays[name] for name in _PER_POINT},
-            deviation_mm=arrays.get("deviation_mm"),
-            uncertainty=known,
-            metadata=metadata,
-        )
-    except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
-
-
-def _uncertainty_names(uncertainty: PointUncertainty | None) -> list[str]:
-    if uncertainty is None:
-        return []
-    covariances = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
-    return covariances + _move_names(len(uncertainty.patterns_mm))
-
-
 def _move_names(patterns: int) -> list[str]:
     return [f"{move}_{axis}" for move in ("position", *(f"pattern{m}" for m in range(patterns))) for axis in "xyz"]
 
 
-def _columns(uncertainty: PointUncertainty) -> np.ndarray:
-    """Columns (15 + 3 M, N) in the order of their names."""
+def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
+    """Columns (N,) float32 by the names of their vertex properties."""
+    if uncertainty is None:
+        return {}
+    names = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
+    names += _move_names(len(uncertainty.patterns_mm))
     patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
-    return np.vstack([uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns])
+    parts = uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns
+    return dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
 
 
-def _uncertainty(names: Sequence[str], column: Callable[[str, float, type], np.ndarray]) -> PointUncertainty | None:
+def _uncertainty(names: tuple[str, ...], column: Callable[[str, float, type], np.ndarray]) -> PointUncertainty | None:
     known = {name.removeprefix("scalar_") for name in names}
     count = sum(f"pattern{m}_x" in known for m in range(len(known)))
     wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
@@ -288,20 +243,20 @@ def _uncertainty(names: Sequence[str], column: Callable[[str, float, type], np.n
     return PointUncertainty(columns[:6].T.copy(), position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
 
 
-def _read_only(values: Any, kind: type) -> np.ndarray:
+def _read_only(values: ArrayLike, kind: type) -> np.ndarray:
     view = np.asarray(values, dtype=kind).view()
     view.flags.writeable = False
     return view
 
 
-def _per_point(name: str, values: Any, kind: type, count: int) -> np.ndarray:
+def _per_point(name: str, values: ArrayLike, kind: type, count: int) -> np.ndarray:
     column = _read_only(values, kind)
     if column.shape != (count,):
         raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {count} points")
     return column
 
 
-def _as_json(metadata: dict[str, Any]) -> str:
+def _as_json(metadata: dict[str, JsonValue]) -> str:
     try:
         text = json.dumps(metadata, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     except (TypeError, ValueError) as error:
@@ -311,14 +266,14 @@ def _as_json(metadata: dict[str, Any]) -> str:
     return text
 
 
-def _comments(metadata: dict[str, Any]) -> list[str]:
+def _comments(metadata: dict[str, JsonValue]) -> list[str]:
     text = _as_json(metadata)
     pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
     # The semicolon keeps a piece's last blank from being stripped by readers.
     return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
 
 
-def _metadata(path: Path, comments: list[str]) -> dict[str, Any]:
+def _metadata(path: Path, comments: list[str]) -> dict[str, JsonValue]:
     own = [comment for comment in comments if comment.startswith(_COMMENT)]
     if not own:
         return {}
@@ -363,36 +318,29 @@ def _indices(path: Path, name: str, values: np.ndarray) -> np.ndarray:
 
 
 class _CloudHeader(Description):
-    """What holds for a whole cloud: its metadata."""
+    """Header of a cloud's HDF5 file."""
 
-    metadata: dict[str, Any]
+    metadata: dict[str, JsonValue]
 
 
-def _write_arrays(
-    path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: dict[str, Any], *, overwrite: bool
-) -> None:
-    """Write named arrays with their metadata, whole or not at all; OutputError where that fails."""
+def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
+    arrays = {name: getattr(cloud, name) for name in _PER_POINT}
+    if cloud.deviation_mm is not None:
+        arrays["deviation_mm"] = cloud.deviation_mm
+    if cloud.uncertainty is not None:
+        arrays |= {part.name: getattr(cloud.uncertainty, part.name) for part in fields(PointUncertainty)}
+        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
     # In memory first: HDF5 does not survive a full disk.
     content = BytesIO()
     with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=metadata))
-        for name, values in arrays.items():
-            file.create_dataset(
-                name, data=values, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True
-            )
+        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=cloud.metadata))
+        for name, data in arrays.items():
+            file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_bytes(content.getbuffer())
 
 
-def _read_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Named arrays of numbers and the metadata.
-
-    Raises
-    ------
-    CaptureError
-        The file is missing, no cloud, newer or damaged.
-    """
-    path = Path(path)
+def _read_hdf5(path: Path) -> PointCloud:
     if not path.is_file():
         raise CaptureError(f"{path} does not exist" if not path.exists() else f"{path} is no file")
     try:
@@ -404,4 +352,13 @@ def _read_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], d
     unusable = [name for name, values in arrays.items() if values.dtype.kind not in "iuf"]
     if unusable:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers")
-    return arrays, header.metadata
+    names = [part.name for part in fields(PointUncertainty)]
+    wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
+    known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
+    try:
+        return PointCloud(*(arrays[name] for name in _PER_POINT), arrays.get("deviation_mm"), known, header.metadata)
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error

@@ -23,6 +23,7 @@ from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 
 HEADER, TABLE = "header.json", "frames.csv"
+_COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 
 
 def export(
@@ -100,13 +101,14 @@ def export_capture(
         aside.mkdir()
         rows = []
         for index, frame in enumerate(capture):
-            name = f"{index:05d}-{_light(frame)}.{image_format}"
+            name = f"{index:05d}-{'laser' if frame.laser_on else 'lamp'}.{image_format}"
             _, encoded = cv2.imencode(f".{image_format}", frame.image)
             (aside / name).write_bytes(encoded.tobytes())
             rows.append(_row(name, frame))
             progress(index + 1, len(capture))
         with open(aside / TABLE, "w", newline="", encoding="utf-8") as file:
-            table = csv.DictWriter(file, _columns(rows), restval="", lineterminator="\n")
+            # Only captures with a pose have its columns, which stand last.
+            table = csv.DictWriter(file, max(rows, key=len, default=_COLUMNS), restval="", lineterminator="\n")
             table.writeheader()
             table.writerows(rows)
         (aside / HEADER).write_text(capture.header.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -119,24 +121,10 @@ def export_capture(
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _light(frame: Frame) -> str:
-    return "laser" if frame.laser_on else "lamp"
-
-
 def _row(name: str, frame: Frame) -> dict[str, str | float]:
-    row = {
-        "file": name,
-        "light": _light(frame),
-        "stage_mm": frame.stage_mm,
-        "exposure_ms": frame.exposure_ms,
-        "time_s": frame.time_s,
-    }
+    light = "laser" if frame.laser_on else "lamp"
+    row = dict(zip(_COLUMNS, (name, light, frame.stage_mm, frame.exposure_ms, frame.time_s), strict=True))
     return row if frame.pose is None else row | dict(zip(POSE_COLUMNS, frame.pose.ravel().tolist(), strict=True))
-
-
-def _columns(rows: list[dict[str, str | float]]) -> list[str]:
-    posed = any(POSE_COLUMNS[0] in row for row in rows)
-    return ["file", "light", "stage_mm", "exposure_ms", "time_s", *(POSE_COLUMNS if posed else ())]
 
 
 CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")

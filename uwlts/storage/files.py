@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from uwlts.model.errors import CaptureError, OutputError
+from uwlts.model.errors import CaptureError, OutputError, problems_of
 
 
 @contextmanager
@@ -23,20 +23,9 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
     The temporary file lies empty in the folder of `path` (a rename is atomic only within one file system) and keeps
     the suffix, by which some libraries choose the format. It is removed whatever exception leaves the body,
-    KeyboardInterrupt included, and an existing file at `path` is untouched until the new one is complete. A symbolic
-    link is followed, so that the file it names is replaced and not the link.
-
-    Parameters
-    ----------
-    path : path
-        Where the finished file shall be.
-    overwrite : bool
-        Replace an existing file; without it an existing file is refused, before the body runs and again at the end.
-
-    Yields
-    ------
-    Path
-        The temporary file; the body opens, writes and closes it.
+    KeyboardInterrupt included, and an existing file at `path` is untouched until the new one is complete. Without
+    ``overwrite`` an existing file is refused, before the body runs and again at the end. A symbolic link is followed,
+    so that the file it names is replaced and not the link.
 
     Raises
     ------
@@ -54,10 +43,12 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         raise OutputError(_cannot_write(target, error)) from error
     try:
         yield aside
-        _flush(aside)
+        _flush(aside, os.O_RDWR)
         refuse_unsuitable(target, overwrite=overwrite)
         os.replace(aside, target)
-        _flush_folder(target.parent)
+        # Only POSIX systems can open a folder, to make the renaming itself last.
+        if os.name == "posix":
+            _flush(target.parent, os.O_RDONLY)
     except OSError as error:
         raise OutputError(_cannot_write(target, error)) from error
     finally:
@@ -82,22 +73,11 @@ def _cannot_write(target: Path, error: OSError) -> str:
         errno.EPERM: f"no permission to write in {target.parent}",
         errno.EROFS: f"{target.parent} is on a read-only file system",
     }
-    return f"cannot write {target}: {advice.get(error.errno, error.strerror or str(error))}"
+    return f"cannot write {target}: {advice.get(error.errno or 0, error.strerror or str(error))}"
 
 
-def _flush(file: Path) -> None:
-    descriptor = os.open(file, os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _flush_folder(folder: Path) -> None:
-    """Make the renaming itself last; only POSIX systems can open a folder."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
+def _flush(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
     finally:
@@ -106,45 +86,44 @@ def _flush_folder(folder: Path) -> None:
 
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
-_MOST_PROBLEMS = 5
-"""Problems named in a message; a damaged table would be reported number by number."""
-
 
 def read_json(path: str | Path, *, called: str) -> dict[str, Any]:
     """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
-    a_thing = f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise CaptureError(f"cannot read the {called} {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path} is not {a_thing}, or is truncated: {error}") from error
+        raise CaptureError(f"{path} is not {_article(called)}, or is truncated: {error}") from error
     if not isinstance(content, dict):
-        raise CaptureError(f'{path} is JSON but not {a_thing}: expected an object with a "format"')
+        raise CaptureError(f'{path} is JSON but not {_article(called)}: expected an object with a "format"')
     return content
 
 
-def described(
-    content: dict[str, Any],
-    model: type[AnyModel],
-    *,
-    path: str | Path,
-    format: str,
-    version: int,
-    called: str,
-    foreign: str,
+def _article(called: str) -> str:
+    return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
+
+
+def read_model(
+    path: str | Path, model: type[AnyModel], *, format: str, version: int, called: str, advice: str = ""
 ) -> AnyModel:
-    """The description in a file's object; CaptureError where it is foreign (in these words), newer or damaged."""
+    """Content of a JSON file of the program; CaptureError where it is missing, foreign, newer or damaged."""
+    content = read_json(path, called=called)
     if content.pop("format", None) != format:
-        raise CaptureError(f'{path} is JSON but {foreign}: expected "format": "{format}"')
+        raise CaptureError(f'{path} is JSON but not {_article(called)}: expected "format": "{format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        problems = error.errors()[:_MOST_PROBLEMS]
-        details = "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems)
-        raise CaptureError(f"{path} is not a valid {called}: {details}") from error
+        raise CaptureError(f"{path} is not a valid {called}: {problems_of(error)}{advice}") from error
+
+
+def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:
+    """Write a model with its format and version as indented JSON, whole or not at all; OutputError where that fails."""
+    content = {"format": format, "version": version} | model.model_dump(mode="json")
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def json_text(content: BaseModel | dict[str, Any] | list[Any], *, indent: int | None = None, ascii: bool = True) -> str:

@@ -9,7 +9,7 @@ import io
 import json
 import os
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import h5py
 import numpy as np
@@ -17,6 +17,9 @@ import numpy as np
 from uwlts.model.errors import CaptureError, Error
 from uwlts.model.library import validated
 from uwlts.model.sensor import Description
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 AnyHeader = TypeVar("AnyHeader", bound=Description)
 
@@ -51,7 +54,7 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
 
 
 def format_of(path: str | Path) -> str | None:
-    """What an HDF5 file calls its format; None where it cannot be opened or calls it nothing."""
+    """Format of an HDF5 file by its label; None where it cannot be opened or has none."""
     try:
         # Unlocked, as it may be a recording that goes on.
         with h5py.File(path, "r", locking=False) as file:
@@ -62,12 +65,10 @@ def format_of(path: str | Path) -> str | None:
 
 def _text(file: h5py.File, name: str) -> str | None:
     """An attribute's text, None where it is missing or something else."""
-    if name not in file.attrs:
+    if name not in file.attrs or file.attrs.get_id(name).dtype.kind != "S":
         return None
-    attribute = file.attrs.get_id(name)
-    if attribute.dtype.kind != "S" or attribute.shape != ():
-        return None
-    return bytes(file.attrs[name]).decode()
+    value = file.attrs[name]
+    return value.decode() if isinstance(value, bytes) else None
 
 
 _SIGNATURE_AND_VERSION = b"\x89HDF\r\n\x1a\n\x03"
@@ -124,7 +125,7 @@ class _AsIfClosed(io.FileIO):
         """Go to a place; the file ends where the settled superblock says."""
         return super().seek(offset + self._end) if whence == os.SEEK_END else super().seek(offset, whence)
 
-    def readinto(self, buffer: memoryview) -> int:
+    def readinto(self, buffer: "Buffer", /) -> int:
         """Read as any file, with the settled superblock in place of the stored one and zeros where nothing is yet."""
         place, position = memoryview(buffer).cast("B"), self.tell()
         count = super().readinto(place)

@@ -19,7 +19,7 @@ _DIMENSIONS = {"centre_px": 2, "point_mm": 3, "normal": 3, "status": 2, "crossin
 
 
 class TruthStatus(IntEnum):
-    """Whether a profile line truly shows the stripe."""
+    """True visibility of the stripe on a profile line."""
 
     VISIBLE = 0
     NO_STRIPE = 1
@@ -35,7 +35,7 @@ class TruthHeader(Description):
 
 @dataclass(frozen=True)
 class Truth:
-    """What every profile line of every frame truly shows; F frames, L lines.
+    """True stripe of every profile line of every frame; F frames, L lines.
 
     ``centre_px (F, L)`` is the image coordinate across the stripe where the line's centre sees the middle of the
     sheet; ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates; ``status (F, L)``
@@ -52,7 +52,7 @@ class Truth:
 
 
 def truth_path(capture: str | Path) -> Path:
-    """Where the truth of a capture lies."""
+    """Path of the truth file of a capture."""
     path = Path(capture)
     return path.with_name(path.name.removesuffix(".h5") + ".truth.h5")
 

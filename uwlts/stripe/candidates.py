@@ -1,4 +1,4 @@
-"""Where on each profile line a stripe may be: blocks of pixels that stick out of both their surroundings.
+"""Candidate places of a stripe on each profile line: blocks of pixels that stick out of both their surroundings.
 
 A frame is reduced to the largest value and the background in blocks of a few pixels along each line, which is the
 only work done on all pixels. A block sticks out by its largest value minus the larger of the background values two
@@ -22,19 +22,10 @@ _MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
 
 
 def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Largest value and background of each block.
+    """Largest value and background of each block of profiles (N, L): two arrays (ceil(N / block), L) of the same type.
 
-    Parameters
-    ----------
-    profiles : (N, L) array
-        Grey levels, position along the line first.
-    block : int
-        Pixels per block; the last block of a line may be smaller.
-
-    Returns
-    -------
-    high, low : (ceil(N / block), L) arrays of the same type, grey levels
-        The largest of all pixels; the smaller of two pixels half a block apart, which no hot pixel raises.
+    The largest of all pixels, and the smaller of two pixels half a block apart, which no hot pixel raises. The last
+    block of a line may be smaller.
     """
     count, lines = profiles.shape
     whole = count // block
@@ -52,7 +43,7 @@ def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.nda
 
 
 def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.ndarray:
-    """How far each block sticks out of its surroundings, grey levels, 0 or more; arrays as of `block_extremes`.
+    """Height of each block above its surroundings, grey levels, 0 or more; arrays as of `block_extremes`.
 
     At the ends of a line, where there is nothing two blocks away, the other side counts alone.
     """

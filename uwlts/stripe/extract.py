@@ -36,7 +36,7 @@ _LONGEST_SIDE = 32766
 """OpenCV's remap addresses pixels with 16 bits."""
 
 _SHORT_GAP = 2
-"""A stripe that is lost for so few lines, as in noise, has not ended."""
+"""A stripe that is lost for so few lines, as in noise, goes on."""
 
 _LOOKS = 4
 """Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
@@ -65,7 +65,7 @@ def extract_stripe(
     background: np.ndarray | None = None,
     saturation: float | None = None,
 ) -> Stripe:
-    """Sub-pixel stripe centre on every profile line.
+    """Sub-pixel stripe centre on every profile line, of which there are L = H or W.
 
     Parameters
     ----------
@@ -81,16 +81,11 @@ def extract_stripe(
         Grey value at which pixels clip. By default the largest of the integer type, none for float32; 10- or 12-bit
         images in uint16 need it given.
 
-    Returns
-    -------
-    Stripe
-        With L = H or W lines.
-
     Raises
     ------
     ImageError
         If the image, the background, `stripe_along` or `saturation` is not as described, or the lines are shorter
-        than two search windows, too short to tell stripe from background.
+        than two search windows, too short to distinguish stripe and background.
     """
     half, block = options.half_window_px, options.half_window_px // 2
     _check_image(image, name="image")
@@ -98,8 +93,9 @@ def extract_stripe(
     clip = _saturation_of(image, saturation)
 
     signal = image if background is None else _subtract_background(image, background)
-    if options.smoothing_lines > 1:
-        signal = _average_lines(signal, options.smoothing_lines, stripe_along=stripe_along)
+    if (count := options.smoothing_lines) > 1:
+        kernel = (1, count) if stripe_along == "height" else (count, 1)
+        signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
     high, low = block_extremes(profiles, block)
     # Two blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
@@ -298,7 +294,7 @@ def _measure(found: _Lines, lines: np.ndarray, peak: PeakWindow, which: np.ndarr
 def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: float) -> np.ndarray:
     """Numbers (M,) of the lines with a centre that are among the ``lines`` last before a stripe ends or jumps.
 
-    ``good`` (L,) tells which lines have a centre. A stripe ends where more than a few lines in a row have none, and
+    ``good`` (L,) marks the lines with a centre. A stripe ends where more than a few lines in a row have none, and
     jumps where neighbouring centres lie more than ``jump_px`` apart. The image's own border is no end.
     """
     if good.all() and np.abs(centre[1:] - centre[:-1]).max(initial=0.0) <= jump_px:
@@ -318,12 +314,7 @@ def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: floa
 
 
 def _check_image(image: np.ndarray, *, name: str) -> None:
-    """Refuse what is not a two-dimensional, finite uint8, uint16 or float32 array.
-
-    Raises
-    ------
-    ImageError
-    """
+    """ImageError for what is not a two-dimensional, finite uint8, uint16 or float32 array."""
     if not isinstance(image, np.ndarray):
         raise ImageError(f"the {name} is a {type(image).__name__}; expected a NumPy array")
     if image.dtype not in _LARGEST:
@@ -338,12 +329,7 @@ def _check_image(image: np.ndarray, *, name: str) -> None:
 
 
 def _check_length(image: np.ndarray, *, stripe_along: str, least: int) -> None:
-    """Refuse an unknown orientation, lines shorter than the search needs and images OpenCV cannot address.
-
-    Raises
-    ------
-    ImageError
-    """
+    """ImageError for an unknown orientation, lines shorter than the search needs and images OpenCV cannot address."""
     if stripe_along not in ("height", "width"):
         raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
     if max(image.shape) > _LONGEST_SIDE:
@@ -366,13 +352,7 @@ def _saturation_of(image: np.ndarray, saturation: float | None) -> float:
 
 
 def _subtract_background(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Image minus background with its sign kept: int16 for two uint8 images, otherwise float32.
-
-    Raises
-    ------
-    ImageError
-        If the background is no image or its size or type differs.
-    """
+    """Image minus background with its sign kept: int16 for two uint8 images, otherwise float32."""
     _check_image(background, name="background")
     if background.shape != image.shape or background.dtype != image.dtype:
         raise ImageError(
@@ -380,12 +360,6 @@ def _subtract_background(image: np.ndarray, background: np.ndarray) -> np.ndarra
             "take both with the same camera settings"
         )
     return cv2.subtract(image, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
-
-
-def _average_lines(image: np.ndarray, count: int, *, stripe_along: str) -> np.ndarray:
-    """float32 image averaged over `count` neighbouring lines, the outermost repeated at the border."""
-    kernel = (1, count) if stripe_along == "height" else (count, 1)
-    return cv2.blur(image.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
 
 
 def _as_profiles(image: np.ndarray, *, stripe_along: str) -> np.ndarray:

@@ -30,7 +30,7 @@ _FLANK_FROM = np.array([[1 - FLANK], [-1]], np.float32)
 
 @dataclass(frozen=True)
 class PeakWindow:
-    """What stands in M windows of W pixels. Positions count from the window's first pixel.
+    """Peaks in M windows of W pixels. Positions count from the window's first pixel.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def measure_windows(
 
     peak = smooth[_sought(half, block)].max(axis=0)
     before, after = smooth[:block].min(axis=0), smooth[-block:].min(axis=0)
-    # Repeated border pixels may belong to the stripe itself, so that only the other side tells the background.
+    # Repeated border pixels may belong to the stripe itself, so that only the other side shows the background.
     if start.min() < 0:
         before[start < 0] = -np.inf
     if start.max() + size > profiles.shape[0]:
@@ -172,14 +172,9 @@ def peak_row(smooth: np.ndarray, *, half: int, block: int) -> np.ndarray:
 
 
 def off_centre(peak_window: PeakWindow) -> tuple[np.ndarray, np.ndarray]:
-    """How far the peak's middle is from its window's, and which windows have to follow it.
+    """Distance (M,) in px of the peak's middle from its window's, and which windows have to follow it (M,).
 
-    Returns
-    -------
-    offset : (M,) float32
-        Distance, px.
-    needed : (M,) bool
-        A half-height crossing or a flank lies outside the window.
+    These are the ones in which a half-height crossing or a flank lies outside the window.
     """
     to_end = 0.5 * (peak_window.window.shape[0] - 1)
     offset = peak_window.middle - to_end

@@ -82,23 +82,13 @@ def find_stripes(
     options: StripeOptions = StripeOptions(),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundStripes:
-    """Find the stripe in all laser images of a recording.
+    """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
-    Parameters
-    ----------
-    capture : LaserImages
-        Such as an opened `uwlts.storage.capture.Capture`.
-    options : StripeOptions, optional
-    progress : callable, optional
-        Called after each image with the number of images done and the number in all.
-
-    Raises
-    ------
-    CaptureError
-        The capture holds no laser image, or none of them shows a stripe.
+    ``progress`` is called after each image with the number of images done and the number in all. CaptureError where
+    the recording holds no laser image, or none of them shows a stripe.
     """
     header = capture.header
-    frames, lines, centres, amplitudes, widths = [], [], [], [], []
+    found: list[tuple[np.ndarray, ...]] = []
     statuses = np.zeros(len(StripeStatus), int)
     for number, image in capture.frames(laser_on=True):
         stripe = extract_stripe(
@@ -106,13 +96,10 @@ def find_stripes(
         )
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
-        centres.append(stripe.centre_px[good])
-        lines.append(good)
-        frames.append(np.full(len(good), number))
-        amplitudes.append(stripe.amplitude[good])
-        widths.append(stripe.width_px[good])
+        of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
+        found.append((np.full(len(good), number), good, *of_lines))
         progress(number + 1, len(capture))
-    if not centres:
+    if not found:
         raise CaptureError(
             f"{capture.path.name} holds no image with the laser on among {len(capture)}: nothing to reconstruct"
         )
@@ -120,15 +107,8 @@ def find_stripes(
     if statuses[StripeStatus.OK] == 0:
         lit = (image for _, image in capture.frames(laser_on=True))
         reason = why_no_stripe(lit, stripe_along=header.sensor.camera.stripe_along, full_dn=header.saturation_dn)
-        raise CaptureError(f"no stripe in any of the {len(centres)} laser images of {capture.path.name}: {reason}")
-    return FoundStripes(
-        frame=np.concatenate(frames),
-        line=np.concatenate(lines),
-        centre_px=np.concatenate(centres),
-        amplitude=np.concatenate(amplitudes),
-        width_px=np.concatenate(widths),
-        lines_by_status=by_status,
-    )
+        raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
+    return FoundStripes(*map(np.concatenate, zip(*found, strict=True)), lines_by_status=by_status)
 
 
 def is_black(image: np.ndarray, full_dn: float) -> bool:
@@ -158,7 +138,7 @@ def _more_across(image: np.ndarray, stripe_along: str, lines: int) -> bool:
 
 
 def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: int) -> str:
-    """What images (H, W) without a stripe show instead, and what to do about it; ``full_dn`` is where pixels clip."""
+    """Reason why images (H, W) show no stripe, and what to do about it; ``full_dn`` is where pixels clip."""
     count = black = white = across = 0
     for image in images:
         count += 1

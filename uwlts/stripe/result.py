@@ -37,7 +37,7 @@ class StripeStatus(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class StripeOptions:
-    """Choices for `uwlts.stripe.extract_stripe`.
+    """Options of `uwlts.stripe.extract_stripe`; RangeError for a number outside the ranges stated below.
 
     Attributes
     ----------
@@ -68,11 +68,6 @@ class StripeOptions:
     end_lines : int
         Lines left out on either side of a place where the stripe ends, or jumps by more than half of `half_window_px`
         from one line to the next: at an edge or a limb the sheet's width meets the surface only in part. 0 keeps them.
-
-    Raises
-    ------
-    RangeError
-        If a number lies outside the range stated above.
     """
 
     method: str = "profile-fit"
@@ -96,21 +91,15 @@ class StripeOptions:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise RangeError(f"{name} is {value!r}; expected a whole number")
-        _demand("half_window_px", self.half_window_px, 8, 512)
-        _demand("smoothing_px", self.smoothing_px, 0.5, self.half_window_px / 4)
-        _demand("smoothing_lines", self.smoothing_lines, 1, 101)
+        ranges = {"half_window_px": (8, 512), "smoothing_px": (0.5, self.half_window_px / 4)}
+        ranges |= {"smoothing_lines": (1, 101), "end_lines": (0, 100), "threshold_sigmas": (1.0, 1e6)}
+        ranges |= {"threshold_floor": (0.0, 1e9), "min_fwhm_px": (0.0, self.half_window_px)}
+        ranges |= {"ambiguous_ratio": (0.05, 1.0)}
+        for name, (low, high) in ranges.items():
+            if not low <= (value := getattr(self, name)) <= high:
+                raise RangeError(f"{name} is {value!r}; expected a number from {low:g} to {high:g}")
         if self.smoothing_lines % 2 == 0:
             raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
-        _demand("end_lines", self.end_lines, 0, 100)
-        _demand("threshold_sigmas", self.threshold_sigmas, 1.0, 1e6)
-        _demand("threshold_floor", self.threshold_floor, 0.0, 1e9)
-        _demand("min_fwhm_px", self.min_fwhm_px, 0.0, self.half_window_px)
-        _demand("ambiguous_ratio", self.ambiguous_ratio, 0.05, 1.0)
-
-
-def _demand(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise RangeError(f"{name} is {value!r}; expected a number from {low:g} to {high:g}")
 
 
 @dataclass(frozen=True)

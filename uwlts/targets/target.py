@@ -1,4 +1,4 @@
-"""Base class of calibration targets: what each target type provides, and how a description is read."""
+"""Base class of calibration targets, and reading of their descriptions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -42,11 +42,8 @@ class TargetView:
 class Patch:
     """A piece of a target's print: a rectangle with sides along x and y, or the ellipse that fits into it.
 
-    Attributes
-    ----------
-    x_min_mm, y_min_mm, x_max_mm, y_max_mm : float, mm, target frame
-    round : whether the patch is the ellipse
-    ink : whether the patch has the brightness of the ink or that of the ground around the pattern
+    In the target frame. ``round`` patches are the ellipse; those that are not ``ink`` have the brightness of the ground
+    around the pattern.
     """
 
     x_min_mm: float
@@ -137,14 +134,8 @@ def rectangle_corners(first: np.ndarray, last: np.ndarray) -> np.ndarray:
     return np.array([first, (last[0], first[1]), last, (first[0], last[1])])
 
 
-def parse_target(mapping: Mapping[str, Any]) -> Target:
-    """Make a target description from keys and values, as read from a file.
-
-    Raises
-    ------
-    DescriptionError
-        `kind` is missing or unknown, a key is unknown or missing, or a value is impossible.
-    """
+def parse_target(mapping: Mapping[str, object]) -> Target:
+    """Make a target description from keys and values, as read from a file; DescriptionError where they are wrong."""
     if not isinstance(mapping, Mapping):
         raise DescriptionError(f"the target is a {type(mapping).__name__}; expected a table of keys and values")
     kind = mapping.get("kind")

@@ -383,7 +383,7 @@ def test_the_other_kind_is_told_by_its_format(tmp_path, sensor):
     rays = nominal_calibration(sensor)
     write_calibration(tmp_path / "rays.json", rays)
     assert load_calibration(tmp_path / "rays.json") == rays
-    with pytest.raises(CaptureError, match="no polynomial calibration"):
+    with pytest.raises(CaptureError, match="not a polynomial calibration"):
         read_polynomials(tmp_path / "rays.json")
 
 
@@ -439,7 +439,7 @@ def test_files_that_are_none(file, tmp_path):
     with pytest.raises(CaptureError, match="truncated"):
         load_calibration(file)
     file.write_text("[1, 2]")
-    with pytest.raises(CaptureError, match="not a calibration"):
+    with pytest.raises(CaptureError, match="not a polynomial calibration"):
         read_polynomials(file)
     with pytest.raises(CaptureError, match="cannot read"):
         load_calibration(tmp_path / "missing.json")

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.artefacts import evaluate_cloud
-from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height_of_profile, step_height_of_scan
+from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
 from uwlts.metrology.truth_comparison import compare_with_truth
 from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.errors import EvaluationError
@@ -267,7 +267,7 @@ def test_profiles_are_labelled_and_measured(shape, tilt_deg):
         assert not np.any(named[:900] & (tread[:900] == StepFace.NEITHER))
         kept += np.count_nonzero(named)
         for reference in ("lower", "upper"):
-            height = step_height_of_profile(points, labels, reference=reference)
+            height = step_height(points, labels, reference=reference)
             scaled.append((height.height_mm - HEIGHT) / height.std_mm)
     # Edges and strays blank 1 mm to each side: at most 12 x 2 of 176 mm.
     assert kept > 6 * 900 * (1 - 24 / 176 - 0.02)
@@ -279,7 +279,7 @@ def test_the_height_of_many_profiles_has_no_bias_and_the_stated_scatter():
     heights, stated = [], []
     for seed in range(49):
         points, _ = step_profile(np.random.default_rng(seed), "base, block, base", tilt_deg=6)
-        height = step_height_of_profile(points, label_step_faces(points, height_mm=HEIGHT))
+        height = step_height(points, label_step_faces(points, height_mm=HEIGHT))
         heights.append(height.height_mm)
         stated.append(height.std_mm)
     assert abs(np.mean(heights) - HEIGHT) < 4 * np.mean(stated) / 7
@@ -301,9 +301,9 @@ def test_rounded_edges_stay_out():
 def test_labels_serve_slightly_changed_points():
     points, _ = step_profile(np.random.default_rng(1), "base, block, base")
     labels = label_step_faces(points, height_mm=HEIGHT)
-    first = step_height_of_profile(points, labels).height_mm
+    first = step_height(points, labels).height_mm
     for scale in (0.97, 1.01, 1.05):
-        stretched = step_height_of_profile(points * [1, scale], labels).height_mm
+        stretched = step_height(points * [1, scale], labels).height_mm
         # Stretching Z stretches the height, but for the tilt of the fitted line: 1e-4 rad squared.
         assert stretched == pytest.approx(scale * first, rel=1e-6)
 
@@ -312,7 +312,7 @@ def test_a_step_as_low_as_ten_times_the_noise_is_found():
     points, _ = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, strays=0)
     labels = label_step_faces(points, height_mm=1.0)
     assert np.count_nonzero(labels) > 600
-    height = step_height_of_profile(points, labels)
+    height = step_height(points, labels)
     assert abs(height.height_mm - 1.0) < 4.5 * height.std_mm < 0.05
 
 
@@ -377,7 +377,7 @@ def test_a_turned_step_is_measured_along_its_normal():
     base = cloud.points_mm[labels == StepFace.LOWER]
     slopes, *_ = np.linalg.lstsq(np.column_stack([base[:, :2], np.ones(len(base))]), base[:, 2], rcond=None)
     drawn = HEIGHT / np.cos(np.radians(25)) / np.cos(np.radians(5)) / np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2)
-    assert step_height_of_scan(cloud.points_mm, labels).height_mm == pytest.approx(drawn, abs=0.005)
+    assert step_height(cloud.points_mm, labels).height_mm == pytest.approx(drawn, abs=0.005)
     result = evaluate_cloud(cloud, StepStandard(height_mm=HEIGHT))
     assert result.height_mm == pytest.approx(drawn, abs=0.005)
     assert result.profile_height_mm == pytest.approx(drawn, abs=0.005)

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -20,22 +20,12 @@ NAME = "import.toml"
 Patterns = str | tuple[str, ...]
 Channel = Literal["red", "green", "blue", "grey", "max"]
 
-_OF_THE_HEADER = (
-    "name",
-    "sensor",
-    "intrinsics",
-    "medium",
-    "saturation_dn",
-    "target",
-    "artefact",
-    "provenance",
-    "bits",
-    "aligned",
-)
+_OF_THE_HEADER = ("name", "sensor", "intrinsics", "medium", "saturation_dn", "target", "artefact")
+_OF_THE_HEADER += ("provenance", "bits", "aligned")
 
 
 class StageMotion(Description):
-    """Where the stage was: by start and step, by a list, or nowhere, when every image has a pose of its own (free).
+    """Positions of the stage: by start and step, by a list, or nowhere, when every image has a pose of its own (free).
 
     ``direction`` is the unit direction in which growing positions move the sensor, in the OCS.
     """
@@ -67,7 +57,7 @@ class ImportDescription(Description):
 
     header: str | None = None
     name: str | None = None
-    sensor: str | dict[str, Any] | None = None
+    sensor: str | dict[str, object] | None = None
     intrinsics: str | None = None
     medium: str | None = None
     laser: Patterns = ()
@@ -84,9 +74,9 @@ class ImportDescription(Description):
     lamp_exposure_ms: NotNegative | None = None
     repeated: bool = False
     stage: StageMotion = StageMotion()
-    target: dict[str, Any] | None = None
-    artefact: dict[str, Any] | None = None
-    provenance: dict[str, Any] | None = None
+    target: dict[str, object] | None = None
+    artefact: dict[str, object] | None = None
+    provenance: dict[str, object] | None = None
 
     @model_validator(mode="after")
     def _given_once(self) -> "ImportDescription":
@@ -113,30 +103,12 @@ def read_description(path: Path) -> ImportDescription:
 
 
 def capture_header(
-    given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: dict[str, Any]
+    given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: dict[str, object]
 ) -> CaptureHeader:
-    """Header of the capture.
+    """Header of the capture; ``name`` and ``remarks`` (as provenance) serve where the description gives none.
 
-    Parameters
-    ----------
-    given : ImportDescription
-    sensor : Sensor
-        As `described_sensor` gives it.
-    beside : Path
-        Folder of the description, where the files it names are sought.
-    name : str
-        Name of the capture unless the description has one.
-    saturation_dn : int
-        Grey value at which the capture's pixels clip.
-    remarks : dict
-        Provenance unless the description has one.
-
-    Raises
-    ------
-    DescriptionError
-        Medium, target, direction or header are missing, unknown or not valid.
-    EvaluationError
-        The artefact is not valid.
+    ``beside`` is the folder in which files that the description names are sought. DescriptionError where medium,
+    target, direction or header are missing, unknown or not valid, EvaluationError where the artefact is not.
     """
     if given.header is not None:
         return read_header(beside / given.header)
@@ -154,17 +126,10 @@ def capture_header(
         parse_target(given.target)
     if given.artefact is not None:
         parse_artefact(given.artefact)
-    table = {
-        "name": given.name or name,
-        "sensor": sensor,
-        "medium_name": given.medium,
-        "medium": sensor.medium(given.medium),
-        "stage_direction": direction,
-        "target": given.target,
-        "artefact": given.artefact,
-        "saturation_dn": saturation_dn,
-        "provenance": remarks if given.provenance is None else given.provenance,
-    }
+    table = {"name": given.name or name, "sensor": sensor, "saturation_dn": saturation_dn, "stage_direction": direction}
+    table |= {"medium_name": given.medium, "medium": sensor.medium(given.medium)}
+    table |= {"target": given.target, "artefact": given.artefact}
+    table |= {"provenance": remarks if given.provenance is None else given.provenance}
     return validated(CaptureHeader, table, "the header from the description")
 
 

@@ -24,33 +24,25 @@ from uwlts.stripe.recording import BLACK, WHITE, has_stripe, is_black, runs_acro
 
 
 def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> None:
-    """Refuse an image (H, W) or (H, W, 3) of another size than the sensor's; the advice differs for the ``first`` one.
-
-    Raises
-    ------
-    ImageError
-    """
-    camera = sensor.camera
+    """ImageError for an image (H, W) or (H, W, 3) of another size than the sensor's; other advice for the first one."""
     height, width = image.shape[:2]
-    if (width, height) == (camera.width_px, camera.height_px):
+    wanted = sensor.camera.width_px, sensor.camera.height_px
+    if (width, height) == wanted:
         return
-    wanted = f"{camera.width_px} x {camera.height_px}"
+    match first, (height, width) == wanted:
+        case True, True:
+            advice = "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of "
+            advice += "the sensor and see to stripe_along"
+        case True, _:
+            advice = "give the description of the sensor that took the images, or correct its width_px and height_px"
+        case _, True:
+            advice = "it is turned by a quarter turn: turn it back"
+        case _:
+            advice = "leave it out (ignore), or import it on its own"
     before = "" if first else " and the images before it"
-    if (width, height) == (camera.height_px, camera.width_px):
-        advice = (
-            "it is turned by a quarter turn: turn it back"
-            if not first
-            else "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
-            "sensor and see to stripe_along"
-        )
-    else:
-        advice = (
-            "leave it out (ignore), or import it on its own"
-            if not first
-            else "give the description of the sensor that took the images, or correct its width_px and height_px"
-        )
     raise ImageError(
-        f"{name} has {width} x {height} pixels; expected {wanted} as the sensor '{sensor.name}' has{before}: {advice}"
+        f"{name} has {width} x {height} pixels; expected {wanted[0]} x {wanted[1]} as the sensor '{sensor.name}' "
+        f"has{before}: {advice}"
     )
 
 
@@ -71,13 +63,7 @@ class Content:
     sideways: int = 0
 
     def look(self, image: np.ndarray, *, laser_on: bool, name: str) -> None:
-        """Take an image (H, W) as the camera gave it into account.
-
-        Raises
-        ------
-        ImageError
-            Most of it is saturated.
-        """
+        """Take an image (H, W) as the camera gave it into account; ImageError where most of it is saturated."""
         self.seen[laser_on] += 1
         white = white_share(image, self.saturation_dn)
         if white > WHITE:
@@ -98,16 +84,13 @@ class Content:
 
     def refuse_black(self) -> None:
         """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
-        if self.seen[True] and len(self.black[True]) == self.seen[True]:
-            raise ImageError(
-                f"all {self.seen[True]} laser images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
-                "the laser on, the exposure long enough, the channel that of its colour, bits right?"
-            )
-        if self.target and self.seen[False] and len(self.black[False]) == self.seen[False]:
-            raise ImageError(
-                f"all {self.seen[False]} lamp images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
-                "the lamp on, the exposure long enough, bits right?"
-            )
+        for laser_on, light, colour in ((True, "laser", " the channel that of its colour,"), (False, "lamp", "")):
+            seen = self.seen[laser_on] if laser_on or self.target else 0
+            if seen and len(self.black[laser_on]) == seen:
+                raise ImageError(
+                    f"all {seen} {light} images are black, no pixel reaches {100 * BLACK:g} % of full scale: is "
+                    f"the {light} on, the exposure long enough,{colour} bits right?"
+                )
 
     def verdict(self) -> list[str]:
         """Warnings, once all images were seen."""
@@ -119,13 +102,11 @@ class Content:
         lasers = self.seen[True]
         if lasers and not self.with_stripe:
             along = self.sensor.camera.stripe_along
-            turned = (
-                f"in {self.sideways} of them one runs across: the images are turned, or the sensor's stripe_along "
-                f"('{along}') is wrong"
-                if self.sideways
-                else "check which images are laser images, the channel, and the exposure"
-            )
-            warnings.append(f"no stripe in any of the {lasers} laser images: {turned}")
+            advice = "check which images are laser images, the channel, and the exposure"
+            if self.sideways:
+                advice = f"in {self.sideways} of them one runs across: the images are turned, or the sensor's "
+                advice += f"stripe_along ('{along}') is wrong"
+            warnings.append(f"no stripe in any of the {lasers} laser images: {advice}")
         elif self.with_stripe < lasers:
             warnings.append(f"{lasers - self.with_stripe} of {lasers} laser images show no stripe")
         return warnings
@@ -137,7 +118,7 @@ _UNKNOWN = 0.0
 
 @dataclass(frozen=True)
 class Imported:
-    """What was imported: number of laser and lamp images, and what is doubtful about them."""
+    """Result of an import: numbers of laser and lamp images, and warnings."""
 
     laser: int
     lamp: int
@@ -213,7 +194,7 @@ def import_images(
 
 
 def _zero_dn(given: ImportDescription, frames: list[PlannedFrame], bits: int) -> int:
-    """What is added to a difference; 0 where nothing is subtracted."""
+    """Grey value that stands for no difference; 0 where no background is subtracted."""
     if all(frame.background is None for frame in frames):
         return 0
     if given.header is not None:
@@ -280,7 +261,9 @@ def _write(
                     image = without_background(image, dark, zero_dn=zero_dn)
                 if frame.laser_on:
                     content.look_for_stripe(image)
-                writer.append(_frame(image.astype(dtype, copy=False), frame))
+                exposure, time = (_UNKNOWN if value is None else value for value in (frame.exposure_ms, frame.time_s))
+                image = image.astype(dtype, copy=False)
+                writer.append(Frame(image, frame.stage_mm, frame.laser_on, exposure, time, frame.pose))
                 progress(number + 1, len(frames))
             content.refuse_black()
     except BaseException:
@@ -289,15 +272,10 @@ def _write(
         raise
 
 
-def _frame(image: np.ndarray, planned: PlannedFrame) -> Frame:
-    exposure, time = (_UNKNOWN if value is None else value for value in (planned.exposure_ms, planned.time_s))
-    return Frame(image, planned.stage_mm, planned.laser_on, exposure, time, planned.pose)
-
-
 def _remarks(
     given: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int
 ) -> dict[str, object]:
-    """What the capture says of its origin."""
+    """Provenance of the capture."""
     remarks: dict[str, object] = {
         "source": "imported images",
         "uwlts": uwlts.__version__,

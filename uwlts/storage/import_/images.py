@@ -1,7 +1,7 @@
 """Reads image files as grey values and finds those that are damaged.
 
-libpng, libjpeg and libtiff make up what they cannot decode, and say so on the process's standard error only. So that is
-read meanwhile: lines about damage are returned, everything else is passed on.
+libpng, libjpeg and libtiff fill in what they cannot decode, and report it on the process's standard error only. So that
+is read meanwhile: lines about damage are returned, everything else is passed on.
 """
 
 import os
@@ -25,13 +25,7 @@ _AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*er
 
 
 def decode(content: bytes) -> tuple[np.ndarray | None, str]:
-    """Image as OpenCV decodes it unchanged, None where it cannot, and the message about damage, empty if there is none.
-
-    Raises
-    ------
-    cv2.error
-        The content cannot be decoded at all.
-    """
+    """Image as OpenCV decodes it unchanged, or None, and the message about damage or ""; may raise cv2.error."""
     with _heard() as said:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     return image, " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
@@ -117,10 +111,7 @@ def read_image(path: Path) -> np.ndarray:
 def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
     """Grey image (H, W): red, green or blue of a colour image, its luminance (grey), or the brightest (max).
 
-    Raises
-    ------
-    ImageError
-        A colour image, and no channel is chosen.
+    ImageError for a colour image where no channel is chosen.
     """
     if image.ndim == 2:
         return image
@@ -137,13 +128,7 @@ def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndar
 
 
 def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
-    """Bits of the grey values: 8 for a file of 8 bit, else as given.
-
-    Raises
-    ------
-    ImageError
-        A file of 16 bit without given bits; a file of 8 bit that should have more.
-    """
+    """Bits of the grey values: 8 for a file of 8 bit, else as given; ImageError where that is contradictory or open."""
     if image.dtype == np.uint8:
         if bits not in (None, 8):
             raise ImageError(f"{name} is a file of 8 bit, but bits = {bits}: save it with 16 bit, or leave out bits")
@@ -156,10 +141,7 @@ def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
 def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.ndarray:
     """Grey values from 0 to 2^bits - 1 of an image (H, W) whose camera put them into the lower or upper bits.
 
-    Raises
-    ------
-    ImageError
-        There are larger values, or bits below the upper ones are used.
+    ImageError where there are larger values, or bits below the upper ones are used.
     """
     if image.dtype == np.uint8:
         return image

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -96,7 +95,7 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
     return validated(Sensor, merged(sensor.model_dump(), {"camera": changes}), source)
 
 
-def _opencv(text: str, path: Path) -> dict[str, Any]:
+def _opencv(text: str, path: Path) -> dict[str, object]:
     """Top entries of a file of `cv2.FileStorage`: matrices, lists, numbers and texts."""
     try:
         # Its nodes hold only as long as the storage does.
@@ -108,7 +107,7 @@ def _opencv(text: str, path: Path) -> dict[str, Any]:
         raise DescriptionError(f"{path} is no complete file of OpenCV: {' '.join(str(error).split())}") from error
 
 
-def _value(node: cv2.FileNode) -> Any:
+def _value(node: cv2.FileNode) -> object:
     if node.isMap():
         # A matrix, with its tag or without, as ROS writes it.
         return _value(node.getNode("data"))
@@ -119,7 +118,7 @@ def _value(node: cv2.FileNode) -> Any:
     return node.real() if node.isInt() or node.isReal() else None
 
 
-def _plain_yaml(text: str, path: Path) -> dict[str, Any]:
+def _plain_yaml(text: str, path: Path) -> dict[str, object]:
     try:
         # What `rostopic echo` prints ends with the mark of a next document.
         entries = next(iter(yaml.safe_load_all(text)), None)
@@ -130,11 +129,11 @@ def _plain_yaml(text: str, path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in entries.items()}
 
 
-def _first(known: dict[str, Any], names: tuple[str, ...]) -> Any:
+def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
     return next((known[name] for name in names if known.get(name) is not None), None)
 
 
-def _numbers(known: dict[str, Any], names: tuple[str, ...], path: Path) -> np.ndarray:
+def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
     """Finite numbers (N,) of a matrix in any of its writings."""
     value = _first(known, names)
     if isinstance(value, dict):
@@ -145,7 +144,7 @@ def _numbers(known: dict[str, Any], names: tuple[str, ...], path: Path) -> np.nd
             f"{', '.join(known) or 'nothing'}"
         )
     try:
-        numbers = np.array(value, dtype=np.float64).ravel()
+        numbers = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
         raise DescriptionError(f"{path}: {names[0]} is {value!r}; expected numbers") from error
     if not np.isfinite(numbers).all():
@@ -167,11 +166,12 @@ def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
     return Distortion(**dict(zip(names, coefficients.tolist()[:5], strict=False)))
 
 
-def _size(known: dict[str, Any], path: Path) -> tuple[int, int] | None:
+def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
     width, height = _first(known, _WIDTH), _first(known, _HEIGHT)
     if width is None or height is None:
         return None
     try:
-        return int(width), int(height)
+        width_px, height_px = np.array([width, height], dtype=np.float64).astype(int).tolist()
+        return width_px, height_px
     except (TypeError, ValueError) as error:
         raise DescriptionError(f"{path}: the image size is {width!r} x {height!r}; expected whole numbers") from error

@@ -22,7 +22,7 @@ _LIGHTS = ("laser", "lamp", "ignore")
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """What a table says of one image, None where it says nothing; ``number`` is its place in the table."""
+    """Entries of a table for one image, None where there is none; ``number`` is its place in the table."""
 
     file: str
     number: int = 0
@@ -125,7 +125,12 @@ def match(folder: Path, given: ImportDescription, rows: list[Row] | None) -> Mat
         ignored = [row.file for row in known if matches(row.file, given.ignore)]
         known = [row for row in known if row.file not in ignored]
         laser, lamp = ([row for row in known if matches(row.file, light)] for light in (given.laser, given.lamp))
-    _refuse_both(laser, lamp)
+    both = sorted({row.file for row in laser} & {row.file for row in lamp})
+    if both:
+        raise DescriptionError(
+            f"{', '.join(both[:3])} would be both laser and lamp image: narrow the patterns; where the laser is drawn "
+            "on the lit target, it is a laser image, and the image without laser is lamp and background"
+        )
     if not laser and not lamp:
         raise DescriptionError(
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "
@@ -143,27 +148,12 @@ def matches(name: str, patterns: Patterns) -> bool:
     return any(fnmatch(name, pattern) or fnmatch(PurePosixPath(name).name, pattern) for pattern in wanted)
 
 
-def _refuse_both(laser: list[Row], lamp: list[Row]) -> None:
-    both = sorted({row.file for row in laser} & {row.file for row in lamp})
-    if both:
-        raise DescriptionError(
-            f"{', '.join(both[:3])} would be both laser and lamp image: narrow the patterns; where the laser is drawn "
-            "on the lit target, it is a laser image, and the image without laser is lamp and background"
-        )
-
-
 def _backgrounds(folder: Path, found: list[str], given: ImportDescription, laser: list[Row]) -> list[str]:
     """One background per laser image, or none at all."""
     named = [row.background for row in laser if row.background is not None]
     if named and (given.background or len(named) < len(laser)):
-        raise DescriptionError(
-            f"the table names a background for {len(named)} of {len(laser)} laser images"
-            + (
-                ", and there is a pattern as well: give one of them"
-                if given.background
-                else ": name it for all or none"
-            )
-        )
+        advice = ", and there is a pattern as well: give one" if given.background else ": name it for all or none"
+        raise DescriptionError(f"the table names a background for {len(named)} of {len(laser)} laser images{advice}")
     if named:
         missing = [name for name in named if not (folder / name).is_file()]
         if missing:
@@ -244,7 +234,7 @@ def planned_frames(folder: Path, given: ImportDescription, matched: Matched, *, 
             frame = PlannedFrame(
                 path=folder / row.file,
                 laser_on=laser_on,
-                stage_mm=_own(row) if positions is None else positions[place],
+                stage_mm=_listed_mm(row) if positions is None else positions[place],
                 exposure_ms=exposure if row.exposure_ms is None else row.exposure_ms,
                 time_s=row.time_s,
                 pose=row.pose,
@@ -258,7 +248,7 @@ def planned_frames(folder: Path, given: ImportDescription, matched: Matched, *, 
 
 
 def stage_remark(given: ImportDescription) -> str:
-    """How the positions are known, for the capture's provenance."""
+    """Source of the positions, for the capture's provenance."""
     if given.stage.free:
         return "none: stage_mm counts the poses"
     if given.stage.start_mm is not None:
@@ -299,7 +289,7 @@ def _positions(given: ImportDescription, matched: Matched) -> list[float] | None
     return [float(place) for place in range(count)]
 
 
-def _own(row: Row) -> float:
+def _listed_mm(row: Row) -> float:
     if row.stage_mm is None:
         raise DescriptionError(f"the position of {row.file} is missing: fill in stage_mm in the table, or leave it out")
     return row.stage_mm

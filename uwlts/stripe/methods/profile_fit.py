@@ -23,8 +23,8 @@ where the wings fall below that part over the contrast, 2.5 sigma from the centr
 _LEAST_NOISE = 0.5
 """Grey levels: values are rounded to whole ones, and cut off at black."""
 
-_USUAL_CONTRAST, _WORTH = 0.3, 5.0
-"""Speckle contrast assumed before anything is measured, and how many pixels' evidence that is worth."""
+_USUAL_CONTRAST, _PRIOR_PIXELS = 0.3, 5.0
+"""Speckle contrast assumed before anything is measured, and the number of pixels whose evidence it counts as."""
 
 _NARROWEST, _WIDENING, _LONGEST_STEP = 0.4, 1.5, 0.5
 """Least sigma in px, its largest ratio to the half-height width's, and the largest change of a parameter at a time."""
@@ -103,10 +103,10 @@ def _floor(peak: PeakWindow, near: np.ndarray, sampled: slice) -> float:
 def _contrast(left: np.ndarray, squared: np.ndarray, *, floor: float) -> float:
     """Contrast of the pixels above half height: what the fit leaves of them over the model, less the floor's share.
 
-    ``squared`` is the model's square. What the fit's own freedom takes from the errors is not made up for.
+    ``squared`` is the model's square. The degrees of freedom of the fit are not accounted for.
     """
-    total = float(((left * left - floor**2) / squared).sum(dtype=float)) + _WORTH * _USUAL_CONTRAST**2
-    return math.sqrt(max(total, 0.0) / (squared.size + _WORTH))
+    total = float(((left * left - floor**2) / squared).sum(dtype=float)) + _PRIOR_PIXELS * _USUAL_CONTRAST**2
+    return math.sqrt(max(total, 0.0) / (squared.size + _PRIOR_PIXELS))
 
 
 def _gaussians(powers: np.ndarray, log_height: np.ndarray, centre: np.ndarray, variance: np.ndarray) -> np.ndarray:

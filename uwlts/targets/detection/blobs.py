@@ -74,19 +74,7 @@ def find_blobs(image):
     filled by keeping outer contours only; blobs at the image border and small ones are left out. The window and
     polarity with most blobs of about the same size win.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-
-    Returns
-    -------
-    Blobs
-        Possibly empty.
-
-    Raises
-    ------
-    ImageError
-        The image is no grey image of 8 or 16 bit.
+    The image is (H, W) of uint8 or uint16, ImageError for others; the result may be empty.
     """
     grey = checked_grey(image).astype(np.float32)
     low, high = np.quantile(grey[::4, ::4], (0.001, 0.999))
@@ -143,9 +131,7 @@ def _ellipse_like(mask, *, bright):
     height, width = mask.shape
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     centres, shapes = [], []
-    if not contours:
-        return Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), bright)
-    is_outline = hierarchy.reshape(-1, 4)[:, 3] < 0
+    is_outline = hierarchy.reshape(-1, 4)[:, 3] < 0 if contours else ()
     # The outline of the largest circle that fits into the image has less than four times its shorter side.
     for contour, outline in zip(contours, is_outline, strict=True):
         if not outline or not 8 <= len(contour) <= 4 * min(height, width):
@@ -165,11 +151,9 @@ def _ellipse_like(mask, *, bright):
             continue
         centres.append((moments["m10"] / area, moments["m01"] / area))
         shapes.append(covariance)
-    if not centres:
-        return Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), bright)
-    values, vectors = np.linalg.eigh(np.array(shapes))
+    values, vectors = np.linalg.eigh(np.array(shapes).reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
-    return Blobs(np.array(centres), (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
+    return Blobs(np.array(centres).reshape(-1, 2), (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
 
 
 def _largest_family(radii):

@@ -17,17 +17,7 @@ def eight_bit(image):
 
 
 def corner_quality(image, pixels):
-    """Contrast and sharpness, as in `TargetView`, of corners between two bright and two dark fields.
-
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-    pixels : (N, 2) float64, px
-
-    Returns
-    -------
-    dict of (N,) float64
-    """
+    """Contrast and sharpness (N,), as in `TargetView`, of corners (N, 2), px, of two bright and two dark fields."""
     rim = HALF_WINDOW + 1
     grey = cv2.copyMakeBorder(image.astype(np.float32), rim, rim, rim, rim, cv2.BORDER_REPLICATE)
     slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8

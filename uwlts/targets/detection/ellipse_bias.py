@@ -1,4 +1,4 @@
-"""How far the centre of the image of a circle lies from the image of its centre."""
+"""Offset of the centre of a circle's image from the image of the circle's centre."""
 
 import numpy as np
 

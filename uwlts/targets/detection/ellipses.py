@@ -9,19 +9,14 @@ from uwlts.targets.detection.blobs import find_blobs, noise_level
 
 PASSES = 2
 
-
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast; 1.2 / slope is therefore three s.
 REACH_TIMES_SLOPE = 1.2
 
-
 MIN_REACH_PX = 2.5
-
 
 MAX_REACH_PX = 8.0
 
-
 MIN_RELATIVE_CONTRAST = 0.25
-
 
 # A centroid further from the ellipse's centre than this has something other than a circle in its band.
 MAX_SHIFT_PX = 0.5
@@ -36,17 +31,8 @@ def area_centroids(grey, ellipses):
     Inside and outside levels are planes, so that shading does not pull the centre, and what lies deep inside (a mark)
     has no influence.
 
-    Parameters
-    ----------
-    grey : (H, W) float32, grey levels
-    ellipses : Ellipses
-        Fitted to the edges; supplies band and start.
-
-    Returns
-    -------
-    centres : (N, 2) float64, px, (u, v)
-    agree : (N,) bool
-        Whether the centroid is next to the ellipse's centre; where not, the ellipse's centre is given.
+    Returns centres (N, 2) in px and whether (N,) the centroid is next to the centre of the ellipse fitted to the edge;
+    where not, the ellipse's centre is given. ``grey`` is float32 (H, W).
     """
     centres, agree = ellipses.centres.copy(), np.ones(len(ellipses), bool)
     if len(ellipses) == 0:
@@ -61,7 +47,7 @@ def area_centroids(grey, ellipses):
 
 
 def _reaches(shape, ellipses):
-    """How far the band should extend, and extends inwards and outwards from each ellipse, three times (N,), px."""
+    """Wanted reach of the band, and its reach inwards and outwards from each ellipse, three times (N,), px."""
     semi_axes = np.linalg.eigvalsh(ellipses.shapes)
     wanted = np.clip(REACH_TIMES_SLOPE / np.maximum(ellipses.sharpness, 0.1), MIN_REACH_PX, MAX_REACH_PX)
     inner = np.minimum(wanted, REACH_OVER_MINOR_AXIS * semi_axes[:, 0])
@@ -155,48 +141,36 @@ def _row_runs(centres, inner_shapes, outer_shapes):
 # Profiles around a blob, and samples on each.
 PROFILES = 48
 
-
 SAMPLES = 11
-
 
 # Reaches of an edge profile on either side of the ellipse, tried in turn. Two and a half pixels hold the edge of a lens
 # in focus, six that of one out of focus; inside a small blob half the minor semi-axis is all there is before the
 # opposite edge is felt. The next is tried where this share of the blobs shows no sharp edge.
 REACHES_PX = (2.5, 6.0)
 
-
 REACH_OVER_MINOR_AXIS = 0.5
 
-
 MISSED_SHARE = 0.2
-
 
 # Largest rms distance of the edge from its ellipse: as a share of the reach (0.15 px of 2.5 px) and of the mean radius,
 # against what the noise of a single pixel does to an edge, and against the median of all blobs, which have about the
 # same noise and blur.
 MAX_RESIDUAL_OVER_REACH = 0.06
 
-
 MAX_RESIDUAL_OVER_RADIUS = 0.01
-
 
 MAX_RESIDUAL_OVER_NOISE = 1.5
 
-
 MAX_RESIDUAL_OVER_MEDIAN = 2.5
 
-
 RESIDUAL_FLOOR_PX = 0.03
-
 
 # Least slope over contrast of an edge, times the reach; at a reach of 2.5 px it is that under a Gaussian blur of 4 px.
 MIN_SHARPNESS_TIMES_REACH = 0.25
 
-
 # Largest departure of one profile's contrast from the smooth course around the blob. Where blur fills a small blob, its
 # inside level differs between the ends and the flanks of the ellipse.
 MAX_CONTRAST_DEPARTURE = 0.2
-
 
 MAX_CONTRAST_DEPARTURE_IF_SMALL = 0.4
 
@@ -226,14 +200,8 @@ class Ellipses:
         return len(self.centres)
 
     def __getitem__(self, select):
-        return Ellipses(
-            self.centres[select],
-            self.shapes[select],
-            self.residual_px[select],
-            self.contrast[select],
-            self.sharpness[select],
-            self.bright,
-        )
+        arrays = (self.centres, self.shapes, self.residual_px, self.contrast, self.sharpness)
+        return Ellipses(*(values[select] for values in arrays), self.bright)
 
 
 def fit_ellipses(image, blobs):
@@ -242,19 +210,11 @@ def fit_ellipses(image, blobs):
     The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
     ellipse. Both levels follow a constant and a first harmonic around the blob, so that shading does not shift the
     centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
-    least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the plate's edge show a large residual or
+    least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the target's edge show a large residual or
     an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
     over a longer distance.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-    blobs : Blobs
-
-    Returns
-    -------
-    Ellipses
-        Fitted and accepted, possibly none.
+    The image is (H, W) of uint8 or uint16; possibly no ellipse is accepted.
     """
     grey = image.astype(np.float32)
     noise = max(noise_level(grey), 0.5)
@@ -328,8 +288,7 @@ def _edges(grey, centres, shapes, longest, *, bright, noise):
     departure = np.abs(inner - outer - contrast)
     share = np.where(reach < longest, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
     whole = (contrast > 0).all(1) & (departure <= np.maximum(share[:, None] * contrast, 6 * noise)).all(1)
-    excess = profiles - (inner_level + outer_level)[:, :, None] / 2
-    distance, crossed = _crossing(excess)
+    distance, crossed = _crossing(profiles - (inner_level + outer_level)[:, :, None] / 2)
     middle = SAMPLES // 2
     slope = (profiles[:, :, middle - 2] - profiles[:, :, middle + 2]).mean(1) / (8 * reach / (SAMPLES - 1))
     mean_contrast = contrast.mean(1)
@@ -338,7 +297,7 @@ def _edges(grey, centres, shapes, longest, *, bright, noise):
 
 
 def _crossing(excess):
-    """Where profiles (N, P, S) fall through zero nearest their middle, from -1 to 1, and whether all N x P do."""
+    """Places, -1 to 1, where profiles (N, P, S) fall through zero nearest their middle, and whether all N x P do."""
     falls = (excess[:, :, :-1] > 0) & (excess[:, :, 1:] <= 0)
     from_middle = np.abs(np.arange(SAMPLES - 1) - (SAMPLES - 2) / 2)
     first = np.where(falls, from_middle, np.inf).argmin(2)
@@ -360,10 +319,8 @@ def _moved(centres, shapes, edge):
     residual = edge.distance - (design @ change)[:, :, 0]
     change = change[:, :, 0]
     shapes = shapes + change[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    values = np.linalg.eigvalsh(shapes)
-    fitted = values[:, 0] > 1.0
     rms = np.sqrt((residual**2).sum(1) / (PROFILES - 5))
-    return centres + change[:, :2], shapes, rms, fitted
+    return centres + change[:, :2], shapes, rms, np.linalg.eigvalsh(shapes)[:, 0] > 1.0
 
 
 def rim_directions():
@@ -391,19 +348,8 @@ def find_circles(image):
     Follows G. S. de Matos (UFSC 2017, section 4.5: median filter, background-corrected threshold, hole filling,
     removal of border and small particles, ellipse fit) up to the blobs; ellipse and centre come from the grey levels.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-
-    Returns
-    -------
-    Ellipses
-        Centres are centroids of the covered area, in px (u, v); possibly none.
-
-    Raises
-    ------
-    ImageError
-        The image is no grey image of 8 or 16 bit.
+    The image is (H, W) of uint8 or uint16, ImageError for others. Centres are centroids of the covered area, in px
+    (u, v); possibly none are found.
     """
     ellipses = fit_ellipses(image, find_blobs(image))
     centres, agree = area_centroids(image.astype(np.float32), ellipses)
@@ -411,20 +357,10 @@ def find_circles(image):
 
 
 def mark_strength(image, circles, *, mark_over_circle):
-    """How strongly each circle shows a centred dot of the opposite brightness.
+    """Strength (N,) with which each circle of an image shows a centred dot of the opposite brightness.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-    circles : Ellipses
-        Of that image.
-    mark_over_circle : float
-        Diameter of the dot over the diameter of the circle, between 0 and 1.
-
-    Returns
-    -------
-    (N,) float64
-        (ring - dot) / contrast: about 0 without a dot, towards 1 with a sharp one.
+    (ring - dot) / contrast: about 0 without a dot, towards 1 with a sharp one. ``mark_over_circle`` is the diameter of
+    the dot over that of the circle.
     """
     grey = image.astype(np.float32)
     rim = rim_directions() @ circles.shapes

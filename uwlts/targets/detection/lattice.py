@@ -11,13 +11,10 @@ from uwlts.targets.detection.ellipses import Ellipses, find_circles
 # Half the side of the square of neighbours: 24 of them determine the six terms of a quadratic with room for gaps.
 NEIGHBOURHOOD = 2
 
-
 # Fewer neighbours than this neither support nor contradict a place.
 MIN_NEIGHBOURS = 3
 
-
 MAX_OVER_SPREAD = 8.0
-
 
 # What a quadratic leaves of perspective and distortion over two steps, as a share of one step.
 MODEL_ERROR = 0.002
@@ -29,16 +26,8 @@ def agreeing(points, indices):
     The worst point of each neighbourhood goes first and the others are judged again without it, because one wrong
     point spoils the predictions of all around it.
 
-    Parameters
-    ----------
-    points : (N, 2) float64, px
-    indices : (N, 2) int64
-        Distinct places.
-
-    Returns
-    -------
-    (M,) int64
-        The points that agree, ascending.
+    ``points`` (N, 2) are in px, ``indices`` (N, 2) their distinct places. Returns the numbers (M,) of the points that
+    agree, ascending.
     """
     if len(points) == 0:
         return np.empty(0, np.int64)
@@ -96,30 +85,23 @@ def _excess(points, around, present, terms, valid):
 
 NEIGHBOURS = 16
 
-
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
-
 
 # A neighbour is taken where it lies within this share of a step of its predicted place. One step changes by up to a
 # tenth from one circle to the next in strong perspective; half a step would reach the neighbour's neighbour.
 TOLERANCE = 0.25
 
-
 # Largest ratio of the radii of neighbouring circles.
 MAX_SIZE_RATIO = 1.5
-
 
 # Smallest sine of the angle between the steps of a seed, where the ellipse of its circle is a circle. An ellipse 20 %
 # too round turns a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice of sides 1 : 3 has the sine 0.95.
 MIN_SINE = 0.95
 
-
 # Largest ratio of the area of a seed's cell to the median, half-way between one and two cells.
 MAX_CELL_RATIO = 1.4
 
-
 MIN_LABELLED = 4
-
 
 MAX_SEEDS = 20
 
@@ -147,21 +129,8 @@ class Lattice:
 def detect_lattice(image):
     """Find the circles of a regular rectangular array without marks and number them.
 
-    Parameters
-    ----------
-    image : (H, W) uint8 or uint16
-
-    Returns
-    -------
-    Lattice
-        The largest connected piece of lattice in the image.
-
-    Raises
-    ------
-    ImageError
-        The image is no grey image of 8 or 16 bit.
-    TargetError
-        Fewer than four circles form a lattice.
+    Returns the largest connected piece of lattice in an image (H, W) of uint8 or uint16; ImageError for other images,
+    TargetError where fewer than four circles form a lattice.
     """
     circles = find_circles(image)
     indices, labelled = label_lattice(circles.centres, circles.shapes)
@@ -180,17 +149,8 @@ def label_lattice(centres, shapes):
     measure in which the ellipse is a circle: there the lattice is rectangular however oblique the view. From the seed,
     each next circle is expected one local step further on.
 
-    Parameters
-    ----------
-    centres : (N, 2) float64, px
-    shapes : (N, 2, 2) float64, px
-        As in `Ellipses`.
-
-    Returns
-    -------
-    indices : (N, 2) int64
-        Zero where not labelled.
-    labelled : (N,) bool
+    ``centres`` (N, 2) and ``shapes`` (N, 2, 2) are as in `Ellipses`. Returns indices (N, 2), zero where not labelled,
+    and whether (N,) a circle is labelled.
     """
     indices, labelled = np.zeros((len(centres), 2), np.int64), np.zeros(len(centres), bool)
     if len(centres) < MIN_LABELLED:
@@ -251,7 +211,7 @@ def _seeds(centres, radii, bases, sines, tree):
     step = np.linalg.norm(bases, axis=2)
     miss = (distance / np.maximum(np.tile(step, 2), 1e-9)).max(1)
     ratio = np.abs(np.log(radii[index] / radii[:, None])).max(1)
-    # An edge of a narrow plate may have no circle with four neighbours; two at a right angle are then enough.
+    # An edge of a narrow target may have no circle with four neighbours; two at a right angle are then enough.
     partial = np.sort(distance[:, :2] / np.maximum(step, 1e-9), 1)[:, 1]
     usable = (step > 0).all(1) & (partial < TOLERANCE)
     # Over the square of the radius the lattice's cell has one size in the whole image, whatever the perspective. Next
