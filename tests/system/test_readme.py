@@ -17,7 +17,7 @@ height_px = 256
 pixel_size_um = 21.2
 """
 STEP_MM = 6.0
-"""Six profiles of both spheres in place of 38: thousands of points for the four parameters of each."""
+"""Six profiles of both spheres in place of 38; enough for the four parameters of each."""
 
 
 def test_the_readme_example_runs(tmp_path: Path):
