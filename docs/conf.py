@@ -1,8 +1,14 @@
 """Settings of the documentation: Sphinx with MyST notebooks, which are executed when the site is built."""
 
+import re
 import shutil
 from importlib.metadata import version as version_of
 from pathlib import Path
+
+# While autodoc imports modules, pydantic does not resolve the annotations of models that keep unknown keys.
+import uwlts.model.joint_estimate  # noqa: F401
+from twin.cli import app as twin_app
+from uwlts.cli import app as uwlts_app
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -10,7 +16,7 @@ project = "uwlts"
 copyright = "the uwlts authors"
 release = version = version_of("uwlts")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "cyclopts.ext.sphinx"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 source_suffix = {".md": "myst-nb"}
 exclude_patterns = ["_build", "studies", "pictures"]
 html_theme = "pydata_sphinx_theme"
@@ -19,11 +25,15 @@ html_theme_options = {
     "show_toc_level": 2,
     "secondary_sidebar_items": ["page-toc"],
     "navigation_with_keys": False,
+    # All pages stand in the left column, by chapters.
+    "navbar_center": [],
     "footer_start": [],
     "footer_end": [],
 }
-html_sidebars = {"index": []}
+html_sidebars = {"index": [], "**": ["globaltoc.html"]}
 html_show_sourcelink = False
+# Options keep both of their dashes.
+smartquotes = False
 html_copy_source = False
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
@@ -53,6 +63,17 @@ def _copy_pictures(app) -> None:
     shutil.copytree(ROOT / "docs" / "pictures", Path(app.outdir) / "pictures", dirs_exist_ok=True)
 
 
+def _insert_commands(app, docname: str, source: list[str]) -> None:
+    """Insert the help of all commands, without its table of contents: the page has one beside it."""
+    if docname == "reference/commands":
+        pages = [each.generate_docs(output_format="markdown", heading_level=2) for each in (uwlts_app, twin_app)]
+        text = re.sub(
+            r"^#+ Table of Contents\n.*?(?=^\*\*Commands)", "", "\n".join(pages), flags=re.DOTALL | re.MULTILINE
+        )
+        source[0] = source[0].replace("\nCOMMANDS\n", f"\n{text}\n")
+
+
 def setup(app) -> None:
     """Connect the steps of this project's own."""
     app.connect("builder-inited", _copy_pictures)
+    app.connect("source-read", _insert_commands)
