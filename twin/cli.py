@@ -17,7 +17,7 @@ from twin.scene.description import load_scene, scene_names
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import names
 from uwlts.model.waters import WATERS
-from uwlts.runtime.console import progress_bar, run
+from uwlts.runtime.console import run
 
 app = App(
     name="twin",
@@ -295,20 +295,18 @@ def sweep(
     variant
         Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    with progress_bar(f"sweep of {Path(study).stem}") as progress:
-        result = twin.sweep(
-            study,
-            out=out,
-            designs=designs,
-            verify=verify,
-            workers=workers,
-            scheduler=scheduler,
-            overwrite=overwrite,
-            variant=variant,
-            progress=lambda what, done, total: progress(done, total),
-        )
+    result = twin.sweep(
+        study,
+        out=out,
+        designs=designs,
+        verify=verify,
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
+        variant=variant,
+        show_progress=True,
+    )
     print("\n".join(result.lines()))
-    print(f"wrote {result.paths.page}, designs.csv, summary.json and winner.toml")
 
 
 @app.command

@@ -89,7 +89,7 @@ def choose(study: Study, columns: Columns) -> Chosen:
         No design works.
     """
     marked, notes = [], []
-    base = study.base()
+    base = study.sensor
     try:
         marked.append(Marked(f"{base.name} (as described)", base, described(study, "base", base)))
     except Error as error:

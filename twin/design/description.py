@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, cast
 
 from pydantic import Field, field_validator, model_validator
 
 from twin.design.figures import FIGURES
 from twin.design.parameters import Follow
 from uwlts.model.errors import DescriptionError
-from uwlts.model.library import find, read_table, validated
+from uwlts.model.library import find, load_sensor, read_table, validated
 from uwlts.model.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
@@ -124,7 +124,8 @@ class Sampling(Description):
 class Study(Description):
     """A study as read from TOML.
 
-    ``sensor`` is the base sensor: a name or path, in whose place its table is kept, or the table itself.
+    ``sensor`` is the base sensor, given by name, path or table; it is kept whole, as workers elsewhere may not have
+    its file.
     ``variables`` are free numbers or words of the sensor's description, by their path (``camera.focal_length_mm``);
     ``choices`` are named alternatives that set several paths at once, such as cameras that can be bought. ``follow``
     is what is set anew for every design as one would on the bench, see `twin.design.parameters.followed`.
@@ -133,7 +134,7 @@ class Study(Description):
     """
 
     title: str
-    sensor: dict[str, Any] = Field(default="thesis", validate_default=True)
+    sensor: Sensor = Field(default="thesis", validate_default=True)
     medium: str = "water"
     reflectance: Annotated[float, Field(gt=0, le=1)] = 0.5
     water_depth_m: NotNegative = 100.0
@@ -149,9 +150,8 @@ class Study(Description):
 
     @field_validator("sensor", mode="before")
     @classmethod
-    def _table_of(cls, value: Any) -> Any:
-        # Workers elsewhere may not have the file.
-        return read_table(find(value, "sensors"), "sensors") if isinstance(value, str) else value
+    def _found(cls, value: object) -> object:
+        return load_sensor(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _figures_known(self) -> Study:
@@ -193,56 +193,59 @@ class Study(Description):
         """All that is free, in order: variables, then choices by the names of their options."""
         return self.variables | {name: Variable(values=tuple(options)) for name, options in self.choices.items()}
 
-    def base(self) -> Sensor:
-        """The base sensor."""
-        return validated(Sensor, self.sensor, "the study's sensor")
-
     def medium_of(self, sensor: Sensor) -> Medium:
         """The study's medium of a sensor."""
         return sensor.medium(self.medium)
 
 
-def load_study(name_or_path: str | Path, *, designs: int | None = None, verify: int | None = None) -> Study:
+def load_study(study: str | Path | Study, *, designs: int | None = None, verify: int | None = None) -> Study:
     """Study by name (``baseline-angle``) or path; a sensor beside it is found by its file name.
 
-    ``designs`` and ``verify`` replace what the study says of them.
+    ``designs`` and ``verify`` replace the study's own; a study that is given as such is checked in the same way.
 
     Raises
     ------
     DescriptionError
         The study is not valid, or a path does not exist in the sensor's description.
     """
-    path = find(name_or_path, FOLDER)
-    table = read_table(path, FOLDER)
-    beside = path.parent / str(table.get("sensor", ""))
-    if beside.suffix == ".toml" and beside.is_file():
-        table["sensor"] = str(beside)
+    if isinstance(study, Study):
+        path, table = Path("the study"), study.model_dump()
+    else:
+        path = find(study, FOLDER)
+        table = read_table(path, FOLDER)
+        beside = path.parent / str(table.get("sensor", ""))
+        if beside.suffix == ".toml" and beside.is_file():
+            table["sensor"] = str(beside)
     if designs is not None and isinstance(table.get("sampling", {}), dict):
         table["sampling"] = table.get("sampling", {}) | {"designs": designs}
     if verify is not None:
         table["verify"] = verify
-    study = validated(Study, table, path)
-    base = study.base()
-    study.medium_of(base)
-    known = base.model_dump()
-    for options in study.choices.values():
-        for name in (name for option in options.values() for name in option):
-            _value_at(known, name, path)
-    counted = [name for name in study.variables if type(_value_at(known, name, path)) is int]
-    whole = {name: study.variables[name].model_copy(update={"whole": True}) for name in counted}
-    return study.model_copy(update={"variables": study.variables | whole})
+    found = validated(Study, table, path)
+    found.medium_of(found.sensor)
+    for option in (option for options in found.choices.values() for option in options.values()):
+        for name in option:
+            value_at(found.sensor, name, path)
+    counted = [name for name in found.variables if type(value_at(found.sensor, name, path)) is int]
+    whole = {name: found.variables[name].model_copy(update={"whole": True}) for name in counted}
+    return found.model_copy(update={"variables": found.variables | whole})
 
 
-def _value_at(known: dict[str, Any], name: str, source: Path) -> Any:
-    """The value at a path of the sensor's description; DescriptionError where there is none."""
-    table: Any = known
+def value_at(sensor: Sensor, name: str, source: str | Path = "the study") -> Value | None:
+    """Value at a path of a sensor's description.
+
+    Raises
+    ------
+    DescriptionError
+        The path does not exist in the description, or leads to a table.
+    """
+    found: object = sensor.model_dump()
     for key in name.split("."):
-        if not isinstance(table, dict) or key not in table:
-            there = ", ".join(table) if isinstance(table, dict) else "nothing"
+        if not isinstance(found, dict) or key not in found:
+            there = ", ".join(map(str, found)) if isinstance(found, dict) else "nothing"
             raise DescriptionError(
                 f"{source}: the sensor's description has no '{name}': there is no '{key}', but {there}"
             )
-        table = table[key]
-    if isinstance(table, dict):
-        raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(table)}")
-    return table
+        found = found[key]
+    if isinstance(found, dict):
+        raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(map(str, found))}")
+    return cast("Value | None", found)

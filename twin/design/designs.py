@@ -6,13 +6,11 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
-from twin.design.description import OTHER_COLUMNS, Study, Value
+from twin.design.description import OTHER_COLUMNS, Study, Value, value_at
 from twin.design.figures import FIGURES, Figures, figures_of
 from twin.design.parameters import followed, numbers_of, parameters_of, stacked
 from uwlts.model.errors import DesignError, Error
@@ -41,12 +39,12 @@ class EvaluatedDesign:
     """
 
     number: int
-    values: dict[str, Value]
+    values: dict[str, Value | None]
     figures: dict[str, float]
     violation: float
     failure: str
 
-    def table(self) -> dict[str, Value]:
+    def table(self) -> dict[str, Value | None]:
         """All columns of a study's results for this design."""
         ends = {"violation": self.violation, "failure": self.failure}
         return {"design": self.number} | self.values | self.figures | ends
@@ -72,7 +70,7 @@ def sensor_of(study: Study, design: Design) -> Sensor:
     changes: dict[str, Value] = {}
     for name, value in design.values.items():
         changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
-    return validated(Sensor, _changed(study.sensor, changes), f"design {design.number}")
+    return _changed(study.sensor, changes, f"design {design.number}")
 
 
 def built(study: Study, design: Design) -> Sensor:
@@ -84,22 +82,20 @@ def built(study: Study, design: Design) -> Sensor:
         "waist": {"laser.waist_distance_mm": found.waist_distance_mm},
         "volume": {"volume.near_mm": found.near_mm, "volume.far_mm": found.far_mm},
     }
-    changes = {path: float(value.item()) for name in study.follow for path, value in numbers[name].items()}
-    table = _changed(sensor.model_dump(exclude_none=True), changes)
-    return validated(Sensor, table, f"design {design.number}")
+    changes: dict[str, Value] = {path: value.item() for name in study.follow for path, value in numbers[name].items()}
+    return _changed(sensor, changes, f"design {design.number}")
 
 
-def _changed(table: dict[str, Any], changes: Mapping[str, Value]) -> dict[str, Any]:
-    """A table with values at paths replaced; the table itself stays as it is."""
-    table = dict(table)
+def _changed(sensor: Sensor, changes: Mapping[str, Value], source: str) -> Sensor:
+    """The sensor with values at paths of its description replaced."""
+    table = sensor.model_dump(exclude_none=True)
     for path, value in changes.items():
         *parents, key = path.split(".")
         place = table
         for parent in parents:
-            place[parent] = dict(place.get(parent, {}))
-            place = place[parent]
+            place = place.setdefault(parent, {})
         place[key] = value
-    return table
+    return validated(Sensor, table, source)
 
 
 def judged(study: Study, designs: Sequence[Design]) -> Columns:
@@ -148,12 +144,7 @@ def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
     figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     if reason:
         raise DesignError(f"{label}: {reason}")
-    table = sensor.model_dump()
-    # `load_study` has checked that the paths lead to values.
-    values: dict[str, Any] = {
-        name: label if name in study.choices else reduce(lambda place, key: place[key], name.split("."), table)
-        for name in study.free()
-    }
+    values = {name: label if name in study.choices else value_at(sensor, name) for name in study.free()}
     numbers = {name: column.item() for name, column in vars(figures).items()}
     return EvaluatedDesign(-1, values, numbers, violations(study, figures).item(), "")
 

@@ -181,66 +181,37 @@ class Figures:
     largest in the part of the measuring volume that the camera sees, and ``sigma_z_rms_mm`` the root mean square over
     it; near, middle and far are the ends and the middle of that part. Z runs along the laser's axis, Y along the
     stripe, X across the sheet, along the stage.
-
-    Attributes
-    ----------
-    sigma_x_mm, sigma_y_mm, sigma_z_mm, sigma_z_rms_mm
-        X by the stage's resolution alone, the others by the stripe's noise.
-    sigma_z_near_mm, sigma_z_middle_mm, sigma_z_far_mm
-        Root mean squares along the stripe.
-    depth_per_px_mm, along_per_px_mm
-        In the middle: Z and Y per pixel.
-    coverage
-        Share of the volume that camera and laser reach.
-    standoff_mm, near_mm, far_mm, depth_mm
-        Where the sheet crosses the camera's axis, and the volume's depths and their difference.
-    line_near_mm, line_mm, line_far_mm, section_cm2
-        Length of the stripe at near end, middle and far end; area of the sheet that the camera sees.
-    occlusion_deg
-        Largest angle between the laser's and the camera's rays: steeper walls hide one from the other.
-    signal_e, exposure_ms, required_ms
-        Faintest signal in the volume; the exposure used, and the one that the wanted brightness takes.
-    stripe_px, blur_px, centre_px
-        Standard deviation of the stripe's image, the lens's part of it, and of the centre: largest in the volume.
-    speckle_limit_mm
-        Dorsch's limit along Z in the middle of the volume, for depolarised light.
-    laser_class
-        1, 2, 3 (3R), 4 (3B) or 5 (4) after IEC 60825-1 for a point source, through 7 mm at 100 mm from the line optics.
-    window_mm
-        Thickness that the camera's window needs for the pressure at the study's depth.
-    baseline_mm
-        How wide the sensor is.
     """
 
-    sigma_x_mm: np.ndarray
+    sigma_x_mm: np.ndarray  # by the stage's resolution alone, the others by the stripe's noise
     sigma_y_mm: np.ndarray
     sigma_z_mm: np.ndarray
     sigma_z_rms_mm: np.ndarray
-    sigma_z_near_mm: np.ndarray
+    sigma_z_near_mm: np.ndarray  # root mean squares along the stripe
     sigma_z_middle_mm: np.ndarray
     sigma_z_far_mm: np.ndarray
-    depth_per_px_mm: np.ndarray
+    depth_per_px_mm: np.ndarray  # Z and Y per pixel, in the middle
     along_per_px_mm: np.ndarray
-    coverage: np.ndarray
-    standoff_mm: np.ndarray
-    near_mm: np.ndarray
+    coverage: np.ndarray  # share of the volume that camera and laser reach
+    standoff_mm: np.ndarray  # where the sheet crosses the camera's axis
+    near_mm: np.ndarray  # depths of the volume's ends, and their difference
     far_mm: np.ndarray
     depth_mm: np.ndarray
-    line_near_mm: np.ndarray
+    line_near_mm: np.ndarray  # lengths of the stripe at near end, middle and far end
     line_mm: np.ndarray
     line_far_mm: np.ndarray
-    section_cm2: np.ndarray
-    occlusion_deg: np.ndarray
-    signal_e: np.ndarray
-    exposure_ms: np.ndarray
-    required_ms: np.ndarray
-    stripe_px: np.ndarray
+    section_cm2: np.ndarray  # area of the sheet that the camera sees
+    occlusion_deg: np.ndarray  # largest angle between laser's and camera's rays: steeper walls hide one from the other
+    signal_e: np.ndarray  # faintest in the volume
+    exposure_ms: np.ndarray  # as used
+    required_ms: np.ndarray  # that the wanted brightness takes
+    stripe_px: np.ndarray  # standard deviation of the stripe's image, largest in the volume; the lens's part of it
     blur_px: np.ndarray
-    centre_px: np.ndarray
-    speckle_limit_mm: np.ndarray
-    laser_class: np.ndarray
-    window_mm: np.ndarray
-    baseline_mm: np.ndarray
+    centre_px: np.ndarray  # standard uncertainty of the stripe's centre, largest in the volume
+    speckle_limit_mm: np.ndarray  # Dorsch's limit along Z in the middle of the volume, for depolarised light
+    laser_class: np.ndarray  # number of the class after IEC 60825-1, see `CLASS_NAMES` and `laser_class`
+    window_mm: np.ndarray  # thickness that the camera's window needs for the pressure at the study's depth
+    baseline_mm: np.ndarray  # width of the sensor
 
 
 FIGURES = tuple(field.name for field in fields(Figures))
@@ -350,8 +321,9 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
     inside = spread / snell_root(np, p.laser_window_index, spread)
     fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
     fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
+    nothing = np.zeros(n)
     checks = (
-        (one(p.focus_mm - p.focal_mm) <= 0, "the lens would be focused within its focal length", None),
+        (one(p.focus_mm - p.focal_mm) <= 0, "the lens would be focused within its focal length", nothing),
         (
             ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5),
             "the sheet crosses the camera's axis {:.0f} mm behind the window's outer face, not in front of it",
@@ -372,18 +344,18 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
             "the laser's fan is {:.0f} mm wide at its window, wider than its opening",
             fan,
         ),
-        (~(figures.coverage > 0), "camera and laser reach no point of the measuring volume", None),
+        (~(figures.coverage > 0), "camera and laser reach no point of the measuring volume", nothing),
         (fullest > 1, "the stripe saturates: at the given exposure it has {:.1f} times the full well", fullest),
         (
             ~(np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm) < 0.5 * figures.standoff_mm),
             "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser",
-            None,
+            nothing,
         ),
     )
     reasons = [""] * n
     for failed, text, value in checks:
         for i in np.flatnonzero(failed):
-            reasons[i] = reasons[i] or text.format(*(() if value is None else (value[i],)))
+            reasons[i] = reasons[i] or text.format(value[i])
     return reasons
 
 

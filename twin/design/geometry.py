@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from uwlts.model.sensor import Camera, Medium, Window
+
 Array = Any
 """A NumPy or Dr.Jit array, or a number that goes with one."""
 Vector = tuple[Array, Array, Array]
@@ -80,6 +82,14 @@ class FlatWindow:
     thickness_mm: Array
     glass_index: Array
     medium_index: Array
+
+    @classmethod
+    def of(cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray) -> FlatWindow:
+        """A mounted window before a medium; ``rotation`` (3, 3) leads from its module's frame to the one wanted."""
+        normal = rotation @ window.normal()
+        distance = window.distance_mm * float(rotation[:, 2] @ normal)
+        indices = window.index(wavelength_nm), medium.refractive_index(wavelength_nm)
+        return cls((normal[0], normal[1], normal[2]), distance, window.thickness_mm, *indices)
 
     @property
     def outer_mm(self) -> Array:
@@ -198,6 +208,12 @@ class Lens:
     k3: Array
     p1: Array
     p2: Array
+
+    @classmethod
+    def of(cls, camera: Camera) -> Lens:
+        """That of a camera's description."""
+        d = camera.distortion
+        return cls(camera.focal_length_px(), *camera.principal_point(), d.k1, d.k2, d.k3, d.p1, d.p2)
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,8 @@ def _distribution(variable: Variable) -> BaseDistribution:
     return FloatDistribution(*variable.ends(), log=variable.scale == "log")
 
 
-Progress = Callable[[str, int, int], None]
+Progress = Callable[[int, int], None]
+"""Called with the number of designs that are done, and of how many."""
 PLAN, PARTS = "plan.json", "screen"
 _FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
 """What may be different when a sweep is gone on with, besides the number of random, Sobol or optimised designs."""
@@ -193,9 +194,7 @@ def judged_part(batch: Batch) -> bytes:
     return as_part(judged(batch.study, batch.all()))
 
 
-def screen(
-    study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda what, done, total: None
-) -> None:
+def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda done, total: None) -> None:
     """Judge all designs of a study that are not judged yet, into parts below ``folder``.
 
     Raises
@@ -218,7 +217,7 @@ def screen(
     # Several machines begin at different places, and look before each batch whether another has done it.
     random.shuffle(waiting)
     done = total - sum(batch.count for batch in waiting)
-    progress("screening", done, total)
+    progress(done, total)
 
     def left() -> Iterator[Batch]:
         nonlocal done
@@ -231,7 +230,7 @@ def screen(
     for batch, result in workers.completed(judged_part, left()):
         write_part(place, batch.first, _content(batch, result), lost=isinstance(result, Lost))
         done += batch.count
-        progress("screening", done, total)
+        progress(done, total)
 
 
 def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
@@ -243,7 +242,7 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
     total = study.sampling.designs
     # Other machines may add designs of their own.
     while (done := sum(map(rows_in, parts(place)))) < total:
-        progress("optimising", done, total)
+        progress(done, total)
         asked = search.ask(min(study.sampling.batch, total - done))
         share = -(-len(asked) // workers.count)
         batches = [
@@ -256,7 +255,7 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
             table = pq.read_table(pa.BufferReader(content))
             search.report({name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names})
             done += batch.count
-            progress("optimising", done, total)
+            progress(done, total)
 
 
 def _content(batch: Batch, result: bytes | Lost) -> bytes:
@@ -286,7 +285,7 @@ def keep_to_plan(study: Study, folder: Path) -> None:
     made_folder(folder)
     plan = json.loads(study.model_dump_json(exclude=set(_FREE_TO_CHANGE)))
     del plan["sampling"]["designs"]
-    plan["sensor"] = json.loads(study.base().model_dump_json())
+    plan["sensor"] = json.loads(study.sensor.model_dump_json())
     path = folder / PLAN
     if path.is_file():
         try:

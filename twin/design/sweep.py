@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tomli_w
@@ -21,56 +21,57 @@ from twin.design.choice import choose
 from twin.design.description import Study, Value, load_study
 from twin.design.designs import Columns, Marked
 from twin.design.report.page import write_study_page
-from twin.design.screening import JOURNAL, PARTS, PLAN, Progress, read_parts, screen, write_csv
+from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
 from twin.design.verification import Agreement, Candidate, render
 from twin.options import CPU
 from uwlts.model.errors import DescriptionError
+from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import open_workers
 from uwlts.storage.files import written_aside
 
 RENDERED = "verified"
-
-
-@dataclass(frozen=True)
-class SweepPaths:
-    """Files that a sweep writes: the page, the table of all designs, the winning sensor, and the summary."""
-
-    page: Path
-    table: Path
-    winner: Path
-    summary: Path
-
-    @classmethod
-    def below(cls, folder: Path) -> SweepPaths:
-        """Those in a folder."""
-        return cls(folder / "report.html", folder / "designs.csv", folder / "winner.toml", folder / "summary.json")
+PAGE, TABLE, WINNER, SUMMARY = "report.html", "designs.csv", "winner.toml", "summary.json"
 
 
 @dataclass(frozen=True)
 class SweepResult:
     """Result of a sweep.
 
-    ``columns`` hold all designs; ``marked`` are those pointed out, the last of which is the ``winner``; ``agreements``
-    say whether the formulas agree with rendering; ``notes`` are sentences on the choice.
+    Attributes
+    ----------
+    study : Study
+    folder : Path
+        Folder of report.html, designs.csv, summary.json and winner.toml.
+    columns : dict of str to (N,) array
+        All N designs: "design", the free values, the figures of merit (units in their names), "violation", "failure".
+    marked : tuple of Marked
+        Base sensor, best design and refined design, as far as they work and are better; the last is the winner.
+    agreements : tuple of Agreement
+        Comparison of formulas and rendering for each rendered design.
+    notes : tuple of str
+        Sentences on the choice.
     """
 
     study: Study
+    folder: Path
     columns: Columns
     marked: tuple[Marked, ...]
     agreements: tuple[Agreement, ...]
     notes: tuple[str, ...]
-    paths: SweepPaths
 
     @property
     def winner(self) -> Marked:
         """The design to build."""
         return self.marked[-1]
 
+    def counts(self) -> tuple[int, int, int]:
+        """Number of designs, of those that work, and of those that meet all constraints."""
+        violation = self.columns["violation"]
+        return len(violation), int(np.isfinite(violation).sum()), int((violation == 0).sum())
+
     def lines(self) -> list[str]:
         """The result in lines of text for a terminal."""
-        violation = self.columns["violation"]
-        works, meets = np.isfinite(violation).sum(), (violation == 0).sum()
-        lines = [f"{len(violation)} designs, {works} work, {meets} meet all constraints", *self.notes]
+        lines = ["{} designs, {} work, {} meet all constraints".format(*self.counts()), *self.notes]
         figures = [o.figure for o in self.study.objectives] + list(self.study.constraints)
         names = [*self.study.free(), *dict.fromkeys(figures)]
         for one in self.marked:
@@ -87,7 +88,7 @@ class SweepResult:
                 f"rendered {found.label}: {verdict}, scatter {found.rendered_over_predicted:.2f} of the predicted one, "
                 f"largest systematic error {worst:.3f} mm, {found.seconds:.0f} s"
             )
-        return lines
+        return [*lines, f"wrote {self.folder / PAGE}, {TABLE}, {SUMMARY} and {WINNER}"]
 
 
 def _short(value: Value) -> str:
@@ -104,73 +105,77 @@ def sweep(
     scheduler: str | None = None,
     overwrite: bool = False,
     variant: str = CPU,
-    progress: Progress = lambda what, done, total: None,
+    show_progress: bool = False,
 ) -> SweepResult:
-    """Judge a study's designs, choose the best, render some, and write page, table, winner and summary into a folder.
+    """Judge the designs of a study by formulas, refine the best, render some, and write page, table and winner.
 
     Parameters
     ----------
-    study
-        Name or path of the study's description, or the study itself.
-    out
-        Folder for all results; runs/STUDY unless given. A sweep that was stopped there continues.
-    designs
-        How many designs a random, Sobol or optimised study judges, in place of the study's own number.
-    verify
-        How many designs are rendered beside the base sensor, 0 for none, in place of the study's own number.
-    workers, scheduler
-        Processes of this machine, one per processor unless given, or the address of a Dask scheduler.
-    overwrite
+    study : str, Path or Study
+        Name of a shipped study, such as "baseline-angle", path of a TOML file, or a study.
+    out : str or Path, optional
+        Folder for all results; runs/STUDY by default. A sweep that was stopped there continues.
+    designs : int, optional
+        Number of designs that a random, Sobol or optimised study judges, in place of the study's.
+    verify : int, optional
+        Number of designs rendered in addition to the base sensor, 0 for no rendering, in place of the study's.
+    workers : int, optional
+        Processes of this machine; one per processor by default.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as tcp://host:8786, whose workers are used in place of this machine's.
+    overwrite : bool
         Remove what an earlier sweep has left in the folder.
-    variant
-        Mitsuba variant for rendering.
-    progress
-        Called with what is being done, how many designs are done, and of how many.
+    variant : str
+        Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
+    show_progress : bool
+        Draw a progress bar on the terminal.
+
+    Returns
+    -------
+    SweepResult
+        All designs, the winner, and the comparison of formulas and rendering.
 
     Raises
     ------
     DescriptionError
-        ``workers`` is below 1, or the folder holds something else.
+        The study is not valid, ``workers`` is below 1, or the folder holds something else.
     DesignError
         No design can work.
     OutputError
         A file cannot be written.
     SetupError
         No scheduler answers, or the workers' cluster is gone.
+
+    Examples
+    --------
+    >>> result = twin.sweep("baseline-angle", out="runs/baseline-angle", verify=0)
+    >>> result.winner.design.figures["sigma_z_rms_mm"]
     """
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
-    if isinstance(study, Study):
-        if out is None or designs is not None or verify is not None:
-            raise DescriptionError("a study that is not loaded by name needs a folder, and states its numbers itself")
-    else:
-        out = out or Path("runs") / Path(study).stem
-        study = load_study(study, designs=designs, verify=verify)
-    out = Path(out)
+    if out is None and isinstance(study, Study):
+        raise DescriptionError("give the folder out for a study that is not read from a file")
+    folder = Path("runs") / Path(str(study)).stem if out is None else Path(out)
+    described = load_study(study, designs=designs, verify=verify)
     if overwrite:
-        clear(out)
-    paths = SweepPaths.below(out)
-    with open_workers(workers=workers, scheduler=scheduler) as pool:
-        screen(study, out, pool, progress=progress)
-        columns = read_parts(out / PARTS)
-        write_csv(paths.table, columns)
-        chosen = choose(study, columns)
+        clear(folder)
+    with (
+        progress_bar(described.title) if show_progress else nullcontext(lambda done, total: None) as progress,
+        open_workers(workers=workers, scheduler=scheduler) as pool,
+    ):
+        screen(described, folder, pool, progress=progress)
+        columns = read_parts(folder / PARTS)
+        write_csv(folder / TABLE, columns)
+        chosen = choose(described, columns)
         winner = chosen.marked[-1]
-        write_winner(paths.winner, study, winner)
+        write_winner(folder / WINNER, described, winner)
         agreements: list[Agreement] = []
-        if study.verify:
+        if described.verify:
             rendered = [winner, *(one for one in chosen.marked if one.design.number < 0), *chosen.further]
             candidates = [Candidate(one.label, one.design.number, one.sensor) for one in rendered]
-            agreements = render(
-                study,
-                out / RENDERED,
-                candidates,
-                pool,
-                variant=variant,
-                progress=lambda done, total: progress("rendering", done, total),
-            )
-    result = SweepResult(study, columns, chosen.marked, tuple(agreements), chosen.notes, paths)
-    write_study_page(paths.page, study, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
+            agreements = render(described, folder / RENDERED, candidates, pool, variant=variant, progress=progress)
+    result = SweepResult(described, folder, columns, chosen.marked, tuple(agreements), chosen.notes)
+    write_study_page(folder / PAGE, described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
     write_summary(result)
     return result
 
@@ -185,21 +190,21 @@ def write_winner(path: Path, study: Study, winner: Marked) -> None:
 
 def write_summary(result: SweepResult) -> None:
     """Write in numbers what the page shows of the marked and the rendered designs."""
-    violation = result.columns["violation"]
+    designs, work, meet = result.counts()
     content = {
         "title": result.study.title,
-        "designs": len(violation),
-        "work": int(np.isfinite(violation).sum()),
-        "meet_all_constraints": int((violation == 0).sum()),
+        "designs": designs,
+        "work": work,
+        "meet_all_constraints": meet,
         "marked": [{"label": one.label} | one.design.table() for one in result.marked],
         "verified": [asdict(one) for one in result.agreements],
         "notes": list(result.notes),
     }
-    with written_aside(result.paths.summary, overwrite=True) as aside:
+    with written_aside(result.folder / SUMMARY, overwrite=True) as aside:
         aside.write_text(json.dumps(_finite(content), indent=2) + "\n", encoding="utf-8")
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     """The value with null in place of numbers that JSON cannot hold."""
     if isinstance(value, dict):
         return {key: _finite(one) for key, one in value.items()}
@@ -223,6 +228,5 @@ def clear(folder: Path) -> None:
     for place in (folder / PARTS, folder / RENDERED):
         if place.is_dir() and not any(place.iterdir()):
             place.rmdir()
-    journals = [folder / name for name in (PLAN, JOURNAL, f"{JOURNAL}.lock")]
-    for path in (*journals, *vars(SweepPaths.below(folder)).values()):
-        path.unlink(missing_ok=True)
+    for name in (PLAN, JOURNAL, f"{JOURNAL}.lock", PAGE, TABLE, WINNER, SUMMARY):
+        (folder / name).unlink(missing_ok=True)

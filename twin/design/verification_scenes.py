@@ -6,7 +6,6 @@ along Z, so that every image shows the same object at another depth.
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ class LineOfSight:
 
     camera: Camera
     index: float
-    glass_index: float
+    window: FlatWindow
     pose: np.ndarray
     laser_mm: np.ndarray
     fan_slope: float
@@ -42,7 +41,9 @@ class LineOfSight:
         return cls(
             camera=sensor.camera,
             index=index,
-            glass_index=sensor.camera.window.index(wavelength),
+            window=FlatWindow.of(sensor.camera.window, medium, wavelength, np.eye(3))
+            if sensor.camera.window.mounted
+            else FlatWindow((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0),
             pose=pose,
             laser_mm=(laser_pose(sensor).origin_mm - pose[:3, 3]) @ pose[:3, :3],
             fan_slope=sine / math.sqrt(1 - sine**2),
@@ -64,26 +65,16 @@ class LineOfSight:
 
     def in_image(self, points: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
         """Which points (N, 3) appear in the image, at least so far within its border: (N,) bool."""
-        camera, window = self.camera, self._window()
-        cx, cy = camera.principal_point()
-        d = camera.distortion
-        lens = Lens(camera.focal_length_px(), cx, cy, d.k1, d.k2, d.k3, d.p1, d.p2)
+        camera, window = self.camera, self.window
         x, y, z = self.pose[:3, :3] @ points.T + self.pose[:3, 3:]
         # The formulas hold beyond the window's outer face only.
         outside = (dot((x, y, z), window.normal) > window.outer_mm) & (z > 0)
-        image = seen(np, lens, window, (np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3)))
+        image = seen(
+            np, Lens.of(camera), window, (np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3))
+        )
         within = margin_px - 0.5
         in_width = (image.x >= within) & (image.x <= camera.width_px - 1 - within)
         return outside & in_width & (image.y >= within) & (image.y <= camera.height_px - 1 - within)
-
-    def _window(self) -> FlatWindow:
-        window = self.camera.window
-        normal = window.normal()
-        if not window.mounted:
-            return FlatWindow(tuple(normal), 0.0, 0.0, 1.0, 1.0)
-        return FlatWindow(
-            tuple(normal), window.distance_mm * normal[2], window.thickness_mm, self.glass_index, self.index
-        )
 
     def line_mm(self, z: float) -> np.ndarray:
         """Y, closely spaced, where the fan lights what the camera sees at depth ``z``; possibly none."""
@@ -94,10 +85,10 @@ class LineOfSight:
         lit = np.abs(y - self.laser_mm[1]) <= self.fan_slope * (z - self.laser_mm[2])
         return y[longest_run(visible & lit)]
 
-    def half_plate_mm(self, z: float, y: float) -> np.ndarray:
-        """Half sides (2,), X and Y, of a plate about (0, y, z) that fills the view, without window and distortion.
+    def half_target_mm(self, z: float, y: float) -> np.ndarray:
+        """Half sides (2,), X and Y, of a target about (0, y, z) that fills the view, without window and distortion.
 
-        Where it is seen at a glance it would have to be endless: it goes beyond the view's diagonal by a quarter.
+        At a grazing angle it would have to be endless: it goes beyond the view's diagonal by a quarter.
         """
         camera, rotation = self.camera, self.pose[:3, :3]
         side = np.linspace(-0.5, 0.5, 41)
@@ -251,14 +242,10 @@ def _with_air(sensor: Sensor) -> tuple[Sensor, str]:
 
 
 def _standard(medium: str, near: float, far: float, y: float, length: float, reflectance: float) -> Scene:
-    plate = {
-        "kind": "plate",
-        "width_mm": length,
-        "height_mm": length,
-        "position_mm": (0.0, y, 0.0),
-        "reflectance": reflectance,
-    }
-    return _scene("Plane standard", medium, _travel(near, far, STANDARD_DEPTHS), [plate], artefact={"kind": "plane"})
+    plate = {"kind": "plate", "position_mm": (0.0, y, 0.0), "reflectance": reflectance}
+    plate |= {"width_mm": length, "height_mm": length}
+    motion = _travel(near, far, STANDARD_DEPTHS)
+    return _scene("Plane standard", medium, motion=motion, objects=[plate], artefact={"kind": "plane"})
 
 
 def _step(medium: str, near: float, far: float, y: float, length: float) -> Scene:
@@ -276,17 +263,17 @@ def _step(medium: str, near: float, far: float, y: float, length: float) -> Scen
     ]
     artefact = {"kind": "step", "height_mm": height, "edge_mm": _EDGE * length}
     travel = _travel(near + height / 2, far - height / 2, STEP_DEPTHS)
-    return _scene("Step standard", medium, travel, blocks, artefact=artefact)
+    return _scene("Step standard", medium, motion=travel, objects=blocks, artefact=artefact)
 
 
-def _travel(near: float, far: float, count: int) -> dict[str, Any]:
+def _travel(near: float, far: float, count: int) -> dict[str, object]:
     """Motion that brings the scene's origin to depths Z from far to near: the sensor approaches."""
     step = (far - near) / (count - 1)
     return {"start_mm": -far, "step_mm": step, "count": count, "direction": (0.0, 0.0, 1.0)}
 
 
-def _scene(title: str, medium: str, motion: dict[str, Any], objects: list[dict[str, Any]], **rest: Any) -> Scene:
-    return validated(Scene, {"title": title, "medium": medium, "motion": motion, "objects": objects} | rest, title)
+def _scene(title: str, medium: str, **rest: object) -> Scene:
+    return validated(Scene, {"title": title, "medium": medium} | rest, title)
 
 
 # --- the target -------------------------------------------------------------------------------------------------------
@@ -309,7 +296,7 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: f
     diameter = _circle_diameter(sight, roughly)
     seen = sight.z_at(_marks_in_view(sight, roughly, diameter, y))
     spacing = 2 * diameter
-    columns, rows = (math.ceil(side / spacing) for side in sight.half_plate_mm(seen[-1], y))
+    columns, rows = (math.ceil(side / spacing) for side in sight.half_target_mm(seen[-1], y))
     lattice = {
         "spacing_x_mm": spacing,
         "spacing_y_mm": spacing,
@@ -333,8 +320,8 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: f
     scene = _scene(
         "Circle target",
         medium,
-        _travel(float(seen[0]), float(seen[-1]), TARGET_POSES) | {"lights": ("lamp", "laser")},
-        [plate],
+        motion=_travel(float(seen[0]), float(seen[-1]), TARGET_POSES) | {"lights": ("lamp", "laser")},
+        objects=[plate],
         target={"kind": "circles"} | lattice,
         window_mounted=sight.camera.window.mounted,
     )

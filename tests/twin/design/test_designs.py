@@ -96,7 +96,7 @@ def test_mistakes_in_a_study_are_named(tmp_path, change, says):
 def test_a_sensor_beside_the_study_is_found(tmp_path):
     (tmp_path / "mine.toml").write_text('base = "thesis"\nname = "mine"\n[laser]\nbaseline_mm = 222.0\n')
     study = load_study(written(tmp_path, STUDY.replace('title = "test"', 'title = "test"\nsensor = "mine.toml"')))
-    assert study.base().laser.baseline_mm == 222.0
+    assert study.sensor.laser.baseline_mm == 222.0
 
 
 def test_the_command_line_overrules_the_study(tmp_path):
@@ -165,7 +165,7 @@ def test_values_and_choices_reach_the_sensor(study):
     assert (sensor.camera.width_px, sensor.camera.height_px) == (640, 512)
     # What is not free stays, and the base itself is not touched.
     assert sensor.detector == load_sensor("thesis").detector
-    assert study.base().laser.baseline_mm == 265.0
+    assert study.sensor.laser.baseline_mm == 265.0
 
 
 def test_a_design_as_built_is_judged_as_in_the_sweep(study):

@@ -36,7 +36,7 @@ from uwlts.model.errors import DesignError, EvaluationError, RangeError
 from uwlts.model.sensor import Sensor
 
 STUDY = load_study("baseline-angle")
-BASE = STUDY.base()
+BASE = STUDY.sensor
 
 
 def small(**changes) -> Study:
@@ -69,7 +69,7 @@ def scattered(study: Study, count: int) -> tuple[list[Design], dict[str, np.ndar
 
 
 def marked_of(study: Study, designs: list[Design], columns: dict[str, np.ndarray]) -> list[Marked]:
-    base = study.base()
+    base = study.sensor
     best = int(Judged(study, columns).best_first[0])
     return [
         Marked("base", base, described(study, "base", base)),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import matplotlib
 import numpy as np
@@ -64,6 +64,7 @@ _MOST_DOTS, _MOST_OF_CURVE, _MOST_BARS, _MOST_DIMENSIONS = 2000, 500, 40, 12
 _FEW, _IN_SVG = 300, 2500
 """More points are drawn smaller; more than the second number with WebGL, which does not slow the page down."""
 _SEED = 0
+_LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
 _LOG_AXIS = {"type": "log", "dtick": "D2"}
 _WIDE_RANGE = 30.0
 """A figure whose largest value is so many times the least gets a logarithmic axis."""
@@ -78,19 +79,14 @@ _plain_text = matplotlib.rc_context({"text.parse_math": False})
 """Names given by users hold no formulas, whatever dollar signs they have."""
 
 
-@dataclass(frozen=True, eq=False)
-class Interactive:
-    """A plotly figure for a page, and what it shows, in a sentence."""
-
-    figure: go.Figure
-    caption: str
+Kind = TypeVar("Kind", Figure, go.Figure)
 
 
 @dataclass(frozen=True, eq=False)
-class Static:
-    """A matplotlib figure for a page, and what it shows, in a sentence."""
+class Chart(Generic[Kind]):
+    """A matplotlib or plotly figure for a page, and its caption."""
 
-    figure: Figure
+    figure: Kind
     caption: str
 
 
@@ -123,38 +119,33 @@ def shown_figures(judged: Judged) -> list[str]:
 # --- panels of static figures -----------------------------------------------------------------------------------------
 
 
-def _panels(figures: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[Figure, list[Axes], list[str]]:
-    """A figure with axes for each of the first figures of merit, and their names."""
-    names = list(figures[:_MOST_PANELS])
+def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[Figure, list[tuple[Axes, str]]]:
+    """A figure with axes for each of the first figures of merit, with their names, which are the titles."""
+    names = names[:_MOST_PANELS]
     columns = min(_PANEL_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     figure, axes = new_figure(_PANEL_INCHES[0] * columns, height * rows, rows=rows, columns=columns)
     for unused in axes[len(names) :]:
         unused.remove()
-    return figure, list(axes[: len(names)]), names
+    panels = list(zip(axes, names, strict=False))
+    for one, name in panels:
+        one.set_title(label_of(name))
+    return figure, panels
 
 
 def _mark(axes: Axes, points: Sequence[Point], x: str, y: str) -> None:
     """Draw marked designs as symbols, the chosen one in red."""
     for point in points:
-        at = point.value(x), point.value(y)
+        at, size = (point.value(x), point.value(y)), 10 if point.chosen else 8
         if all(map(math.isfinite, at)):
-            marker = _SYMBOLS[point.number % len(_SYMBOLS)][1]
-            axes.plot(
-                *at,
-                marker,
-                color=point.colour,
-                markeredgecolor="white",
-                markersize=10 if point.chosen else 8,
-                label=point.label,
-                zorder=6,
-            )
+            style = {"color": point.colour, "markersize": size, "markeredgecolor": "white", "zorder": 6}
+            axes.plot(*at, _SYMBOLS[point.number % len(_SYMBOLS)][1], label=point.label, **style)
 
 
-def _bound_lines(axes: Axes, judged: Judged, name: str) -> None:
+def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None:
     for bounded, _, bound in bounds_of(judged.study):
         if bounded == name:
-            axes.axhline(bound, color=RED, linewidth=1.2, linestyle="--")
+            draw(bound, color=RED, linewidth=1.2, linestyle="--")
 
 
 def _dashed(judged: Judged) -> str:
@@ -165,7 +156,7 @@ def _dashed(judged: Judged) -> str:
 
 
 @_plain_text
-def curves(judged: Judged, marked: Sequence[Point], x: str) -> Static:
+def curves(judged: Judged, marked: Sequence[Point], x: str) -> Chart[Figure]:
     """Figures over one variable: a curve for every combination of what else is free, or the best of all."""
     others = [name for name in judged.study.free() if name != x]
     groups: dict[str, list[int]] = {}
@@ -176,18 +167,18 @@ def curves(judged: Judged, marked: Sequence[Point], x: str) -> Static:
         groups = {"best": judged.best_first.tolist()}
         caption = f"{listed([words_of(o) for o in others]).capitalize()} also vary: the best design of every place. "
     found = {name: _first_at(judged, x, np.array(places), best=bool(caption)) for name, places in groups.items()}
-    figure, panels, names = _panels(shown_figures(judged))
-    for axes, name in zip(panels, names, strict=True):
+    figure, panels = _panels(shown_figures(judged))
+    for axes, name in panels:
         for colour, (group, places) in zip(COLOURS, found.items(), strict=False):
             values, meets = (judged.columns[x][places], judged.figure(name)[places]), judged.feasible[places]
             axes.plot(*values, color=colour, linewidth=1.3, label=group or "designs")
             axes.scatter(*values, s=16, color=np.where(meets, colour, "white"), edgecolors=colour, zorder=3)
-        _bound_lines(axes, judged, name)
+        _draw_bounds(axes.axhline, judged, name)
         _mark(axes, marked, x, name)
-        axes.set(xlabel=label_of(x), title=label_of(name), xscale=judged.study.variables[x].scale)
+        axes.set(xlabel=label_of(x), xscale=judged.study.variables[x].scale)
     legend_below(figure)
     missed = "Hollow: misses a constraint. " if (judged.works & ~judged.feasible).any() else ""
-    return Static(figure, f"{caption}{missed}{_dashed(judged)}".strip())
+    return Chart(figure, f"{caption}{missed}{_dashed(judged)}".strip())
 
 
 def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
@@ -206,24 +197,21 @@ def _first_at(judged: Judged, x: str, places: np.ndarray, *, best: bool) -> np.n
 
 
 @_plain_text
-def bars(judged: Judged) -> Static:
+def bars(judged: Judged) -> Chart[Figure]:
     """Figures of every combination of choices, the best first."""
     places = judged.best_first[:_MOST_BARS]
     labels = [_combination(judged, list(judged.study.free()), place) for place in places]
     height = max(_PANEL_INCHES[1], _BAR_INCHES * len(places))
-    figure, panels, names = _panels(shown_figures(judged), height=height)
-    for number, (axes, name) in enumerate(zip(panels, names, strict=True)):
+    figure, panels = _panels(shown_figures(judged), height=height)
+    for number, (axes, name) in enumerate(panels):
         axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, PALE))
         # Long names stand at the left only.
         axes.set_yticks(range(len(places)), labels if number % _PANEL_COLUMNS == 0 else [""] * len(places))
         axes.invert_yaxis()
-        axes.set_title(label_of(name))
-        for bounded, _, bound in bounds_of(judged.study):
-            if bounded == name:
-                axes.axvline(bound, color=RED, linewidth=1.2, linestyle="--")
+        _draw_bounds(axes.axvline, judged, name)
     count = f"The best {len(places)} of {int(judged.works.sum()):,} designs." if len(places) == _MOST_BARS else ""
     grey = " Grey: misses a constraint." if not judged.feasible[places].all() else ""
-    return Static(figure, f"{count}{grey} {_dashed(judged)}".strip())
+    return Chart(figure, f"{count}{grey} {_dashed(judged)}".strip())
 
 
 def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
@@ -349,16 +337,16 @@ def _reasons(judged: Judged, values: dict[str, np.ndarray], failures: np.ndarray
 
 
 @_plain_text
-def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Static | None:
+def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Chart[Figure] | None:
     """The figures over two variables beside each other; None where the designs span no area."""
     figures = shown_figures(judged)
     found = map_of(judged, x, y, figures)
     if found is None:
         return None
-    figure, panels, names = _panels(figures)
+    figure, panels = _panels(figures)
     variables = [judged.study.variables[name] for name in (x, y)]
     dots = np.flatnonzero(sample(judged.works, np.zeros(len(judged), bool), _MOST_DOTS)) if found.dots else []
-    for number, (axes, name) in enumerate(zip(panels, names, strict=True)):
+    for number, (axes, name) in enumerate(panels):
         _fill(axes, found, name)
         _shade(axes, found)
         if len(judged.study.free()) == 2:
@@ -368,33 +356,21 @@ def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Static 
             axes.plot(*at, ".", color=INK, markersize=1.0, alpha=0.5, rasterized=True)
         _mark(axes, marked, x, y)
         axes.grid(visible=False)
-        axes.set(xlabel=label_of(x), ylabel="" if number % _PANEL_COLUMNS else label_of(y), title=label_of(name))
+        axes.set(xlabel=label_of(x), ylabel="" if number % _PANEL_COLUMNS else label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
         axes.set(xlim=_with_margin(variables[0]), ylim=_with_margin(variables[1]))
     legend_below(figure)
-    outside = [
-        point.label
-        for point in marked
-        if not all(_inside(variable, point.value(name)) for name, variable in zip((x, y), variables, strict=True))
-    ]
+    ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
+    outside = [p.label for p in marked if not all(low <= p.value(name) <= high for name, (low, high) in ends.items())]
     beyond = f" Outside the ranges: {listed(outside)}." if outside else ""
     missed = "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
     parts = [found.caption, missed if (found.reasons != "").any() else "", beyond]
-    return Static(figure, " ".join(part.strip() for part in parts if part))
+    return Chart(figure, " ".join(part.strip() for part in parts if part))
 
 
 def _with_margin(variable: Variable) -> tuple[float, float]:
     """Ends of an axis, a little beyond the range so that designs on its border are seen wholly."""
-    low, high = variable.ends()
-    if variable.scale == "log":
-        factor = (high / low) ** _MARGIN
-        return low / factor, high * factor
-    return low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-
-
-def _inside(variable: Variable, value: float) -> bool:
-    low, high = variable.ends()
-    return low <= value <= high
+    return float(variable.at(-_MARGIN)), float(variable.at(1 + _MARGIN))
 
 
 def _fill(axes: Axes, found: Map, name: str) -> None:
@@ -427,18 +403,8 @@ def _shade(axes: Axes, found: Map) -> None:
     for where, colour, strength in ((works, "#e4e7eb", 0.72), (~works, "#969ea8", 1.0)):
         shaded = np.where((found.reasons != "") & where, 1.0, np.nan)
         if np.isfinite(shaded).any():
-            shades = ListedColormap([colour])
-            axes.pcolormesh(
-                found.x,
-                found.y,
-                shaded,
-                cmap=shades,
-                alpha=strength,
-                shading="nearest",
-                rasterized=True,
-                linewidth=0,
-                antialiased=False,
-            )
+            style = {"alpha": strength, "shading": "nearest", "rasterized": True, "linewidth": 0, "antialiased": False}
+            axes.pcolormesh(found.x, found.y, shaded, cmap=ListedColormap([colour]), **style)
 
 
 def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
@@ -455,7 +421,7 @@ def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
 
 
 @_plain_text
-def verification_chart(found: Agreement) -> Static | None:
+def verification_chart(found: Agreement) -> Chart[Figure] | None:
     """Scatter as predicted and as rendered, and the systematic error, over Z."""
     if not found.z_mm:
         return None
@@ -473,7 +439,7 @@ def verification_chart(found: Agreement) -> Static | None:
     error.set(xlabel="Z from the stand-off (mm)", ylabel="systematic error (µm)")
     legend_below(figure)
     caption = "Left: standard deviation of the points along Z. Right: their mean distance from the true plane."
-    return Static(figure, caption)
+    return Chart(figure, caption)
 
 
 # --- the Pareto front -------------------------------------------------------------------------------------------------
@@ -498,7 +464,7 @@ def _varies(judged: Judged, name: str) -> bool:
     return len(values) > 1 and float(np.ptp(values)) > 1e-9 * float(np.abs(values).max())
 
 
-def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Interactive | None:
+def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Chart[go.Figure] | None:
     """All designs that work over two figures, and the front of those that meet the constraints."""
     (x, x_sign), (y, y_sign) = trade_off(judged)
     values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
@@ -508,92 +474,90 @@ def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Interactive | None:
     front = pareto(np.where((judged.of_interest & known)[:, None], values, np.nan))
     shown = sample(known, front, MOST_POINTS)
     figure = go.Figure()
-    layers = (
+    labels = [escaped(label_of(name)) for name in (x, y)]
+
+    def add(places: np.ndarray, name: str, *, gl: bool = False, **style: object) -> None:
+        at = {"x": rounded(judged.figure(x)[places]), "y": rounded(judged.figure(y)[places])}
+        figure.add_trace((go.Scattergl if gl else go.Scatter)(**at, name=name, **style))
+
+    for name, chosen, colour in (
         ("misses a constraint", shown & ~judged.feasible, "#b3bcc6"),
         ("meets all constraints", shown & judged.feasible & ~front, BLUE),
-    )
-    size = 4 if shown.sum() > _FEW else 7
-    for name, chosen, colour in layers:
+    ):
         if chosen.any():
-            marker = {"color": colour, "size": size, "opacity": 0.55}
-            _add_designs(figure, judged, np.flatnonzero(chosen), x, y, name=name, marker=marker)
+            add(
+                places := np.flatnonzero(chosen),
+                name,
+                gl=len(places) > _IN_SVG,
+                mode="markers",
+                marker={"color": colour, "size": 4 if shown.sum() > _FEW else 7, "opacity": 0.55},
+                customdata=judged.columns["design"][places].tolist(),
+                hovertemplate=f"design %{{customdata}}<br>{labels[0]}: %{{x}}<br>{labels[1]}: %{{y}}"
+                f"<extra>{name}</extra>",
+            )
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
-    figure.add_scatter(
-        x=rounded(judged.figure(x)[order]),
-        y=rounded(judged.figure(y)[order]),
+    add(
+        order,
+        f"Pareto front ({len(order):,} of the designs)",
         mode="lines+markers",
-        name=f"Pareto front ({len(order):,} of the designs)",
         line={"color": GREEN, "width": 2},
         marker={"size": 6, "color": GREEN},
         text=hover_texts(judged, order, x, y),
         hovertemplate="%{text}<extra></extra>",
     )
     axis = {"gridcolor": FAINT, "linecolor": INK, "ticks": "outside", "zeroline": False, "automargin": True}
+    ends, axes = [], []
+    for name, label, distance in zip((x, y), labels, (10, 12), strict=True):
+        numbers = np.append(judged.figure(name)[known], [point.value(name) for point in marked])
+        ends.append((float(np.nanmin(numbers)), float(np.nanmax(numbers))))
+        log = _LOG_AXIS if 0 < ends[-1][0] * _WIDE_RANGE < ends[-1][1] else {}
+        axes.append(axis | {"title": {"text": label, "standoff": distance}} | log)
     figure.update_layout(
-        template="none",
+        _LAYOUT,
         height=520,
         margin={"l": 70, "r": 20, "t": 30, "b": 56},
-        font={"size": 13, "color": INK},
-        xaxis=axis | {"title": {"text": escaped(label_of(x)), "standoff": 10}},
-        yaxis=axis | {"title": {"text": escaped(label_of(y)), "standoff": 12}},
+        font_size=13,
+        xaxis=axes[0],
+        yaxis=axes[1],
         legend={"orientation": "h", "y": -0.16, "yanchor": "top", "x": 0, "itemsizing": "constant"},
         hovermode="closest",
         hoverlabel={"namelength": -1, "bgcolor": "white", "font": {"color": INK}},
         separators=". ",
-        paper_bgcolor="white",
         plot_bgcolor="white",
     )
-    ends = []
-    for axis, name in (("xaxis", x), ("yaxis", y)):
-        numbers = np.append(judged.figure(name)[known], [point.value(name) for point in marked])
-        ends.append((float(np.nanmin(numbers)), float(np.nanmax(numbers))))
-        if ends[-1][0] > 0 and ends[-1][1] > _WIDE_RANGE * ends[-1][0]:
-            figure.update_layout({axis: _LOG_AXIS})
-    _add_marked(figure, marked, x, y, ends=ends)
+    _add_marked(figure, marked, x, y, middle=sum(map(math.log10, ends[0]) if "type" in axes[0] else ends[0]) / 2)
     better = " and ".join(
         f"{'less' if sign > 0 else 'more'} {words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
     )
     thin = f" {int(shown.sum()):,} of {int(known.sum()):,} designs are drawn." if shown.sum() < known.sum() else ""
     none = "" if judged.feasible.any() else " None meets all constraints: the front is that of all that work."
     more = " Further objectives are left out here." if len(judged.study.objectives) > 2 else ""
-    return Interactive(
-        figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}"
-    )
+    return Chart(figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}")
 
 
-def _add_marked(
-    figure: go.Figure, points: Sequence[Point], x: str, y: str, *, ends: Sequence[tuple[float, float]]
-) -> None:
-    """Add marked designs with their labels, which stand towards the middle between the ``ends`` of the x axis."""
+def _add_marked(figure: go.Figure, points: Sequence[Point], x: str, y: str, *, middle: float) -> None:
+    """Add marked designs with their labels, which stand towards the ``middle`` of the x axis."""
     layout: Any = figure.layout
-    logs = [layout[axis].type == "log" for axis in ("xaxis", "yaxis")]
-    low, high = (math.log10(end) if logs[0] else end for end in ends[0])
+    logs = [axis.type == "log" for axis in (layout.xaxis, layout.yaxis)]
     for point in points:
         at, label = [point.value(x), point.value(y)], escaped(point.label)
         if not all(map(math.isfinite, at)):
             continue
         places = [math.log10(value) if log else value for value, log in zip(at, logs, strict=True)]
-        left = places[0] > (low + high) / 2
+        left = places[0] > middle
+        marker = {"symbol": _SYMBOLS[point.number % len(_SYMBOLS)][0], "size": 15 if point.chosen else 11}
         figure.add_scatter(
             x=rounded(at[:1]),
             y=rounded(at[1:]),
             mode="markers",
             showlegend=False,
             name=label,
-            marker={
-                "symbol": _SYMBOLS[point.number % len(_SYMBOLS)][0],
-                "size": 15 if point.chosen else 11,
-                "color": point.colour,
-                "line": {"color": "white", "width": 1.5},
-            },
+            marker=marker | {"color": point.colour, "line": {"color": "white", "width": 1.5}},
             hovertemplate=f"<b>{label}</b><br>{escaped(label_of(x))}: %{{x}}<br>%{{y}}<extra></extra>",
         )
         figure.add_annotation(
-            x=places[0],
-            y=places[1],
+            {"x": places[0], "y": places[1], "ax": -30 if left else 30, "ay": _AWAY[point.number % len(_AWAY)]},
             text=f"<b>{label}</b>",
-            ax=-30 if left else 30,
-            ay=_AWAY[point.number % len(_AWAY)],
             xanchor="right" if left else "left",
             arrowcolor=point.colour,
             arrowwidth=1.2,
@@ -608,24 +572,6 @@ def _add_marked(
 def escaped(text: str) -> str:
     """Text in which plotly finds no tags."""
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-def _add_designs(
-    figure: go.Figure, judged: Judged, places: np.ndarray, x: str, y: str, *, name: str, marker: dict[str, Any]
-) -> None:
-    kind = go.Scattergl if len(places) > _IN_SVG else go.Scatter
-    figure.add_trace(
-        kind(
-            x=rounded(judged.figure(x)[places]),
-            y=rounded(judged.figure(y)[places]),
-            mode="markers",
-            name=name,
-            marker=marker,
-            customdata=judged.columns["design"][places].tolist(),
-            hovertemplate=f"design %{{customdata}}<br>{escaped(label_of(x))}: %{{x}}<br>{escaped(label_of(y))}: %{{y}}"
-            f"<extra>{name}</extra>",
-        )
-    )
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
@@ -654,7 +600,7 @@ def hover_texts(judged: Judged, places: np.ndarray, *figures: str) -> list[str]:
 # --- all at once ------------------------------------------------------------------------------------------------------
 
 
-def parallel_chart(judged: Judged) -> Interactive | None:
+def parallel_chart(judged: Judged) -> Chart[go.Figure] | None:
     """Every design that meets the constraints as a line over all that is free, wanted and bounded."""
     if not judged.feasible.any():
         return None
@@ -685,43 +631,26 @@ def parallel_chart(judged: Judged) -> Interactive | None:
             },
         )
     )
-    figure.update_layout(
-        template="none",
-        height=470,
-        margin={"l": 80, "r": 40, "t": 110, "b": 30},
-        font={"size": 12, "color": INK},
-        paper_bgcolor="white",
-    )
+    figure.update_layout(_LAYOUT, height=470, margin={"l": 80, "r": 40, "t": 110, "b": 30}, font_size=12)
     total = int(judged.feasible.sum())
     count = f"{len(places):,} of {total:,} designs" if len(places) < total else f"All {total:,} designs"
-    return Interactive(figure, f"{count} that meet all constraints. Drag along an axis to keep only what passes there.")
+    return Chart(figure, f"{count} that meet all constraints. Drag along an axis to keep only what passes there.")
 
 
-def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, Any]:
-    values = judged.columns[name][places]
+def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, object]:
+    """A parallel axis: choices and laser classes by name, else numbers."""
+    values, variable = judged.columns[name][places], judged.study.free().get(name)
     label = escaped(label_of(name))
-    variable = judged.study.free().get(name)
     if variable is not None and variable.values is not None:
         options = list(variable.values)
-        codes = [options.index(value) for value in values.tolist()]
         # Ticks hold plain text, in which nothing is a tag.
         texts = [textwrap.shorten(value_text(name, option, unit=False), 24, placeholder="…") for option in options]
-        return {
-            "label": label,
-            "values": codes,
-            "tickvals": list(range(len(options))),
-            "ticktext": texts,
-            "range": [-0.3, len(options) - 0.7],
-        }
-    if name == "laser_class":
-        classes = sorted(CLASS_NAMES)
-        return {
-            "label": label,
-            "values": rounded(values),
-            "tickvals": classes,
-            "ticktext": [CLASS_NAMES[one] for one in classes],
-            "range": [classes[0] - 0.3, classes[-1] + 0.3],
-        }
-    low, high = float(values.min()), float(values.max())
-    margin = 0.0 if high > low else max(abs(low) * 0.05, 1e-6)
-    return {"label": label, "values": rounded(values), "range": [low - margin, high + margin]}
+        ticks, codes = list(range(len(options))), [options.index(value) for value in values.tolist()]
+    elif name == "laser_class":
+        ticks, texts, codes = list(CLASS_NAMES), list(CLASS_NAMES.values()), rounded(values)
+    else:
+        low, high = float(values.min()), float(values.max())
+        margin = 0.0 if high > low else max(abs(low) * 0.05, 1e-6)
+        return {"label": label, "values": rounded(values), "range": [low - margin, high + margin]}
+    ends = [ticks[0] - 0.3, ticks[-1] + 0.3]
+    return {"label": label, "values": codes, "tickvals": ticks, "ticktext": texts, "range": ends}

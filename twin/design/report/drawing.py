@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from twin.design.figures import depths_in_view, field_of
 from twin.design.geometry import FlatWindow, Lens, directions_of, traced
@@ -34,7 +35,7 @@ _HOUSING_MM, _WALL_MM, _BARE_FRONT_MM, _BARE_HALF_MM = 42.0, 5.0, 12.0, 15.0
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """Camera or laser from one side: its origin, its window's corners (4, 2) or None, and its housing's (4, 2), mm.
+    """Camera or laser from one side: origin (2,), the window's corners (4, 2) or None, the housing's (4, 2), mm.
 
     Only origin and window are to scale: the description does not know the housing.
     """
@@ -48,25 +49,10 @@ class Module:
 class SideView:
     """A sensor in the plane of the camera's axis and the baseline; points are (baseline, depth) from the pupil, in mm.
 
-    Attributes
-    ----------
-    camera, laser : Module
-    pupil_mm, baseline_mm : float
-        Diameter of the entrance pupil; distance of the fan's origin from the camera's axis, in any direction.
-    edges : tuple of (K, 2)
-        Rays of the image's edges: pupil, both faces of the window if there is one, and an end in the medium.
-    sheet : (K, 2)
-        The laser's axis, from the fan's origin on.
-    volume : (2, 2)
-        Where the sheet has the depths of the volume's near and far end.
-    in_view : (2, 2) or None
-        Ends of the part of ``volume`` that camera and laser reach.
-    crossing : (2,)
-        Where the sheet crosses the camera's axis.
-    outer_mm, near_mm, far_mm : float
-        Depths of the window's outer face and of the volume's ends, on the camera's axis.
-    angle_rad : float
-        Between sheet and camera's axis, in this view.
+    ``edges`` are rays (K, 2) of the image's edges: pupil, both faces of the window if there is one, and an end in the
+    medium. ``sheet`` (K, 2) is the laser's axis, ``volume`` (2, 2) its points at the depths of the volume's ends,
+    ``in_view`` the ends of the part that camera and laser reach, ``crossing`` where the sheet crosses the camera's
+    axis, at ``angle_rad``. ``baseline_mm`` is the distance of the fan's origin from that axis, in any direction.
     """
 
     camera: Module
@@ -79,31 +65,20 @@ class SideView:
     in_view: np.ndarray | None
     crossing: np.ndarray
     outer_mm: float
-    near_mm: float
-    far_mm: float
     angle_rad: float
 
     def points(self) -> np.ndarray:
-        """All points (N, 2) that a picture must hold."""
-        modules = [corners for module in (self.camera, self.laser) for corners in _corners(module)]
-        return _finite([*modules, *self.edges, self.sheet, self.volume])
+        """All finite points (N, 2) of the view."""
+        return _finite(_corners(self.camera), _corners(self.laser), *self.edges, self.sheet, self.volume)
 
 
 @dataclass(frozen=True, eq=False)
 class FrontView:
     """The sheet face on; points are (along the stripe, along the laser's axis) from the fan's origin, in mm.
 
-    Attributes
-    ----------
-    laser : Module
-    fan : tuple of (K, 2)
-        The fan's edges.
-    borders : tuple of (N, 2)
-        Where the four sides of the image lie in the sheet; NaN where they miss it.
-    lines : (3, 2, 2)
-        Ends of the line at near end, middle and far end of what the camera sees of the volume; NaN if it sees nothing.
-    region : (N, 2)
-        Outline of what camera and laser reach between near and far end; empty if nothing.
+    ``fan`` are the fan's edges (K, 2) and ``borders`` the image's four sides (N, 2) in the sheet, NaN where they miss
+    it. ``lines`` (3, 2, 2) are the ends of the line at near end, middle and far end of what the camera sees of the
+    volume, NaN if it sees nothing; ``region`` (N, 2) is the outline of what camera and laser reach, possibly empty.
     """
 
     laser: Module
@@ -113,8 +88,8 @@ class FrontView:
     region: np.ndarray
 
     def points(self) -> np.ndarray:
-        """All points (N, 2) that a picture must hold."""
-        return _finite([*_corners(self.laser), *self.fan, self.lines.reshape(-1, 2), self.region])
+        """All finite points (N, 2) of the view."""
+        return _finite(_corners(self.laser), *self.fan, *self.lines, self.region)
 
 
 def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
@@ -127,30 +102,72 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     DescriptionError, RangeError
         As `twin.design.parameters.numbers_of`.
     """
-    pose, p = laser_pose(sensor), parameters_of([sensor], [medium])
+    pose, p, camera = laser_pose(sensor), parameters_of([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())
-    _require_crossing(pose, outer)
+    crossing = _crossing_mm(pose, outer)
+    start = np.array([0.0, 0.0, crossing])
+
+    def on_sheet(depths: np.ndarray) -> np.ndarray:
+        """Points (N, 3) at depths on the line through ``start`` along the laser's axis."""
+        return start + ((depths - crossing) / pose.axis[2])[:, None] * pose.axis
+
     # Camera and laser are modules of one kind: a frame with z along the axis, and perhaps a window.
-    along = np.cross(pose.axis, pose.normal)
-    camera = _mounted(sensor, sensor.camera.window, medium, np.zeros(3), np.eye(3))
-    laser = _mounted(
-        sensor, sensor.laser.window, medium, pose.origin_mm, np.stack([pose.normal, along, pose.axis], axis=1)
-    )
-    far = _on_sheet(pose, np.array([outer + sensor.volume.far_mm]))[0]
-    end = pose.origin_mm + _BEYOND * ((far - pose.origin_mm) @ pose.axis) * pose.axis
-    middle, low, high = 0.0, p.lit_from_rad.item(), p.lit_to_rad.item()
-    fan = np.stack([math.cos(a) * pose.axis + math.sin(a) * pose.fan for a in (middle, low, high)])
-    sheet_rays = laser.rays(fan, end, pose.axis)
-    reach = _reach(sensor, p, pose, outer)
-    return (
-        _side_view(sensor, pose, camera, laser, sheet_rays[0], reach),
-        _front_view(sensor, pose, camera, laser, sheet_rays[1:], reach),
+    seeing = _mounted(sensor, camera.window, medium, np.zeros(3), np.eye(3))
+    frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
+    lighting = _mounted(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
+    lens = Lens.of(camera)
+    reach = _reach(sensor, p, (start - pose.origin_mm) @ pose.fan)
+    near, far = outer + reach.depths_mm[[0, -1]]
+    reached = np.isfinite(reach.low_mm)
+
+    end = pose.origin_mm + _BEYOND * ((on_sheet(np.array([far]))[0] - pose.origin_mm) @ pose.axis) * pose.axis
+    angles = np.array([0.0, p.lit_from_rad.item(), p.lit_to_rad.item()])[:, None]
+    axis, *fan = lighting.rays(np.cos(angles) * pose.axis + np.sin(angles) * pose.fan, end, pose.axis)
+
+    # The side view runs along the sheet whatever the fan's roll; the laser is on the positive side.
+    sideways = math.hypot(*pose.normal[:2])
+    across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
+    side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
+    ahead = np.array([0.0, 0.0, 1.0])
+    seen = on_sheet(outer + reach.depths_mm[reached][[0, -1]]) @ side_axes.T if reached.any() else None
+    side = SideView(
+        camera=seeing.seen_along(side_axes, 0.0),
+        laser=lighting.seen_along(side_axes, 0.0),
+        pupil_mm=camera.focal_length_mm / camera.f_number,
+        baseline_mm=math.hypot(*pose.origin_mm[:2]),
+        edges=tuple(
+            seeing.rays(directions_of(lens, _border_towards(camera, across)), far * _BEYOND * ahead, ahead)
+            @ side_axes.T
+        ),
+        sheet=axis @ side_axes.T,
+        volume=on_sheet(np.array([near, far])) @ side_axes.T,
+        in_view=seen,
+        crossing=np.array([0.0, crossing]),
+        outer_mm=outer,
+        angle_rad=math.atan2(abs(pose.normal[2]), sideways),
     )
 
+    front_axes = np.stack([pose.fan, pose.axis])
+    heights, shown = (
+        (on_sheet(outer + depths) - pose.origin_mm) @ pose.axis for depths in (reach.depths_mm, reach.shown_mm)
+    )
+    low, high = (np.stack([y, heights], axis=1)[reached] for y in (reach.low_mm, reach.high_mm))
+    borders = [seeing.rays(directions_of(lens, s), pose.origin_mm, pose.normal)[:, -1] for s in _image_sides(camera)]
+    front = FrontView(
+        laser=lighting.seen_along(front_axes, pose.origin_mm),
+        fan=tuple((edge - pose.origin_mm) @ front_axes.T for edge in fan),
+        borders=tuple((border - pose.origin_mm) @ front_axes.T for border in borders),
+        lines=np.stack([reach.line_mm, np.repeat(shown[:, None], 2, axis=1)], axis=2),
+        region=np.concatenate([low, high[::-1]]),
+    )
+    return side, front
 
-def _require_crossing(pose: LaserPose, outer: float) -> None:
-    crossing = pose.normal[2]
-    depth = _crossing_mm(pose) if abs(crossing) > 1e-9 else math.inf
+
+def _crossing_mm(pose: LaserPose, outer: float) -> float:
+    """Depth at which the sheet crosses the camera's axis; DesignError if it does not do so ahead of the window."""
+    steep = abs(pose.normal[2]) > 1e-9  # otherwise the sheet is parallel to the axis, up to rounding
+    depth = float(pose.normal @ pose.origin_mm / pose.normal[2]) if steep else math.inf
+    # Beyond 100 m nothing is a design; a normal along the axis has no side view.
     if not outer < depth < 1e5 or math.hypot(*pose.normal[:2]) < 1e-9:
         raise DesignError(
             f"the sheet crosses the camera's axis {depth:.1f} mm from the entrance pupil; it must cross it aslant, in "
@@ -158,85 +175,12 @@ def _require_crossing(pose: LaserPose, outer: float) -> None:
         )
     if pose.axis[2] <= 0:
         raise DesignError("the laser shines back towards the camera: turn its axis")
-
-
-def _side_view(
-    sensor: Sensor, pose: LaserPose, camera: _Mounted, laser: _Mounted, axis: np.ndarray, reach: _Reach
-) -> SideView:
-    axes = _side_axes(pose)
-    near, far = reach.depths_mm[[0, -1]]
-    edges = directions_of(_lens(sensor.camera), _border_towards(sensor.camera, axes[0, :2]))
-    ahead = np.array([0.0, 0.0, 1.0])
-    rays = camera.rays(edges, far * _BEYOND * ahead, ahead)
-    seen = reach.depths_mm[np.isfinite(reach.low_mm)]
-    return SideView(
-        camera=camera.seen_along(axes, 0.0),
-        laser=laser.seen_along(axes, 0.0),
-        pupil_mm=sensor.camera.focal_length_mm / sensor.camera.f_number,
-        baseline_mm=math.hypot(*pose.origin_mm[:2]),
-        edges=tuple(rays @ axes.T),
-        sheet=axis @ axes.T,
-        volume=_on_sheet(pose, np.array([near, far])) @ axes.T,
-        in_view=_on_sheet(pose, seen[[0, -1]]) @ axes.T if len(seen) else None,
-        crossing=np.array([0.0, _crossing_mm(pose)]),
-        outer_mm=float(near - sensor.volume.near_mm),
-        near_mm=float(near),
-        far_mm=float(far),
-        angle_rad=math.atan2(abs(pose.normal[2]), math.hypot(*pose.normal[:2])),
-    )
-
-
-def _front_view(
-    sensor: Sensor, pose: LaserPose, camera: _Mounted, laser: _Mounted, edges: np.ndarray, reach: _Reach
-) -> FrontView:
-    axes = np.stack([pose.fan, pose.axis])
-    heights, shown = ((_on_sheet(pose, d) - pose.origin_mm) @ pose.axis for d in (reach.depths_mm, reach.shown_mm))
-    reached = np.isfinite(reach.low_mm)
-    low, high = (np.stack([y, heights], axis=1)[reached] for y in (reach.low_mm, reach.high_mm))
-    return FrontView(
-        laser=laser.seen_along(axes, pose.origin_mm),
-        fan=tuple((edges - pose.origin_mm) @ axes.T),
-        borders=tuple(
-            (
-                camera.rays(directions_of(_lens(sensor.camera), side), pose.origin_mm, pose.normal)[:, -1]
-                - pose.origin_mm
-            )
-            @ axes.T
-            for side in _image_sides(sensor.camera)
-        ),
-        lines=np.stack([reach.line_mm, np.repeat(shown[:, None], 2, axis=1)], axis=2),
-        region=np.concatenate([low, high[::-1]]),
-    )
-
-
-# --- the sheet --------------------------------------------------------------------------------------------------------
-
-
-def _side_axes(pose: LaserPose) -> np.ndarray:
-    """Axes (2, 3) of the side view: the direction in the camera's x-y plane square to the sheet, and the depth.
-
-    The view then runs along the sheet whatever the fan's roll; the laser is on the positive side.
-    """
-    across = pose.normal[:2] / math.hypot(*pose.normal[:2])
-    if across @ pose.origin_mm[:2] < 0:
-        across = -across
-    return np.array([[across[0], across[1], 0.0], [0.0, 0.0, 1.0]])
-
-
-def _crossing_mm(pose: LaserPose) -> float:
-    """Depth at which the sheet crosses the camera's axis."""
-    return float(pose.normal @ pose.origin_mm / pose.normal[2])
-
-
-def _on_sheet(pose: LaserPose, depths: np.ndarray) -> np.ndarray:
-    """Points (N, 3) at depths, on the line along the laser's axis through where the sheet crosses the camera's axis."""
-    depth = _crossing_mm(pose)
-    return np.array([0.0, 0.0, depth]) + ((depths - depth) / pose.axis[2])[:, None] * pose.axis
+    return depth
 
 
 @dataclass(frozen=True, eq=False)
 class _Reach:
-    """Of N depths (from the pupil): from where to where (N,) camera and laser reach, from the laser's axis; NaN where
+    """Of N depths from the window: from where to where (N,) camera and laser reach, from the laser's axis; NaN where
     they reach nothing. Of the three depths to show: ends (3, 2) of the line."""
 
     depths_mm: np.ndarray
@@ -246,10 +190,10 @@ class _Reach:
     line_mm: np.ndarray
 
 
-def _reach(sensor: Sensor, p: Parameters, pose: LaserPose, outer: float) -> _Reach:
-    shares, places = np.linspace(0, 1, _DEPTHS), np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
-    depths = sensor.volume.near_mm + shares * (sensor.volume.far_mm - sensor.volume.near_mm)
-    aside = (np.array([0.0, 0.0, _crossing_mm(pose)]) - pose.origin_mm) @ pose.fan
+def _reach(sensor: Sensor, p: Parameters, aside: float) -> _Reach:
+    """Reach at the depths of the volume; ``aside`` is where Y = 0 lies, from the laser's axis."""
+    places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
+    depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
     with np.errstate(all="ignore"):
         f = field_of(np, p, depths.reshape(1, -1, 1), places.reshape(1, 1, -1), reflectance=0.5)
         near, far = depths_in_view(np, p)
@@ -258,10 +202,10 @@ def _reach(sensor: Sensor, p: Parameters, pose: LaserPose, outer: float) -> _Rea
     y, inside = (np.broadcast_to(values, (1, _DEPTHS, _PLACES))[0] for values in (f.y_mm + aside, f.in_view))
     reached = inside.any(axis=1)
     return _Reach(
-        depths_mm=outer + depths,
+        depths_mm=depths,
         low_mm=np.where(reached, np.where(inside, y, np.inf).min(axis=1), np.nan),
         high_mm=np.where(reached, np.where(inside, y, -np.inf).max(axis=1), np.nan),
-        shown_mm=outer + shown.ravel(),
+        shown_mm=shown.ravel(),
         line_mm=np.where((np.diff(line) > 0) & (far > near)[0], line, np.nan),
     )
 
@@ -310,30 +254,15 @@ class _Mounted:
 
 
 def _mounted(sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
-    flat, wavelength = None, sensor.laser.wavelength_nm
-    if window.mounted:
-        normal = rotation @ window.normal()
-        flat = FlatWindow(
-            (normal[0], normal[1], normal[2]),
-            window.distance_mm * float(rotation[:, 2] @ normal),
-            window.thickness_mm,
-            window.index(wavelength),
-            medium.refractive_index(wavelength),
-        )
+    flat = FlatWindow.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
     return _Mounted(origin, rotation[:, 2], flat, window.aperture_diameter_mm, window.distance_mm)
-
-
-def _lens(camera: Camera) -> Lens:
-    d = camera.distortion
-    return Lens(camera.focal_length_px(), *camera.principal_point(), d.k1, d.k2, d.k3, d.p1, d.p2)
 
 
 def _image_sides(camera: Camera) -> list[np.ndarray]:
     """Pixels (N, 2) along the image's four sides."""
     width, height = camera.width_px - 0.5, camera.height_px - 0.5
     corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
-    share = np.linspace(0, 1, _BORDER)[:, None]
-    return [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    return [np.linspace(a, b, _BORDER) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
 
 
 def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
@@ -346,11 +275,11 @@ def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
     return np.stack([centre + lengths[0] * across, centre - lengths[1] * across])
 
 
-def _corners(module: Module) -> list[np.ndarray]:
-    return [module.origin[None], module.housing] + ([] if module.window is None else [module.window])
+def _corners(module: Module) -> np.ndarray:
+    return np.vstack([module.origin, module.housing, *([] if module.window is None else [module.window])])
 
 
-def _finite(parts: list[np.ndarray]) -> np.ndarray:
+def _finite(*parts: np.ndarray) -> np.ndarray:
     points = np.concatenate(parts)
     return points[np.isfinite(points).all(axis=1)]
 
@@ -358,14 +287,14 @@ def _finite(parts: list[np.ndarray]) -> np.ndarray:
 # --- the drawing ------------------------------------------------------------------------------------------------------
 
 _RED, _BLUE, _GLASS, _BEHIND, _THIN = "#c22f2f", "#3573b1", "#12a3a8", "#98a3af", "#b9c2cc"
-_WIDTH, _HEIGHT = 1080.0, 700.0
-"""Most room in px for both views together, without the dimensions around them."""
-_PX_PER_INCH = 96.0
-_SIDE_MARGINS, _FRONT_MARGINS = (108.0, 72.0), (30.0, 150.0)
-"""Room in px left and right of the views."""
-_TOP, _BOTTOM = 64.0, 44.0
+_WIDTH, _HEIGHT, _PX_PER_INCH = 720.0, 700.0, 96.0
+"""Most room in px for both views together, without labels: what the page's width and a screen's height leave."""
+_LEFT, _BETWEEN, _RIGHT, _TOP, _BOTTOM = 108.0, 102.0, 150.0, 64.0, 44.0
+"""Room in px for the dimensions and labels around the views."""
 _FITS = 1.7
 """A design behind the chosen one is drawn if the picture need not grow more than this for it."""
+_LETTER_PX = 6.7
+"""Mean width of a letter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,173 +306,174 @@ class Drawing:
 
 
 def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> Drawing:
-    """Draw a design's views at one scale, another design dashed behind them where it fits."""
-    behind = other if other is not None and _fits(side, other[0]) and _fits(front, other[1]) else None
-    sides, fronts = ([side], [front]) if behind is None else ([side, behind[0]], [front, behind[1]])
-    boxes = [_box(np.concatenate([view.points() for view in views])) for views in (sides, fronts)]
-    (_, size), (_, front_size) = boxes
-    margins = sum(_SIDE_MARGINS) + sum(_FRONT_MARGINS)
+    """Draw a design's views beside each other at one scale, another design dashed behind them where it fits."""
+    if other is not None and not (_fits(side, other[0]) and _fits(front, other[1])):
+        other = None
+    behind_side, behind_front = other or (None, None)
+    low, size = _box(side, behind_side)
+    front_low, front_size = _box(front, behind_front)
     tall = max(size[1], front_size[1])
-    scale = min((_WIDTH - margins) / (size[0] + front_size[0]), _HEIGHT / tall)
-    width, height = margins + scale * (size[0] + front_size[0]), _TOP + scale * tall + _BOTTOM
-    figure, views = new_figure(width / _PX_PER_INCH, height / _PX_PER_INCH, columns=2)
-    figure.set_layout_engine("none")
-    start = 0.0
-    for axes, (low, extent), (left, right) in zip(views, boxes, (_SIDE_MARGINS, _FRONT_MARGINS), strict=True):
-        room = left + scale * extent[0] + right
-        axes.set_position((start / width, 0.0, room / width, 1.0))
-        axes.set_xlim(low[0] - left / scale, low[0] + (room - left) / scale)
-        axes.set_ylim(low[1] + (height - _TOP) / scale, low[1] - _TOP / scale)
-        axes.axis("off")
-        start += room
-    px = 1 / scale
-    _draw_side(views[0], side, None if behind is None else behind[0], low=boxes[0][0], high=np.add(*boxes[0]), px=px)
-    _draw_front(views[1], front, None if behind is None else behind[1], right=float(np.add(*boxes[1])[0]), px=px)
-    return Drawing(figure, behind is not None)
+    px = 1 / min(_WIDTH / (size[0] + front_size[0]), _HEIGHT / tall)
+    width = size[0] + front_size[0] + (_LEFT + _BETWEEN + _RIGHT) * px
+    height = tall + (_TOP + _BOTTOM) * px
+    figure, (axes,) = new_figure(width / px / _PX_PER_INCH, height / px / _PX_PER_INCH)
+    left, top = low - (_LEFT * px, _TOP * px)
+    axes.set(xlim=(left, left + width), ylim=(top + height, top), aspect="equal")
+    axes.axis("off")
+    _draw_side(_Pen(axes, px, np.zeros(2)), side, behind_side, low, low + size)
+    shift = np.array([low[0] + size[0] + _BETWEEN * px, low[1]]) - front_low
+    _draw_front(_Pen(axes, px, shift), front, behind_front, right=float(front_low[0] + front_size[0]))
+    return Drawing(figure, other is not None)
 
 
-def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = points.min(axis=0), points.max(axis=0)
-    return low, np.maximum(high - low, 1e-6)
+def _box(*views: SideView | FrontView | None) -> tuple[np.ndarray, np.ndarray]:
+    """Least coordinates and size of all points of views."""
+    points = np.concatenate([view.points() for view in views if view is not None])
+    return points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
 
 
 def _fits(view: SideView | FrontView, other: SideView | FrontView) -> bool:
-    own, both = _box(view.points())[1], _box(np.concatenate([view.points(), other.points()]))[1]
-    return bool((both <= _FITS * own.max()).all())
+    return bool((_box(view, other)[1] <= _FITS * _box(view)[1].max()).all())
 
 
-def _draw_side(
-    axes: Axes, view: SideView, other: SideView | None, *, low: np.ndarray, high: np.ndarray, px: float
-) -> None:
-    """Draw the side view into the box from ``low`` to ``high``; ``px`` is the size of a pixel in mm."""
-    band = [low[0] - 4 * px, high[0] + 4 * px]
-    axes.fill_between(band, view.near_mm, view.far_mm, color="#f1ecd9", linewidth=0)
+@dataclass(frozen=True, eq=False)
+class _Pen:
+    """Draws on axes with points (2,) in mm moved by ``shift``; ``px`` is the size of a pixel in mm."""
+
+    axes: Axes
+    px: float
+    shift: np.ndarray
+
+    def line(self, points: ArrayLike, color: str, linewidth: float, style: str = "-") -> None:
+        """A line through points (N, 2)."""
+        self.axes.plot(*(np.asarray(points) + self.shift).T, style, color=color, linewidth=linewidth, markersize=4.5)
+
+    def area(self, points: np.ndarray, color: str, alpha: float, edge: str = "none") -> None:
+        """A filled outline (N, 2), nothing if a point is not finite."""
+        if len(points) and np.isfinite(points).all():
+            self.axes.fill(*(points + self.shift).T, facecolor=color, edgecolor=edge, alpha=alpha, linewidth=0.8)
+
+    def text(self, at: ArrayLike, words: str, *, turned: float = 0.0, ha: str = "left", halo: bool = False) -> None:
+        """Words beside or about a point."""
+        x, y = np.asarray(at) + self.shift
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8} if halo else None
+        self.axes.text(x, y, words, rotation=turned, ha=ha, va="center", rotation_mode="anchor", bbox=box)
+
+    def behind(self, *lines: np.ndarray) -> None:
+        """Lines of another design."""
+        for line in lines:
+            self.line(line, _BEHIND, 0.8, "--")
+
+    def module(self, module: Module, name: str) -> None:
+        """Housing, window, and name at the housing's back."""
+        self.area(module.housing, "#e6eaef", 0.6, edge="#aab4c0")
+        if module.window is not None:
+            self.area(module.window, _GLASS, 0.4, edge=_GLASS)
+        back = module.housing[:2].mean(axis=0)
+        ahead = module.housing[2:].mean(axis=0) - back
+        place = back + 10 * self.px * ahead / max(np.hypot(*ahead), 1e-9)
+        self.text(place, name, turned=90 - math.degrees(math.atan2(ahead[1], ahead[0])), ha="center")
+
+    def dimension(self, a: tuple[float, float], b: tuple[float, float], words: str = "") -> None:
+        """A dimension with its words along it, or beside its end where it is too short for them."""
+        px, vertical = self.px, a[0] == b[0]
+        self.line([a, b], INK, 0.8)
+        for x, y in (a, b):
+            self.line([(x - 4 * px, y + 4 * px), (x + 4 * px, y - 4 * px)], INK, 1.0)
+        if math.dist(a, b) > (_LETTER_PX * len(words) + 6) * px:
+            place = np.mean([a, b], axis=0) - ((9 * px, 0.0) if vertical else (0.0, 9 * px))
+            self.text(place, words, turned=90.0 * vertical, ha="center", halo=vertical)
+        else:
+            place = (a[0] + 6 * px, (a[1] + b[1]) / 2) if vertical else (max(a[0], b[0]) + 8 * px, a[1])
+            self.text(place, words, halo=vertical)
+
+
+def _draw_side(pen: _Pen, view: SideView, other: SideView | None, low: np.ndarray, high: np.ndarray) -> None:
+    """Draw the side view into the box from ``low`` to ``high``."""
+    px, outer, cross = pen.px, view.outer_mm, float(view.crossing[1])
+    near, far = view.volume[:, 1].tolist()
+    left, right = low[0] - 4 * px, high[0] + 4 * px
+    pen.area(np.array([(left, near), (right, near), (right, far), (left, far)]), "#f1ecd9", 1.0)
     if other is not None:
-        _draw_behind(axes, [*other.edges, other.sheet, _closed(other.camera), _closed(other.laser), other.volume])
-    cone = np.concatenate([view.edges[0], view.edges[1][::-1]])
-    if np.isfinite(cone).all():
-        axes.fill(*cone.T, color=_BLUE, alpha=0.1, linewidth=0)
-    for depth, name in ((view.near_mm, "near"), (view.far_mm, "far")):
-        axes.plot(band, [depth, depth], color="#bda96b", linewidth=0.8)
-        axes.text(high[0] + 8 * px, depth, name, va="center")
-    _draw_module(axes, view.camera, "camera", px)
-    _draw_module(axes, view.laser, "laser", px)
-    axes.plot([0, 0], [0, _BEYOND * view.far_mm], color=SOFT, linewidth=0.8, linestyle="-.")
+        pen.behind(*other.edges, other.sheet, _closed(other.camera), _closed(other.laser), other.volume)
+    pen.area(np.concatenate([view.edges[0], view.edges[1][::-1]]), _BLUE, 0.1)
+    for depth, name in ((near, "near"), (far, "far")):
+        pen.line([(left, depth), (right, depth)], "#bda96b", 0.8)
+        pen.text((high[0] + 8 * px, depth), name)
+    pen.module(view.camera, "camera")
+    pen.module(view.laser, "laser")
+    pen.line([(0, 0), (0, _BEYOND * far)], SOFT, 0.8, "-.")
     for edge in view.edges:
-        axes.plot(*edge.T, color=_BLUE, linewidth=0.9)
-    axes.plot(*view.sheet.T, color=_RED, linewidth=1.0)
-    axes.plot(*view.volume.T, color=_RED, linewidth=1.8, linestyle=":")
+        pen.line(edge, _BLUE, 0.9)
+    pen.line(view.sheet, _RED, 1.0)
+    pen.line(view.volume, _RED, 1.8, ":")
     if view.in_view is not None:
-        axes.plot(*view.in_view.T, color=_RED, linewidth=3.4)
-    axes.plot([-view.pupil_mm / 2, view.pupil_mm / 2], [0, 0], color=INK, linewidth=2.6)
-    axes.plot(*np.stack([view.laser.origin, view.crossing]).T, "o", color=INK, markersize=4.5)
-    _draw_angle(axes, view, px)
-    outer = view.outer_mm
+        pen.line(view.in_view, _RED, 3.4)
+    pen.line([(-view.pupil_mm / 2, 0), (view.pupil_mm / 2, 0)], INK, 2.6)
+    pen.line([view.laser.origin, view.crossing], INK, 0.0, "o")
+    _draw_angle(pen, view)
+
     chain, whole = low[0] - 26 * px, low[0] - 70 * px
-    for depth in (outer, view.crossing[1]):
-        axes.plot([whole, 0], [depth, depth], color=_THIN, linewidth=0.6)
-    _dimension(axes, (chain, outer), (chain, view.near_mm), f"near {number_text(view.near_mm - outer)}", px)
-    depth = number_text(view.far_mm - view.near_mm)
-    _dimension(axes, (chain, view.near_mm), (chain, view.far_mm), f"volume {depth}", px)
-    standoff = number_text(view.crossing[1] - outer)
-    _dimension(axes, (whole, outer), (whole, view.crossing[1]), f"stand-off {standoff}", px)
+    for depth in (outer, cross):
+        pen.line([(whole, depth), (0, depth)], _THIN, 0.6)
+    pen.dimension((chain, outer), (chain, near), f"near {number_text(near - outer)}")
+    pen.dimension((chain, near), (chain, far), f"volume {number_text(far - near)}")
+    pen.dimension((whole, outer), (whole, cross), f"stand-off {number_text(cross - outer)}")
     shown, top = float(view.laser.origin[0]), low[1] - 40 * px
     for x, y in ((0.0, 0.0), view.laser.origin):
-        axes.plot([x, x], [top, y], color=_THIN, linewidth=0.6)
+        pen.line([(x, top), (x, y)], _THIN, 0.6)
     words = f"baseline {number_text(view.baseline_mm)} mm"
     if abs(view.baseline_mm - shown) > 1e-3 * view.baseline_mm:
         # The baseline does not run square to the sheet.
         words = f"{number_text(shown)} mm of the {words}"
-    _dimension(axes, (0.0, top), (shown, top), words, px)
+    pen.dimension((0.0, top), (shown, top), words)
     # A bar of a round length of about a fifth of the picture.
     wanted = 0.2 * (high[0] - low[0])
     decade = 10.0 ** math.floor(math.log10(wanted))
     length = max(step * decade for step in (1, 2, 5) if step * decade <= wanted)
-    bottom = axes.get_ylim()[0] - 16 * px
-    _dimension(axes, (low[0], bottom), (low[0] + length, bottom), "", px)
-    axes.text(low[0] + length + 8 * px, bottom, f"{number_text(length)} mm", va="center")
+    bottom = pen.axes.get_ylim()[0] - 16 * px
+    pen.dimension((low[0], bottom), (low[0] + length, bottom))
+    pen.text((low[0] + length + 8 * px, bottom), f"{number_text(length)} mm")
 
 
-def _draw_front(axes: Axes, view: FrontView, other: FrontView | None, *, right: float, px: float) -> None:
+def _draw_front(pen: _Pen, view: FrontView, other: FrontView | None, *, right: float) -> None:
+    """Draw the front view, with its labels right of ``right``."""
+    px = pen.px
     if other is not None:
-        _draw_behind(axes, [*other.fan, *other.lines, _closed(other.laser)])
-    fan = np.concatenate([view.fan[0], view.fan[1][::-1]])
-    if np.isfinite(fan).all():
-        axes.fill(*fan.T, color=_RED, alpha=0.06, linewidth=0)
-    if len(view.region):
-        axes.fill(*view.region.T, color=_RED, alpha=0.18, linewidth=0)
-    _draw_module(axes, view.laser, "laser", px)
+        pen.behind(*other.fan, *other.lines, _closed(other.laser))
+    pen.area(np.concatenate([view.fan[0], view.fan[1][::-1]]), _RED, 0.06)
+    pen.area(view.region, _RED, 0.18)
+    pen.module(view.laser, "laser")
     for edge in view.fan:
-        axes.plot(*edge.T, color=_RED, linewidth=0.9)
+        pen.line(edge, _RED, 0.9)
     end = max(edge[-1, 1] for edge in view.fan)
     for border in view.borders:
-        shown = np.where((border[:, 1:] <= end) & (border[:, :1] <= right + 8 * px), border, np.nan)
-        axes.plot(*shown.T, color=_BLUE, linewidth=0.9)
-    axes.plot(*view.laser.origin, "o", color=INK, markersize=4.5)
+        pen.line(np.where((border[:, 1:] <= end) & (border[:, :1] <= right + 8 * px), border, np.nan), _BLUE, 0.9)
+    pen.line([view.laser.origin], INK, 0.0, "o")
     for word, line in zip(("near", "middle", "far"), view.lines, strict=True):
-        if not np.isfinite(line).all():
-            continue
-        axes.plot(*line.T, color=_RED, linewidth=2.8)
-        x, y = line.max(axis=0)
-        axes.plot([x, right + 8 * px], [y, y], color=_THIN, linewidth=0.6)
-        axes.text(right + 12 * px, y, f"{word} {number_text(float(np.ptp(line[:, 0])))} mm", va="center")
-
-
-def _draw_behind(axes: Axes, lines: list[np.ndarray]) -> None:
-    for line in lines:
-        axes.plot(*line.T, color=_BEHIND, linewidth=0.8, linestyle="--")
+        if np.isfinite(line).all():
+            pen.line(line, _RED, 2.8)
+            x, y = line.max(axis=0)
+            pen.line([(x, y), (right + 8 * px, y)], _THIN, 0.6)
+            pen.text((right + 12 * px, y), f"{word} {number_text(float(np.ptp(line[:, 0])))} mm")
 
 
 def _closed(module: Module) -> np.ndarray:
     return np.vstack([module.housing, module.housing[:1]])
 
 
-def _draw_module(axes: Axes, module: Module, name: str, px: float) -> None:
-    """Housing, window and name, which stands at the housing's back."""
-    axes.fill(*module.housing.T, facecolor="#e6eaef", edgecolor="#aab4c0", alpha=0.6, linewidth=0.8)
-    if module.window is not None:
-        axes.fill(*module.window.T, facecolor=_GLASS, edgecolor=_GLASS, alpha=0.4, linewidth=0.8)
-    back = module.housing[:2].mean(axis=0)
-    ahead = module.housing[2:].mean(axis=0) - back
-    x, y = back + 10 * px * ahead / max(np.hypot(*ahead), 1e-9)
-    turned = 90 - math.degrees(math.atan2(ahead[1], ahead[0]))
-    axes.text(x, y, name, rotation=turned, ha="center", va="center", rotation_mode="anchor")
-
-
-def _draw_angle(axes: Axes, view: SideView, px: float) -> None:
-    """An arc between the camera's axis and the sheet, above their crossing."""
+def _draw_angle(pen: _Pen, view: SideView) -> None:
+    """Draw an arc between the camera's axis and the sheet, above their crossing."""
+    px = pen.px
     radius = min(74.0 * px, 0.6 * float(view.crossing[1] - view.outer_mm))
     towards = math.copysign(1.0, float(view.sheet[0, 0] - view.sheet[-1, 0]))
 
     def at(angles: np.ndarray | float, r: float) -> np.ndarray:
         return view.crossing + r * np.stack([towards * np.sin(angles), -np.cos(angles)], axis=-1)
 
-    axes.plot(*at(np.linspace(0, view.angle_rad, 60), radius).T, color=INK, linewidth=0.8)
-    narrow = 2 * math.sin(view.angle_rad / 2) * (radius - 16 * px) < 40 * px
-    x, y = at(view.angle_rad, radius + 8 * px) if narrow else at(view.angle_rad / 2, radius - 16 * px)
-    side = ("left" if towards > 0 else "right") if narrow else "center"
-    axes.text(x, y, f"{number_text(math.degrees(view.angle_rad), 3)}°", ha=side, va="center", bbox=_HALO)
-
-
-_HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
-
-
-def _dimension(axes: Axes, a: tuple[float, float], b: tuple[float, float], words: str, px: float) -> None:
-    """A dimension with its words along it, or beside its end where it is too short for them."""
-    axes.plot(*np.stack([a, b]).T, color=INK, linewidth=0.8)
-    for x, y in (a, b):
-        axes.plot([x - 4 * px, x + 4 * px], [y + 4 * px, y - 4 * px], color=INK, linewidth=1.0)
-    vertical = a[0] == b[0]
-    fits = math.dist(a, b) > (_LETTER_PX * len(words) + 6) * px
-    (x, y), turned = np.mean([a, b], axis=0), 90.0 if vertical and fits else 0.0
-    if fits:
-        x, y = (x - 9 * px, y) if vertical else (x, y - 9 * px)
+    pen.line(at(np.linspace(0, view.angle_rad, 60), radius), INK, 0.8)
+    words = f"{number_text(math.degrees(view.angle_rad), 3)}°"
+    if 2 * math.sin(view.angle_rad / 2) * (radius - 16 * px) < 40 * px:
+        pen.text(at(view.angle_rad, radius + 8 * px), words, ha="left" if towards > 0 else "right", halo=True)
     else:
-        x, y = (x + 6 * px, y) if vertical else (max(a[0], b[0]) + 8 * px, y)
-    axes.text(
-        x, y, words, rotation=turned, ha="center" if fits else "left", va="center", bbox=_HALO if vertical else None
-    )
-
-
-_LETTER_PX = 6.7
-"""Mean width of a letter."""
+        pen.text(at(view.angle_rad / 2, radius - 16 * px), words, ha="center", halo=True)

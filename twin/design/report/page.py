@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import plotly.graph_objects as go
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
 import uwlts
 from twin.design.description import Study
 from twin.design.designs import Columns, Marked
 from twin.design.report.charts import (
-    Interactive,
+    Chart,
     Point,
-    Static,
     bars,
     contours,
     curves,
@@ -122,11 +123,11 @@ def page_text(
     )
 
 
-def _interactive(collected: FigureCollector, drawn: Interactive | None) -> InteractiveFigure | None:
+def _interactive(collected: FigureCollector, drawn: Chart[go.Figure] | None) -> InteractiveFigure | None:
     return None if drawn is None else collected.add(drawn.figure, drawn.caption)
 
 
-def _shown(drawn: Static | None) -> tuple[Markup, str] | None:
+def _shown(drawn: Chart[Figure] | None) -> tuple[Markup, str] | None:
     return None if drawn is None else (svg_of(drawn.figure), drawn.caption)
 
 
@@ -150,7 +151,7 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
     return svg_of(drawing.figure), _DRAWN + behind
 
 
-def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> Static | None:
+def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> Chart[Figure] | None:
     """The chart that suits what is free; None where no design works."""
     if not judged.works.any():
         return None

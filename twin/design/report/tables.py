@@ -285,7 +285,7 @@ _FOLLOW = {
 def introduction(judged: Judged) -> list[tuple[str, str]]:
     """What was asked and how many designs were judged, by key words."""
     study, feasible, works = judged.study, int(judged.feasible.sum()), int(judged.works.sum())
-    base = study.base()
+    base = study.sensor
     facts = [
         ("base sensor", f"{base.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
         ("free", "; ".join(_range_text(name, variable) for name, variable in study.free().items())),
