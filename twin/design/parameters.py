@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.polynomial import Chebyshev
-from numpy.typing import ArrayLike
 
 from twin.design.geometry import (
     Array,
@@ -28,7 +27,7 @@ from twin.design.geometry import (
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.model.errors import DescriptionError
 from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Laser, Medium, Sensor, Window
 
 Follow = Literal["focus", "waist", "volume"]
 
@@ -43,8 +42,8 @@ class Parameters:
     """One array of numbers per quantity, all of the same shape or 1; units are part of the names.
 
     ``placed`` is the pose (origin, axis, fan, normal) of lasers that are placed by their axis, NaN for those placed by
-    baseline and angle. ``along_width`` is 1 where the stripe runs along the image's width, else 0. ``fan_nodes_rad``
-    and ``fan_powers`` hold tabulated profiles (relative power per angle; lists of arrays), empty where none has one.
+    baseline and angle. ``distortion`` is k1, k2, k3, p1 and p2. ``along_width`` is 1 where the stripe runs along the
+    image's width, else 0. ``fan_nodes_rad`` and ``fan_powers`` hold tabulated profiles (relative power per angle).
     """
 
     baseline_mm: Array
@@ -56,13 +55,8 @@ class Parameters:
     height_px: Array
     pixel_mm: Array
     focal_mm: Array
-    cx_px: Array
-    cy_px: Array
-    k1: Array
-    k2: Array
-    k3: Array
-    p1: Array
-    p2: Array
+    principal_px: tuple[Array, Array]
+    distortion: tuple[Array, Array, Array, Array, Array]
     f_number: Array
     focus_mm: Array
     window_mounted: Array
@@ -99,7 +93,6 @@ class Parameters:
     offset_e: Array
     prnu: Array
     step_e: Array
-    bits: Array
     exposure_ms: Array
     exposure_level: Array
     longest_ms: Array
@@ -136,8 +129,7 @@ class Parameters:
 
     def lens(self) -> Lens:
         """The camera's lens."""
-        focal = self.focal_mm / self.pixel_mm
-        return Lens(focal, self.cx_px, self.cy_px, self.k1, self.k2, self.k3, self.p1, self.p2)
+        return Lens(self.focal_mm / self.pixel_mm, *self.principal_px, *self.distortion)
 
     def window(self, xp: ModuleType) -> FlatWindow:
         """The camera's window; unmounted one of no thickness in the pupil, with nothing but air behind it."""
@@ -205,32 +197,20 @@ def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> Paramet
 
 def stacked(rows: Sequence[Parameters]) -> Parameters:
     """Parameters of N sensors, each of plain numbers, as arrays (N, 1, 1)."""
-    names = [field.name for field in fields(Parameters) if field.name not in ("placed", "fan_nodes_rad", "fan_powers")]
-    columns = {name: _column([getattr(row, name) for row in rows]) for name in names}
-    placed = np.array([row.placed for row in rows])
-    origin, axis, fan, normal = (_vector([_column(placed[:, i, k]) for k in range(3)]) for i in range(4))
     nodes = max(len(row.fan_nodes_rad) for row in rows)
 
-    def filled(table: Sequence[float]) -> list[float]:
+    def filled(table: tuple[float, ...]) -> tuple[float, ...]:
         # Short tables are filled up with their last node, which adds nothing.
-        return [*table, *[table[-1]] * (nodes - len(table))]
+        return (*table, *table[-1:] * (nodes - len(table)))
 
-    angles = np.array([filled(row.fan_nodes_rad) for row in rows])
-    powers = np.array([filled(row.fan_powers) for row in rows])
-    return Parameters(
-        **columns,
-        placed=(origin, axis, fan, normal),
-        fan_nodes_rad=tuple(map(_column, angles.T)),
-        fan_powers=tuple(map(_column, powers.T)),
-    )
+    full = [replace(row, fan_nodes_rad=filled(row.fan_nodes_rad), fan_powers=filled(row.fan_powers)) for row in rows]
+    return Parameters(**{one.name: _columns([getattr(row, one.name) for row in full]) for one in fields(Parameters)})
 
 
-def _vector(parts: Sequence[Array]) -> Vector:
-    x, y, z = parts
-    return x, y, z
-
-
-def _column(values: ArrayLike) -> np.ndarray:
+def _columns(values: Sequence[Array]) -> Array:
+    """Arrays (N, 1, 1) of N numbers, or of N tuples of numbers in a tuple of the same kind."""
+    if isinstance(values[0], tuple):
+        return tuple(_columns(parts) for parts in zip(*values, strict=True))
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
@@ -253,15 +233,15 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
     glass, laser_glass = (w.index(wavelength) if w.mounted else 1.0 for w in (window, laser.window))
     by_axis = laser.origin_mm is not None
-    placed = [np.full(3, math.nan)] * 4
+    unplaced: Vector = (math.nan, math.nan, math.nan)
+    placed: tuple[Vector, Vector, Vector, Vector] = (unplaced,) * 4
     if by_axis:
         pose = laser_pose(sensor)
-        placed = [pose.origin_mm, pose.axis, pose.fan, pose.normal]
-    origin, axis, fan, normal = (_vector(vector.tolist()) for vector in placed)
+        origin, axis, fan, normal = (tuple(v.tolist()) for v in (pose.origin_mm, pose.axis, pose.fan, pose.normal))
+        placed = origin, axis, fan, normal
     table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
-    cx, cy = camera.principal_point()
     d, angle = camera.distortion, laser.triangulation_angle_deg
     numbers = {
         "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
@@ -272,13 +252,6 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "height_px": camera.height_px,
         "pixel_mm": 1e-3 * camera.pixel_size_um,
         "focal_mm": camera.focal_length_mm,
-        "cx_px": cx,
-        "cy_px": cy,
-        "k1": d.k1,
-        "k2": d.k2,
-        "k3": d.k3,
-        "p1": d.p1,
-        "p2": d.p2,
         "f_number": camera.f_number,
         "focus_mm": camera.focus_distance_mm,
         "window_mounted": float(window.mounted),
@@ -287,7 +260,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "window_tilt_x_rad": math.radians(window.tilt_x_deg),
         "window_tilt_y_rad": math.radians(window.tilt_y_deg),
         "window_index": glass,
-        "window_passes": _passes(glass, index, window.absorption_per_mm() * window.thickness_mm * window.mounted),
+        "window_passes": _passes(window, glass, index),
         "window_aperture_mm": window.aperture_diameter_mm if window.mounted else math.inf,
         "wavelength_mm": 1e-6 * wavelength,
         "power_w": 1e-3 * laser.power_mw,
@@ -302,9 +275,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "laser_window_distance_mm": laser.window.distance_mm * laser.window.mounted,
         "laser_window_thickness_mm": laser.window.thickness_mm * laser.window.mounted,
         "laser_window_index": laser_glass,
-        "laser_window_passes": _passes(
-            laser_glass, index, laser.window.absorption_per_mm() * laser.window.thickness_mm * laser.window.mounted
-        ),
+        "laser_window_passes": _passes(laser.window, laser_glass, index),
         "laser_window_aperture_mm": laser.window.aperture_diameter_mm if laser.window.mounted else math.inf,
         "medium_index": index,
         "extinction_per_mm": medium.extinction_per_mm(wavelength),
@@ -315,16 +286,11 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "offset_e": math.hypot(detector.dsnu_e, detector.dsnu_row_e, detector.dsnu_column_e),
         "prnu": detector.prnu,
         "step_e": 1 / detector.gain_dn_per_e(),
-        "bits": detector.bits,
         "exposure_ms": math.nan if isinstance(exposure.laser_ms, str) else exposure.laser_ms,
         "exposure_level": exposure.auto_level,
         "longest_ms": exposure.longest_ms,
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
-        "speckle_coherence": float(
-            coherence(_DIFFUSE_ROUGHNESS_UM, linewidth_nm=laser.linewidth_nm, wavelength_nm=wavelength, index=index)
-        )
-        if laser.linewidth_nm > 0
-        else 1.0,
+        "speckle_coherence": _coherence(laser, index),
         "stage_resolution_mm": sensor.stage.resolution_mm,
         "near_mm": sensor.volume.near_mm,
         "far_mm": sensor.volume.far_mm,
@@ -332,19 +298,26 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     nodes = _normalised(table) if table else ((0.0, 0.0),)
     return Parameters(
         **{name: float(value) for name, value in numbers.items()},
-        placed=(origin, axis, fan, normal),
+        placed=placed,
+        principal_px=camera.principal_point(),
+        distortion=(d.k1, d.k2, d.k3, d.p1, d.p2),
         fan_nodes_rad=tuple(float(angle) for angle, _ in nodes),
         fan_powers=tuple(float(power) for _, power in nodes),
     )
 
 
-def _passes(glass_index: float, medium_index: float, depth: float) -> float:
+def _coherence(laser: Laser, index: float) -> float:
+    """Speckle contrast that a laser's line width leaves on a diffuse surface."""
+    if laser.linewidth_nm <= 0:
+        return 1.0
+    lines = {"linewidth_nm": laser.linewidth_nm, "wavelength_nm": laser.wavelength_nm}
+    return float(coherence(_DIFFUSE_ROUGHNESS_UM, **lines, index=index))
+
+
+def _passes(window: Window, glass: float, medium: float) -> float:
     """Share of light that passes both faces and the glass, square to them (Fresnel; Beer and Lambert)."""
-    lost = (
-        ((glass_index - 1) / (glass_index + 1)) ** 2,
-        ((glass_index - medium_index) / (glass_index + medium_index)) ** 2,
-    )
-    return (1 - lost[0]) * (1 - lost[1]) * math.exp(-depth)
+    faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - medium) / (glass + medium)) ** 2)
+    return faces * math.exp(-(window.absorption_per_mm() * window.thickness_mm * window.mounted))
 
 
 def _normalised(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:

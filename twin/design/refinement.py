@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -41,6 +40,9 @@ PARAMETER_OF: dict[str, tuple[str, float]] = {
 """Numbers of the description along which figures can be derived, with the parameter and its unit per the path's.
 
 What a window's glass absorbs is taken as it is at the starting point."""
+
+_OF_BASELINE = ("laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg")
+"""Numbers without a meaning for a laser that is placed by its axis."""
 
 _STEPS, _TOLERANCE = 40, 1e-7
 _HALVINGS = 12
@@ -115,13 +117,14 @@ class DerivedFigures:
 
         self._dr, self._float = dr, Float64
         sensor = sensor_of(study, design)
+        by_baseline = sensor.laser.baseline_mm is not None
         self.paths = [
             path
             for path, variable in study.variables.items()
             if path in PARAMETER_OF
             and variable.values is None
             and not variable.whole
-            and _is_placed(path, sensor.laser.baseline_mm)
+            and (by_baseline or path not in _OF_BASELINE)
         ]
         self._figures, self._study = figures, study
         self._parameters = numbers_of(sensor, study.medium_of(sensor))
@@ -190,25 +193,25 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
 
     sign = 1.0 if objective.goal == "minimise" else -1.0
     scale = sign / (abs(at(start).values[0]) or 1.0)
-    limits: list[dict[str, Any]] = []
-    for place, (_, bound) in enumerate(bounds, start=1):
-        for side, limit in ((1.0, bound.least), (-1.0, bound.most)):
-            if limit is not None:
-                size = side / max(abs(limit), 1.0)
-                limits.append(
-                    {
-                        "type": "ineq",
-                        "fun": lambda x, k=place, s=size, b=limit: s * (at(x).values[k] - b),
-                        "jac": lambda x, k=place, s=size: s * at(x).gradient[k] * wide,
-                    }
-                )
+    sides = [
+        (place, side / max(abs(limit), 1.0), limit)
+        for place, (_, bound) in enumerate(bounds, start=1)
+        for side, limit in ((1.0, bound.least), (-1.0, bound.most))
+        if limit is not None
+    ]
+    places, sizes, limits = np.array(sides).reshape(-1, 3).T
+    places = places.astype(int)
     found = minimize(
         lambda x: scale * at(x).values[0],
         start,
         jac=lambda x: scale * at(x).gradient[0] * wide,
         method="SLSQP",
         bounds=[(0.0, 1.0)] * len(start),
-        constraints=limits,
+        constraints={
+            "type": "ineq",
+            "fun": lambda x: sizes * (at(x).values[places] - limits),
+            "jac": lambda x: sizes[:, None] * at(x).gradient[places] * wide,
+        },
         options={"maxiter": _STEPS, "ftol": _TOLERANCE},
     )
     step = np.clip(found.x, 0, 1) - start
@@ -221,12 +224,3 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
             return moved
         step = 0.5 * step
     return None
-
-
-def _is_placed(path: str, baseline_mm: float | None) -> bool:
-    """Whether a number can be derived along: of a laser placed by its axis, neither baseline nor angle nor roll."""
-    return baseline_mm is not None or path not in (
-        "laser.baseline_mm",
-        "laser.triangulation_angle_deg",
-        "laser.roll_deg",
-    )

@@ -12,7 +12,7 @@ import csv
 import json
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,7 +74,6 @@ def read_parts(folder: Path) -> Columns:
     CaptureError
         A part is damaged or foreign.
     """
-    columns: Columns = {}
     tables = []
     for path in parts(folder):
         try:
@@ -84,25 +83,26 @@ def read_parts(folder: Path) -> Columns:
                 f"{path} is damaged: {error}; remove it, and the sweep judges its designs anew"
             ) from error
     if not tables:
-        return columns
+        return {}
     try:
         table = pa.concat_tables(tables, promote_options="permissive")
     except pa.ArrowException as error:
         raise CaptureError(f"the parts in {folder} are not of one study: {error}") from error
-    numbers = table.column("design").to_numpy()
-    _, first = np.unique(numbers, return_index=True)
-    for name in table.column_names:
-        columns[name] = table.column(name).to_numpy(zero_copy_only=False)[first]
-    return columns
+    columns = _columns(table)
+    _, first = np.unique(columns["design"], return_index=True)
+    return {name: column[first] for name, column in columns.items()}
 
 
-def write_csv(path: Path, columns: Columns, *, names: Iterable[str] | None = None) -> None:
+def _columns(table: pa.Table) -> Columns:
+    return {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+
+
+def write_csv(path: Path, columns: Columns) -> None:
     """Write columns as CSV, replacing an older file."""
-    chosen = list(columns if names is None else names)
     with written_aside(path, overwrite=True) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(chosen)
-        writer.writerows(zip(*(columns[name].tolist() for name in chosen), strict=True))
+        writer.writerow(columns)
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
 
 
 def made_folder(folder: Path) -> Path:
@@ -252,8 +252,7 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
         for batch, result in workers.completed(judged_part, batches):
             content = _content(batch, result)
             write_part(place, batch.first, content)
-            table = pq.read_table(pa.BufferReader(content))
-            search.report({name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names})
+            search.report(_columns(pq.read_table(pa.BufferReader(content))))
             done += batch.count
             progress(done, total)
 

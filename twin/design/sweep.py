@@ -20,11 +20,12 @@ import tomli_w
 from twin.design.choice import choose
 from twin.design.description import Study, Value, load_study
 from twin.design.designs import Columns, Marked
-from twin.design.report.page import write_study_page
+from twin.design.report.page import page_text
 from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
 from twin.design.verification import Agreement, Candidate, render
 from twin.options import CPU
 from uwlts.model.errors import DescriptionError
+from uwlts.report.page_toolkit import write_page
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import open_workers
 from uwlts.storage.files import written_aside
@@ -175,7 +176,8 @@ def sweep(
             candidates = [Candidate(one.label, one.design.number, one.sensor) for one in rendered]
             agreements = render(described, folder / RENDERED, candidates, pool, variant=variant, progress=progress)
     result = SweepResult(described, folder, columns, chosen.marked, tuple(agreements), chosen.notes)
-    write_study_page(folder / PAGE, described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
+    page = page_text(described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
+    write_page(folder / PAGE, page, overwrite=True)
     write_summary(result)
     return result
 

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -69,7 +68,22 @@ class CalibrationFigures:
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """Depths, points, scatter, error and line length of a measured plane, as in `Rendered`."""
+    """What a sensor measures of a plane square to the laser's axis, at K depths.
+
+    Attributes
+    ----------
+    z_mm : (K,)
+        True Z of the plane in the OCS, ascending.
+    points : (K,) int
+        Points found at each depth, including outliers.
+    scatter_mm, error_mm : (K,)
+        Along Z: standard deviation of the points about the profile's own quadratic trend (the random part), and their
+        mean deviation from the true plane (the systematic part, with the error of the calibrated OCS's origin, which
+        moves all depths alike). Outliers, farther from the trend than five robust standard deviations, are left out.
+        NaN where fewer than 20 points were found.
+    line_mm : (K,)
+        Length along Y over which points were found, without outliers; 0 where there are fewer than 20.
+    """
 
     z_mm: np.ndarray
     points: np.ndarray
@@ -80,27 +94,7 @@ class Profiles:
 
 @dataclass(frozen=True, eq=False)
 class Rendered(Profiles):
-    """What a rendered sensor measures of a plane square to the laser's axis, at K depths.
-
-    Attributes
-    ----------
-    z_mm : (K,)
-        True Z of the plane in the OCS, ascending.
-    points : (K,) int
-        Points found at each depth, outliers among them.
-    scatter_mm, error_mm : (K,)
-        Along Z: standard deviation of the points about the profile's own quadratic trend, which is the random part,
-        and their mean deviation from the true plane, which is the systematic part. The origin of the calibrated OCS
-        counts: where it is off, all depths are off alike. Points farther from the trend than five robust standard
-        deviations are left out of both. NaN where fewer than 20 points were found.
-    line_mm : (K,)
-        Length along Y over which points were found, outliers left out; 0 where there are fewer than 20.
-    exposure_ms : float
-        That of the plane's images.
-    calibration : CalibrationFigures
-    seconds : dict
-        Time taken to ``render``, ``calibrate`` and ``measure``.
-    """
+    """Profiles of a rendered sensor, exposure of the plane's images, and seconds to render, calibrate and measure."""
 
     exposure_ms: float
     calibration: CalibrationFigures
@@ -142,14 +136,16 @@ def verify(
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     planned = recordings(sensor, medium, reflectance=reflectance)
     calibration, cloud = folder / "calibration.json", folder / "standard.ply"
+    made_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         calibration.unlink(missing_ok=True)  # one of an earlier run must not pass for this one's
     except OSError as error:
-        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+        raise OutputError(f"cannot replace {calibration}: {error.strerror}") from error
+    # Noise must differ between recordings: each has a seed of its own.
+    seeds = [int(np.random.SeedSequence([seed, k]).generate_state(1)[0]) for k in range(len(planned.all()))]
     jobs = [
-        _Job(recording, _capture(folder, recording), Options(spp=spp, seed=_seed_of(seed, number)), variant)
-        for number, recording in enumerate(planned.all())
+        _Job(recording, _capture(folder, recording), Options(spp=spp, seed=one), variant)
+        for recording, one in zip(planned.all(), seeds, strict=True)
     ]
     seconds: dict[str, float] = {}
     try:
@@ -168,8 +164,16 @@ def verify(
             profiles = _judged(_points(cloud), stage)
     finally:
         if not keep:
-            _remove([path for job in jobs for path in job.files()] + [cloud])
+            for path in (cloud, *(path for job in jobs for path in job.files())):
+                path.unlink(missing_ok=True)
     return Rendered(**vars(profiles), exposure_ms=exposure, calibration=_figures(calibration), seconds=seconds)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    begun = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - begun
 
 
 # --- the twin's part --------------------------------------------------------------------------------------------------
@@ -193,12 +197,7 @@ def _capture(folder: Path, recording: Recording) -> Path:
     return folder / f"{recording.name}.h5"
 
 
-def _seed_of(seed: int, number: int) -> int:
-    """Seed of one of several recordings, whose noise must not be the same."""
-    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-
-
-def _record(job: _Job, tell: Callable[[Any], None]) -> None:
+def _record(job: _Job, report: Callable[[object], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
 
@@ -293,19 +292,7 @@ def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
     return float(np.sqrt(residuals @ residuals / (len(y) - 3))), float(z.mean()), float(np.ptp(y))
 
 
-# --- small things -----------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    begun = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - begun
-
-
-def _remove(paths: list[Path]) -> None:
-    for path in paths:
-        path.unlink(missing_ok=True)
+# --- candidates of a study ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -334,7 +321,7 @@ class Agreement:
 
     ``ratio`` is the root mean square over all points of the rendered scatter over that of the predicted one, or its
     inverse if that is larger; they agree up to the study's tolerance. What the software or the renderer refuses stands
-    in ``failure``; the depths are empty then. Values read from files may be None where they are NaN.
+    in ``failure``; the depths are empty then.
     """
 
     label: str

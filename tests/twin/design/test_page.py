@@ -18,7 +18,7 @@ from twin.design.figures import FIGURES, figures_of
 from twin.design.parameters import parameters_of
 from twin.design.report.charts import Point, bars, curves, map_of, parallel_chart, pareto_chart, sample, trade_off
 from twin.design.report.drawing import views_of
-from twin.design.report.page import page_text, write_study_page
+from twin.design.report.page import page_text
 from twin.design.report.tables import (
     FIGURE_NAMES,
     Judged,
@@ -34,6 +34,7 @@ from twin.design.report.tables import (
 from twin.design.verification import Agreement
 from uwlts.model.errors import DesignError, EvaluationError, RangeError
 from uwlts.model.sensor import Sensor
+from uwlts.report.page_toolkit import write_page
 
 STUDY = load_study("baseline-angle")
 BASE = STUDY.sensor
@@ -455,7 +456,8 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     rows = [verification(), bad]
     path = tmp_path / "report.html"
     path.write_text("older")
-    write_study_page(path, study, columns, marked=marked, agreements=rows, notes=["A note & more."])
+    written = page_text(study, columns, marked=marked, agreements=rows, notes=["A note & more."])
+    write_page(path, written, overwrite=True)
     raw = path.read_text(encoding="utf-8")
     page = Page(raw)
     assert not page.open

@@ -426,10 +426,8 @@ def verification_chart(found: Agreement) -> Chart[Figure] | None:
     if not found.z_mm:
         return None
     figure, (scatter, error) = new_figure(9.6, 3.2, columns=2)
-    z, predicted, rendered, off = (
-        np.array([math.nan if value is None else value for value in values])
-        for values in (found.z_mm, found.predicted_mm, found.rendered_mm, found.error_mm)
-    )
+    z, *values = (np.array(values) for values in (found.z_mm, found.predicted_mm, found.rendered_mm, found.error_mm))
+    predicted, rendered, off = values
     scatter.plot(z, 1e3 * predicted, "o--", markersize=4, label="predicted by formulas")
     scatter.plot(z, 1e3 * rendered, "o-", color=RED, markersize=4, label="rendered and measured")
     error.plot(z, 1e3 * off, "o-", color=INK, markersize=4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from contextlib import suppress
 
 import plotly.graph_objects as go
 from markupsafe import Markup
@@ -35,7 +35,7 @@ from twin.design.report.tables import (
 )
 from twin.design.verification import Agreement
 from uwlts.model.errors import Error
-from uwlts.report.page_toolkit import FigureCollector, InteractiveFigure, render_page, svg_of, write_page
+from uwlts.report.page_toolkit import FigureCollector, InteractiveFigure, render_page, svg_of
 
 _BEST = 20
 """Designs in the table of the best."""
@@ -47,42 +47,6 @@ _DRAWN = (
 )
 
 
-def write_study_page(
-    path: Path,
-    study: Study,
-    columns: Columns,
-    *,
-    marked: Sequence[Marked],
-    agreements: Sequence[Agreement],
-    notes: Sequence[str] = (),
-) -> None:
-    """Write the page of a study, whole or not at all, replacing an older one.
-
-    Parameters
-    ----------
-    path
-        The file.
-    study
-        The study.
-    columns
-        All judged designs, as `twin.design.screening.read_parts` gives them; empty where there are none.
-    marked
-        Designs to point out, the chosen one last.
-    agreements
-        What was rendered.
-    notes
-        Sentences for the page's head.
-
-    Raises
-    ------
-    EvaluationError
-        The columns are of another study.
-    OutputError
-        The file cannot be written.
-    """
-    write_page(path, page_text(study, columns, marked=marked, agreements=agreements, notes=notes), overwrite=True)
-
-
 def page_text(
     study: Study,
     columns: Columns,
@@ -91,9 +55,29 @@ def page_text(
     agreements: Sequence[Agreement],
     notes: Sequence[str] = (),
 ) -> str:
-    """The page as text; arguments and errors as `write_study_page`."""
+    """The page of a study as HTML.
+
+    Parameters
+    ----------
+    study
+        The study.
+    columns
+        All judged designs, as `twin.design.screening.read_parts` gives them; empty where there are none.
+    marked
+        Designs to point out, the chosen one last.
+    agreements
+        Comparison of formulas and rendering of each rendered design.
+    notes
+        Sentences for the page's head.
+
+    Raises
+    ------
+    EvaluationError
+        The columns are of another study.
+    """
     judged, collected = Judged(study, columns), FigureCollector()
     points = [Point(one.label, one.design.table(), number, one is marked[-1]) for number, one in enumerate(marked)]
+    over_free_title, over_free = _over_what_is_free(judged, points)
     chosen = None
     if marked:
         compared = None if len(marked) == 1 else (marked[0].label, marked[0].design.table())
@@ -108,8 +92,8 @@ def page_text(
         label=marked[-1].label if marked else "",
         chosen=chosen,
         drawing=_drawing(study, marked),
-        over_free=_shown(_over_what_is_free(judged, points)),
-        over_free_title=_over_free_title(study),
+        over_free=over_free,
+        over_free_title=over_free_title,
         pareto=_interactive(collected, pareto_chart(judged, points)),
         parallel=_interactive(collected, parallel_chart(judged)),
         nothing=_nothing(judged),
@@ -142,34 +126,23 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
         return None, f"The design cannot be drawn: {error}."
     other = None
     if base is not chosen:
-        try:
+        with suppress(Error):
             other = views_of(base.sensor, study.medium_of(base.sensor))
-        except Error:
-            other = None
     drawing = draw(*views, other)
     behind = f" Dashed grey behind: {base.label}." if drawing.with_other else ""
     return svg_of(drawing.figure), _DRAWN + behind
 
 
-def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> Chart[Figure] | None:
-    """The chart that suits what is free; None where no design works."""
-    if not judged.works.any():
-        return None
-    ranges = _ranges(judged.study)
+def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> tuple[str, tuple[Markup, str] | None]:
+    """Title of the chart that suits what is free, and the chart; None where no design works."""
+    ranges = [name for name, variable in judged.study.variables.items() if variable.values is None]
+    works = judged.works.any()
     if len(ranges) >= 2:
-        return contours(judged, points, ranges[0], ranges[1])
-    return curves(judged, points, ranges[0]) if ranges else bars(judged)
-
-
-def _ranges(study: Study) -> list[str]:
-    return [name for name, variable in study.variables.items() if variable.values is None]
-
-
-def _over_free_title(study: Study) -> str:
-    ranges = _ranges(study)
-    if len(ranges) >= 2:
-        return f"Figures over {words_of(ranges[0])} and {words_of(ranges[1])}"
-    return f"Figures over {words_of(ranges[0])}" if ranges else "Figures of the choices"
+        title = f"Figures over {words_of(ranges[0])} and {words_of(ranges[1])}"
+        return title, _shown(contours(judged, points, ranges[0], ranges[1]) if works else None)
+    if ranges:
+        return f"Figures over {words_of(ranges[0])}", _shown(curves(judged, points, ranges[0]) if works else None)
+    return "Figures of the choices", _shown(bars(judged) if works else None)
 
 
 def _nothing(judged: Judged) -> str:

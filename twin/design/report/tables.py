@@ -307,6 +307,9 @@ def _range_text(name: str, variable: Variable) -> str:
     return f"{words_of(name)} from {value_text(name, variable.least)} to {value_text(name, variable.most)}{scale}"
 
 
+_ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
+
+
 def tiles(
     study: Study, sensor: Sensor, row: Mapping[str, Value], *, compared: tuple[str, Mapping[str, Value]] | None
 ) -> list[Tile]:
@@ -327,21 +330,13 @@ def tiles(
     found = [tile(name, accent=True) for name in study.free()]
     objectives = [objective.figure for objective in study.objectives]
     found += [tile(name, accent=True, note="an objective") for name in objectives]
-    others = [
-        "sigma_z_near_mm",
-        "sigma_z_middle_mm",
-        "sigma_z_far_mm",
-        "line_mm",
-        "depth_mm",
-        "standoff_mm",
-        *study.constraints,
-    ]
+    others = [*_ALWAYS_SHOWN, *study.constraints]
     found += [tile(name) for name in dict.fromkeys(others) if name not in objectives]
     required, used = (_number(row, name) for name in ("required_ms", "exposure_ms"))
     darker = f"the wanted brightness takes {value_text('required_ms', required)}" if required > 1.001 * used else ""
-    shown = {*objectives, *others}
-    found += [tile("exposure_ms", note=darker)] if "exposure_ms" not in shown else []
-    found += [tile("laser_class", note="estimate, IEC 60825-1")] if "laser_class" not in shown else []
+    for name, note in (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1")):
+        if name not in (*objectives, *others):
+            found.append(tile(name, note=note))
     return found + ([_window_tile(study, sensor, row)] if "window_mm" not in objectives else [])
 
 
@@ -371,37 +366,26 @@ def agreement_text(study: Study, found: Agreement) -> str:
             f"Formulas and rendering agree: their scatters differ by a factor {factor}, up to "
             f"{number_text(study.verify_tolerance, 3)} is allowed."
         )
-    worst = _worst(found)
-    if factor == MISSING or worst is None:
+    predicted, rendered = np.array(found.predicted_mm, float), np.array(found.rendered_mm, float)
+    with np.errstate(all="ignore"):
+        off = np.abs(np.log(rendered / predicted))
+    if factor == MISSING or not np.isfinite(off).any():
         return "Formulas and rendering could not be compared: rendering found no scatter at any depth."
-    z, predicted, rendered = worst
+    worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
     return (
         f"Formulas and rendering disagree by a factor {factor}, more than the {number_text(study.verify_tolerance, 3)} "
-        f"allowed: most at Z = {number_text(z)} mm, where {number_text(1e3 * predicted)} µm were predicted and "
-        f"{number_text(1e3 * rendered)} µm rendered. Do not rely on the formulas for designs like this one."
+        f"allowed: most at Z = {number_text(found.z_mm[worst])} mm, where "
+        f"{number_text(1e3 * predicted[worst])} µm were predicted and {number_text(1e3 * rendered[worst])} µm "
+        "rendered. Do not rely on the formulas for designs like this one."
     )
-
-
-def _worst(found: Agreement) -> tuple[float, float, float] | None:
-    """Z, predicted and rendered scatter where they differ most; None where nothing can be compared."""
-    triples = [
-        (z, predicted, rendered)
-        for z, predicted, rendered in zip(found.z_mm, found.predicted_mm, found.rendered_mm, strict=True)
-        if _positive(predicted) and _positive(rendered)
-    ]
-    return max(triples, key=lambda one: abs(math.log(one[2] / one[1])), default=None)
-
-
-def _positive(value: float | None) -> bool:
-    return value is not None and math.isfinite(value) and value > 0
 
 
 def agreement_rows(agreements: Sequence[Agreement]) -> list[list[str]]:
     """Rows of the table of what was rendered."""
     rows = []
     for found in agreements:
-        errors = [abs(value) for value in found.error_mm if value is not None and math.isfinite(value)]
-        lines = [value for value in found.line_mm if value is not None and math.isfinite(value)]
+        errors = [abs(value) for value in found.error_mm if math.isfinite(value)]
+        lines = found.line_mm
         rows.append(
             [
                 found.label,
