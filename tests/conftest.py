@@ -28,6 +28,7 @@ SERVING = {
 }
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Several processes share the tests by file, as fixtures are made once for a file."""
     for item in items:
