@@ -27,7 +27,7 @@ demo: setup
 
 test: check
 	@$(PYTHON) -m twin.devices.aravis_install
-	@$(PYTHON) -m pytest -q -n 2 --dist loadgroup --durations=10
+	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --durations=10
 
 check: setup
 	@$(PYTHON) -m ruff format --check --quiet .

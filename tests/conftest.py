@@ -1,6 +1,10 @@
 """Chooses Mitsuba's variant before any test module imports the renderer, and loads the sensor most tests start from."""
 
+import fcntl
 import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -28,11 +32,15 @@ SERVING = {
 }
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Several processes share the tests by file, as fixtures are made once for a file."""
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("serving" if item.path.name in SERVING else str(item.path)))
+@pytest.fixture(scope="module", autouse=True)
+def serving_alone(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Let only one of several test processes serve cameras and pages."""
+    if request.path.name not in SERVING:
+        yield
+        return
+    with open(Path(tempfile.gettempdir()) / "uwlts-tests-serving.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 @pytest.fixture(scope="session")

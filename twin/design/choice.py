@@ -142,4 +142,4 @@ def _cost(values: np.ndarray, goal: str) -> np.ndarray:
 
 def _design(columns: Columns, place: int) -> Design:
     found = row_of(columns, place)
-    return Design(found.number, found.values)
+    return Design(found.number, {name: value for name, value in found.values.items() if value is not None})

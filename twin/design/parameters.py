@@ -234,11 +234,10 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     glass, laser_glass = (w.index(wavelength) if w.mounted else 1.0 for w in (window, laser.window))
     by_axis = laser.origin_mm is not None
     unplaced: Vector = (math.nan, math.nan, math.nan)
-    placed: tuple[Vector, Vector, Vector, Vector] = (unplaced,) * 4
+    placed = unplaced, unplaced, unplaced, unplaced
     if by_axis:
         pose = laser_pose(sensor)
-        origin, axis, fan, normal = (tuple(v.tolist()) for v in (pose.origin_mm, pose.axis, pose.fan, pose.normal))
-        placed = origin, axis, fan, normal
+        placed = _vector(pose.origin_mm), _vector(pose.axis), _vector(pose.fan), _vector(pose.normal)
     table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
@@ -306,12 +305,20 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     )
 
 
+def _vector(values: np.ndarray) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 def _coherence(laser: Laser, index: float) -> float:
     """Speckle contrast that a laser's line width leaves on a diffuse surface."""
     if laser.linewidth_nm <= 0:
         return 1.0
-    lines = {"linewidth_nm": laser.linewidth_nm, "wavelength_nm": laser.wavelength_nm}
-    return float(coherence(_DIFFUSE_ROUGHNESS_UM, **lines, index=index))
+    return float(
+        coherence(
+            _DIFFUSE_ROUGHNESS_UM, linewidth_nm=laser.linewidth_nm, wavelength_nm=laser.wavelength_nm, index=index
+        )
+    )
 
 
 def _passes(window: Window, glass: float, medium: float) -> float:

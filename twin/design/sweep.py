@@ -92,7 +92,7 @@ class SweepResult:
         return [*lines, f"wrote {self.folder / PAGE}, {TABLE}, {SUMMARY} and {WINNER}"]
 
 
-def _short(value: Value) -> str:
+def _short(value: Value | None) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 

@@ -182,7 +182,8 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             return _mesh(thing, pose, bsdf)
         case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
-            matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
+            half_width, half_height = (last - first) / 2
+            matrix = _FACING_SENSOR @ _scaled(half_width, half_height, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
         case Mesh() | Head() | Weld():

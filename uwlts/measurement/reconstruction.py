@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.measurement.point_uncertainty import point_uncertainty
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
@@ -145,7 +147,7 @@ def reconstruct_stripes(
             "sensor": calibration.sensor_name,
             "medium": capture.header.medium_name,
             "medium_index": index,
-            "artefact": capture.header.artefact,
+            "artefact": cast(JsonValue, capture.header.artefact),  # read from JSON or TOML
             "calibration": calibration_digest(calibration),
         },
         stripe=sharp[good],

@@ -214,9 +214,11 @@ class Calibration(Description):
 
 
 def figures_of(residuals: dict[str, JsonValue], step: str) -> dict[str, JsonValue]:
-    """Figures of a step among residuals; none where there are none of it."""
-    figures = residuals.get(step)
-    return figures if isinstance(figures, dict) else {}
+    """Figures of a step among residuals; none where there are none of it. ValueError where they are no table."""
+    figures = residuals.get(step, {})
+    if not isinstance(figures, dict):
+        raise ValueError(f"the residuals of the {step} are {figures!r}; expected a table")
+    return figures
 
 
 def require_plain_json(residuals: dict[str, JsonValue], provenance: dict[str, JsonValue]) -> None:

@@ -144,15 +144,19 @@ def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
     if camera.coefficients().any():
-        outside = x * x + y * y >= _largest_square(camera.distortion)
+        outside = x * x + y * y >= _largest_square(*_all(camera.distortion))
         x, y = _distorted(camera.distortion, x, y)
         x[outside] = np.nan
         y[outside] = np.nan
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
+def _all(d: Distortion) -> tuple[float, float, float, float, float]:
+    return d.k1, d.k2, d.p1, d.p2, d.k3
+
+
 @lru_cache(maxsize=16)
-def _largest_square(d: Distortion) -> float:
+def _largest_square(k1: float, k2: float, p1: float, p2: float, k3: float) -> float:
     """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it.
 
     The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
@@ -161,9 +165,9 @@ def _largest_square(d: Distortion) -> float:
     first reaches 6 r |(p1, p2)|, which is the exact edge for a barrel. Solved for 1 / r, as then the polynomials lead
     with 1; an edge farther than `_WIDEST` is none.
     """
-    tangential = 6.0 * math.hypot(d.p1, d.p2)
-    across = np.roots([1.0, -tangential, d.k1, 0.0, d.k2, 0.0, d.k3])
-    along = np.roots([1.0, -tangential, 3.0 * d.k1, 0.0, 5.0 * d.k2, 0.0, 7.0 * d.k3])
+    tangential = 6.0 * math.hypot(p1, p2)
+    across = np.roots([1.0, -tangential, k1, 0.0, k2, 0.0, k3])
+    along = np.roots([1.0, -tangential, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3])
     roots = np.concatenate([across, along])
     ends = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / _WIDEST)]
     return float(ends.max() ** -2) if len(ends) else math.inf
@@ -211,7 +215,7 @@ def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple
             if found.all():
                 break
             x, y = x + x_step, y + y_step
-        found &= x * x + y * y < _largest_square(d)
+        found &= x * x + y * y < _largest_square(*_all(d))
     if not found.all():
         hard = np.flatnonzero(~found)
         x[hard], y[hard] = _undistorted_with_care(d, x_seen[hard], y_seen[hard])
@@ -223,7 +227,7 @@ def _undistorted_with_care(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray
 
     As the Jacobian is positive definite in the domain, Newton's direction always helps if the step is short enough.
     """
-    largest, allowed = _largest_square(d), _allowed(x_seen, y_seen)
+    largest, allowed = _largest_square(*_all(d)), _allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
     x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):

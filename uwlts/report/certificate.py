@@ -292,19 +292,24 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
         return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
-    figures = calibration.residuals
-    std = figures.get("camera", {}).get("std", {})
+    std = calibration.figures("camera").get("std")
+    known = std if isinstance(std, dict) else {}
     names = ("f",) if camera.fx_px == camera.fy_px else ("fx", "fy")
     values = {"f": camera.fx_px, "fx": camera.fx_px, "fy": camera.fy_px, "cx": camera.cx_px, "cy": camera.cy_px}
     values |= camera.distortion.model_dump()
     shown = [*names, "cx", "cy", *(name for name, value in camera.distortion.model_dump().items() if value)]
-    rows = [_row(parameter_of(name), values[name], std.get(name), None) for name in shown]
+    rows = [_row(parameter_of(name), values[name], _number(known.get(name)), None) for name in shown]
     if window is not None:
-        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, figures.get("window", {}).get("std_mm"), None))
+        distance_std = _number(calibration.figures("window").get("std_mm"))
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, distance_std, None))
         if window.refractions == 2:
             rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm, None, None))
             rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index, None, None))
     return tuple(rows)
+
+
+def _number(value: JsonValue) -> float | None:
+    return value if isinstance(value, int | float) else None
 
 
 def _row(key: ParameterKey, value: float, std: float | None, before: float | None) -> ParameterRow:
@@ -320,14 +325,15 @@ def _row(key: ParameterKey, value: float, std: float | None, before: float | Non
 
 
 def _sequential(shared: _Shared, calibration: Calibration) -> SequentialCertificate:
-    figures, window = calibration.residuals, calibration.window
+    window = calibration.window
+    shown = ("rms_px", "rms_mm", "max_mm", "images")
     rms = {
         step: {
-            key: value
-            for key, value in table.items()
-            if key in ("rms_px", "rms_mm", "max_mm", "images") and not isinstance(value, list)
+            key: number
+            for key, value in calibration.figures(step).items()
+            if key in shown and (number := _number(value)) is not None
         }
-        for step, table in figures.items()
+        for step in calibration.residuals
     }
     return SequentialCertificate(
         **shared,

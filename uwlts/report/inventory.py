@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.measurement.evaluation_file import FORMAT as EVALUATION_FORMAT
 from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
@@ -239,8 +240,11 @@ def calibration_lines(calibration: Calibration) -> list[str]:
     }
     for step, (name, unit) in figures.items():
         value = calibration.figures(step).get(name)
-        if isinstance(value, (int, float)):
-            lines.append(f"{step} residual: {value:.4f} {unit}" if step != "window" else f"window: {value:.3f} {unit}")
+        if value is not None:
+            number = _number(value)
+            lines.append(
+                f"window: {number:.3f} {unit}" if step == "window" else f"{step} residual: {number:.4f} {unit}"
+            )
     return lines + _joint_lines(calibration.joint)
 
 
@@ -269,9 +273,15 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
     ]
     for name, what in (("depth", "Z(position)"), ("along", "Y(Z)"), ("map", "target's points on the plate")):
         value = calibration.figures(name).get("rms_mm")
-        if isinstance(value, (int, float)):
-            lines.append(f"{what}: residual {value:.4f} mm (rms)")
+        if value is not None:
+            lines.append(f"{what}: residual {_number(value):.4f} mm (rms)")
     return lines
+
+
+def _number(value: JsonValue) -> float:
+    if not isinstance(value, int | float):
+        raise ValueError(f"{value!r}")
+    return value
 
 
 def evaluation_lines(record: EvaluationRecord) -> list[str]:

@@ -359,6 +359,11 @@ def _read_hdf5(path: Path) -> PointCloud:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
     known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
     try:
-        return PointCloud(*(arrays[name] for name in _PER_POINT), arrays.get("deviation_mm"), known, header.metadata)
+        return PointCloud(
+            **{name: arrays[name] for name in _PER_POINT},
+            deviation_mm=arrays.get("deviation_mm"),
+            uncertainty=known,
+            metadata=header.metadata,
+        )
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error

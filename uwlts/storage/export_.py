@@ -123,8 +123,9 @@ def export_capture(
 
 def _row(name: str, frame: Frame) -> dict[str, str | float]:
     light = "laser" if frame.laser_on else "lamp"
-    row = dict(zip(_COLUMNS, (name, light, frame.stage_mm, frame.exposure_ms, frame.time_s), strict=True))
-    return row if frame.pose is None else row | dict(zip(POSE_COLUMNS, frame.pose.ravel().tolist(), strict=True))
+    pose = [] if frame.pose is None else frame.pose.ravel().tolist()
+    values = (name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *pose)
+    return dict(zip((*_COLUMNS, *POSE_COLUMNS)[: len(values)], values, strict=True))
 
 
 CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")

@@ -139,7 +139,10 @@ def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
         ).points_mm
         y_mm, z_mm = np.round(points[:, 1:], 4).T.tolist()
         lines[name] = PolynomialLine(number, np.round(centres, 3).tolist(), y_mm, z_mm)
-    return PolynomialCurves(lines, calibration.figures("depth")["rms_mm"])
+    rms = calibration.figures("depth")["rms_mm"]
+    if not isinstance(rms, int | float):
+        raise CaptureError(f"the polynomials' residual is {rms!r}; expected a number of mm: calibrate again")
+    return PolynomialCurves(lines, rms)
 
 
 def _budget(

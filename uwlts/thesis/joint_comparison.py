@@ -239,8 +239,9 @@ def _rows(part: MediumSummary) -> list[_Row]:
     for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
         sizes = {method: np.abs(errors) for method, errors in errors_mm.items()}
         rows += [
-            _Row(quantity, _WORDS[method], size.mean(), size.max(), size.mean() / sizes["joint"].mean(), len(size))
-            for method, size in sizes.items()
+            _Row(quantity, words, size.mean(), size.max(), size.mean() / sizes["joint"].mean(), len(size))
+            for method, words in _WORDS.items()
+            if (size := sizes.get(method)) is not None
         ]
     return rows
 

@@ -116,7 +116,7 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
     lighting = _mounted(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
     lens = Lens.of(camera)
-    reach = _reach(sensor, p, (start - pose.origin_mm) @ pose.fan)
+    reach = _reach(sensor, p, float((start - pose.origin_mm) @ pose.fan))
     near, far = outer + reach.depths_mm[[0, -1]]
     reached = np.isfinite(reach.low_mm)
 

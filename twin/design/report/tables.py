@@ -258,7 +258,7 @@ def bound_text(name: str, sign: int, bound: float) -> str:
     return f"{words_of(name)} {'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
 
 
-def misses(study: Study, row: Mapping[str, Value]) -> list[str]:
+def misses(study: Study, row: Mapping[str, Value | None]) -> list[str]:
     """Which constraints a design misses, in words."""
     found = []
     for name, sign, bound in bounds_of(study):
@@ -311,7 +311,11 @@ _ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line
 
 
 def tiles(
-    study: Study, sensor: Sensor, row: Mapping[str, Value], *, compared: tuple[str, Mapping[str, Value]] | None
+    study: Study,
+    sensor: Sensor,
+    row: Mapping[str, Value | None],
+    *,
+    compared: tuple[str, Mapping[str, Value | None]] | None,
 ) -> list[Tile]:
     """What is free, what is wanted, and what else decides, of a design; beside that of another one (label, row)."""
     missed = {text.split(" is ")[0]: text for text in misses(study, row)}
@@ -340,13 +344,13 @@ def tiles(
     return found + ([_window_tile(study, sensor, row)] if "window_mm" not in objectives else [])
 
 
-def _number(row: Mapping[str, Value], name: str) -> float:
+def _number(row: Mapping[str, Value | None], name: str) -> float:
     """A number of a row, NaN where it is missing."""
     value = row.get(name)
     return math.nan if value is None or isinstance(value, str) else value
 
 
-def _window_tile(study: Study, sensor: Sensor, row: Mapping[str, Value]) -> Tile:
+def _window_tile(study: Study, sensor: Sensor, row: Mapping[str, Value | None]) -> Tile:
     """The window's thickness and the one it needs."""
     window, needed = sensor.camera.window, _number(row, "window_mm")
     if not window.mounted:

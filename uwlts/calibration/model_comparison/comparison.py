@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from uwlts.calibration.evidence import Progress as Searched
 from uwlts.calibration.joint.evidence import TargetEvidence
@@ -19,6 +19,8 @@ from uwlts.optics.window import require_index
 from uwlts.runtime.workers import Tell, work_through
 from uwlts.storage.capture import Capture, opened_captures
 from uwlts.stripe import StripeOptions
+
+Level = TypeVar("Level")
 
 Progress = Callable[[int, int], None]
 _Captures = Sequence[Capture | str | Path]
@@ -88,7 +90,7 @@ class Choice:
         good = [e for e in judged if all(self.no_worse(e.candidate, best.candidate, where) for where in self.ways)]
         return best, good
 
-    def level(self, name: str, levels: Sequence[object]) -> object:
+    def level(self, name: str, levels: Sequence[Level]) -> Level:
         """Of the ways in which one thing can be modelled, the simplest that is as good as the best of them."""
         alternatives = [replace(Candidate(), **{name: value}) for value in levels]
         _, good = self.good_among([e for e in self.judged if e.scores and e.candidate in alternatives])

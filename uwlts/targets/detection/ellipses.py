@@ -200,8 +200,14 @@ class Ellipses:
         return len(self.centres)
 
     def __getitem__(self, select):
-        arrays = (self.centres, self.shapes, self.residual_px, self.contrast, self.sharpness)
-        return Ellipses(*(values[select] for values in arrays), self.bright)
+        return Ellipses(
+            self.centres[select],
+            self.shapes[select],
+            self.residual_px[select],
+            self.contrast[select],
+            self.sharpness[select],
+            self.bright,
+        )
 
 
 def fit_ellipses(image, blobs):
