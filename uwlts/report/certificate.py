@@ -327,7 +327,7 @@ def _row(key: ParameterKey, value: float, std: float | None, before: float | Non
 def _sequential(shared: _Shared, calibration: Calibration) -> SequentialCertificate:
     window = calibration.window
     shown = ("rms_px", "rms_mm", "max_mm", "images")
-    rms = {
+    rms: dict[str, dict[str, JsonValue]] = {
         step: {
             key: number
             for key, value in calibration.figures(step).items()

@@ -95,7 +95,7 @@ class Point:
     """A marked design: its label, its values by name, its number among the marked ones, and whether it is chosen."""
 
     label: str
-    values: Mapping[str, Value]
+    values: Mapping[str, Value | None]
     number: int
     chosen: bool
 
