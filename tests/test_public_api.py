@@ -50,7 +50,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts doctor": ("uwlts.examine", set(), set()),
     "twin simulate": ("twin.simulate", set(), {"show_progress"}),
     "twin demo": ("twin.demo", set(), set()),
-    "twin sweep": ("twin.sweep", set(), set()),
+    "twin sweep": ("twin.sweep", set(), {"show_progress"}),
     # The evaluation is uwlts.evaluate_thesis, in a process of its own.
     "twin reproduce": ("twin.reproduce", set(), {"show_progress"}),
 }

@@ -209,4 +209,4 @@ def _line_profile(folder: CampaignFolder, side: str) -> LineProfile | None:
         header = capture.header
         scan = reconstruct(capture, nominal_calibration(header.sensor, header.medium))
     points = scan.points_mm[:, 1:]
-    return LineProfile(float(np.ptp(points[:, 0])), np.round(points[::4], 3).tolist())
+    return LineProfile(float(np.ptp(points[:, 0])), [(x, y) for x, y in np.round(points[::4], 3).tolist()])

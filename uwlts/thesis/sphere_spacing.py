@@ -144,7 +144,7 @@ def window_choices(
         window = nominal.model_copy(update={"distance_mm": share * nominal.distance_mm})
         profile = step_profile(calibration, window, shown.pixels, medium_index=shown.medium_index)
         seen = profile[np.isfinite(profile).all(axis=1)][::4]
-        profiles.append(WindowProfile(window.distance_mm, np.round(seen, 4).tolist()))
+        profiles.append(WindowProfile(window.distance_mm, [(y, z) for y, z in np.round(seen, 4).tolist()]))
     return choices, profiles
 
 

@@ -145,7 +145,7 @@ def test_an_image_that_fits_no_distance_has_none():
 def test_unusable_steps_are_refused():
     with pytest.raises(CalibrationError, match="at least one"):
         solve_window(AIR, PLATE, [])
-    with pytest.raises(EvaluationError, match="no two parallel treads"):
+    with pytest.raises(EvaluationError, match="no two parallel step faces"):
         steps(PLATE, [np.column_stack([np.zeros(400), np.linspace(-60, 60, 400), np.full(400, 10.0)])])
     good = steps(PLATE, nine_steps()[3:4])[0]
     with pytest.raises(RangeError, match="finite"):

@@ -139,7 +139,7 @@ def rigid(rotation: np.ndarray, last=(0.0, 0.0, 0.0, 1.0)) -> list[list[float]]:
         ({"sheet__normal": [0.6, 0.6, 0.6]}, "the sheet's normal"),
         ({"sheet__offset_mm": math.nan}, "sheet.offset_mm"),
         ({"stripe_along": "diagonal"}, "stripe_along"),
-        ({"residuals": {"camera": {"rms_px": math.nan}}}, "finite numbers"),
+        ({"residuals": {"camera": {"rms_px": math.nan}}}, "finite number"),
         ({"colour": "red"}, "colour"),
         ({"camera_from_object": rigid(1.001 * TURN)}, "rigid"),
         ({"camera_from_object": rigid(TURN + 1e-5)}, "rigid"),

@@ -96,11 +96,11 @@ def test_every_choice_of_images_finds_the_window(study, scans):
 
 def test_profiles_are_a_step_at_four_distances(study):
     profiles = study[1]
-    shares = [profile["distance_mm"] / DISTANCE_MM for profile in profiles]
+    shares = [profile.distance_mm / DISTANCE_MM for profile in profiles]
     assert shares == pytest.approx([0.25, 0.5, 1.0, 1.5])
     heights = []
     for profile in profiles:
-        points = np.array(profile["points_mm"])
+        points = np.array(profile.points_mm)
         assert points.ndim == 2 and len(points) > 80 and np.isfinite(points).all()
         # The first image at the stand-off: a block 60 mm wide about Y = -8 mm, tilted by 0.01 rad.
         y, z = (points @ [[1.0, -0.01], [0.01, 1.0]]).T
@@ -109,7 +109,7 @@ def test_profiles_are_a_step_at_four_distances(study):
         heights.append(np.median(z[beside]) - np.median(z[on_block]))
     # The true one at the true distance, too high before and too low behind it or the other way round: 0.02 mm per mm.
     assert heights[2] == pytest.approx(STEP_MM, abs=0.05)
-    slopes = np.diff(heights) / np.diff([profile["distance_mm"] for profile in profiles])
+    slopes = np.diff(heights) / np.diff([profile.distance_mm for profile in profiles])
     assert np.abs(slopes) == pytest.approx([0.02] * 3, rel=0.25)
     assert len(set(np.sign(slopes))) == 1
 
