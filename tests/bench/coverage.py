@@ -72,7 +72,7 @@ class Outcome:
     figures_s: float
 
 
-def run_campaign(campaign: Campaign, tell: Any = None) -> Outcome:
+def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
     """Calibrate, scan spheres at one of three places in turn, measure them; CalibrationError as `solve_jointly`."""
     described = load_sensor("thesis")
     real = drawn_reality(described, np.random.default_rng(campaign.seed))

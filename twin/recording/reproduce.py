@@ -180,7 +180,7 @@ def record_campaigns(
         progress(done, total)
 
     # The longest first, so that no process is left alone with a long one at the end.
-    work_through(_record, sorted(waiting, key=_Job.images, reverse=True), workers=workers, heard=count)
+    work_through(_record, sorted(waiting, key=_Job.images, reverse=True), workers=workers, on_message=count)
     return folders
 
 

@@ -21,13 +21,14 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.model.errors import Error, SetupError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-Tell = Callable[[Any], None]
+Send = Callable[[Any], None]
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
@@ -98,27 +99,21 @@ def open_workers(
         return
     processors = _processors()
     count = workers or processors
-    pool = _Processes(count, threads=max(1, processors // count))
-    try:
+    with _Processes(count, threads=max(1, processors // count)) as pool:
         yield pool
-    except BaseException:
-        pool.close(at_once=True)
-        raise
-    finally:
-        pool.close()
 
 
 def work_through(
-    work: Callable[[Job, Tell], Result],
+    work: Callable[[Job, Send], Result],
     jobs: Sequence[Job],
     *,
     workers: int | None = None,
-    heard: Tell = lambda message: None,
+    on_message: Send = lambda message: None,
 ) -> list[Result]:
-    """Results of ``work(job, tell)`` for all jobs, in their order, from several processes.
+    """Results of ``work(job, send)`` for all jobs, in their order, from several processes.
 
-    Jobs are begun in their order. What a job passes to ``tell`` is passed to ``heard`` in this process. When an
-    exception leaves this function, KeyboardInterrupt stops the jobs that are under way, and no process is left.
+    Jobs are begun in their order. A job's messages, passed to ``send``, are passed to ``on_message`` in this process.
+    When an exception leaves this function, KeyboardInterrupt stops the jobs that are under way, and no process is left.
     ``workers`` is the number of processes, one per processor unless given; with 1, jobs run in this process. Each
     process does linear algebra in one thread, unless the environment sets another number.
 
@@ -130,16 +125,13 @@ def work_through(
         A process has ended before its job.
     """
     if workers == 1:
-        return [work(job, heard) for job in jobs]
+        return [work(job, on_message) for job in jobs]
     results: dict[int, Result] = {}
-    pool = _Processes(max(1, min(len(jobs), workers or _processors())), threads=1)
-    try:
-        for number, _, result in pool.run(work, jobs, heard):
+    with _Processes(max(1, min(len(jobs), workers or _processors())), threads=1) as pool:
+        for number, _, result in pool.run(work, jobs, on_message):
             if isinstance(result, Lost):
                 raise SetupError(result.reason)
             results[number] = result
-    finally:
-        pool.close(at_once=len(results) < len(jobs))
     return [results[number] for number in range(len(jobs))]
 
 
@@ -148,11 +140,24 @@ def _processors() -> int:
 
 
 class _Processes(Workers):
-    """Processes of this machine, started when the first jobs come."""
+    """Processes of this machine, started when the first jobs come.
+
+    The context ends them, by KeyboardInterrupt if an exception leaves it; after a while they are killed.
+    """
 
     def __init__(self, count: int, *, threads: int):
         self.count, self._threads = count, threads
         self._processes: list[_Process] = []
+
+    def __enter__(self) -> "_Processes":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        for process in self._processes:
+            process.stop(at_once=kind is not None)
+        deadline = time.monotonic() + _GRACE_S
+        for process in self._processes:
+            process.end(deadline)
 
     def processes_for(self, jobs: int) -> int:
         """More than one where there are more processes than jobs."""
@@ -173,7 +178,7 @@ class _Processes(Workers):
             yield from ((job, result) for _, _, result in self.run(silent, [job]))
 
     def run(
-        self, work: Callable[[Job, Tell], Result], jobs: Iterable[Job], heard: Tell = lambda message: None
+        self, work: Callable[[Job, Send], Result], jobs: Iterable[Job], on_message: Send = lambda message: None
     ) -> Iterator[tuple[int, Job, Result | Lost]]:
         """Number, job and result of each job as it is done."""
         waiting = enumerate(jobs)
@@ -187,7 +192,10 @@ class _Processes(Workers):
                 except StopIteration:
                     more = False
                     break
-                process = idle.popleft() if idle else self._started()
+                if not idle:
+                    idle.append(_Process(self._threads))
+                    self._processes.append(idle[-1])
+                process = idle.popleft()
                 busy[process.connection] = process, number, job
                 process.give(work, job)
             # Without a connection `wait` would wait for ever.
@@ -195,7 +203,7 @@ class _Processes(Workers):
                 process, number, job = busy[connection]
                 match process.message():
                     case ("message", message):
-                        heard(message)
+                        on_message(message)
                         continue
                     case ("raised", error):
                         raise error
@@ -209,22 +217,8 @@ class _Processes(Workers):
                 del busy[connection]
                 yield number, job, result
 
-    def close(self, *, at_once: bool = False) -> None:
-        """End the processes, by KeyboardInterrupt where it is to be at once; after a while they are killed."""
-        for process in self._processes:
-            process.stop(at_once=at_once)
-        deadline = time.monotonic() + _GRACE_S
-        for process in self._processes:
-            process.end(deadline)
-        self._processes.clear()
 
-    def _started(self) -> "_Process":
-        process = _Process(self._threads)
-        self._processes.append(process)
-        return process
-
-
-def _without_messages(function: Callable[[Job], Result], job: Job, tell: Tell) -> Result:
+def _without_messages(function: Callable[[Job], Result], job: Job, send: Send) -> Result:
     return function(job)
 
 
@@ -236,12 +230,11 @@ class _Process:
         self.connection, theirs = context.Pipe()
         # Not a daemon, which could start no processes of its own; it watches its parent itself.
         self._process = context.Process(target=_serve, args=(theirs,))
-        with _interrupts_held(), _limited_threads(threads):
-            self._process.start()
+        _start(self._process, threads)
         theirs.close()
-        self._work: Callable[[Any, Tell], Any] | None = None
+        self._work: Callable[[Any, Send], Any] | None = None
 
-    def give(self, work: Callable[[Any, Tell], Any], job: Any) -> None:
+    def give(self, work: Callable[[Any, Send], Any], job: Any) -> None:
         """Hand over a job, and what to do with it where that is new."""
         # If the process has ended, `message` reports it.
         with suppress(BrokenPipeError):
@@ -280,37 +273,28 @@ class _Process:
         self.connection.close()
 
 
-@contextmanager
-def _limited_threads(threads: int) -> Iterator[None]:
-    """Processes started meanwhile do linear algebra in so many threads, unless the environment says otherwise.
+def _start(process: BaseProcess, threads: int) -> None:
+    """Start a process that does linear algebra in so many threads, unless the environment says otherwise.
 
     With a thread for each processor in each of as many processes they wait for each other: two joint calibrations at a
-    time took 17 to 25 s instead of 6 to 8 s on two processors.
+    time took 17 to 25 s instead of 6 to 8 s on two processors. SIGINT is blocked meanwhile, so that the process never
+    receives Ctrl-C, which the command alone handles.
     """
     given = {name: os.environ[name] for name in _THREADS if name in os.environ}
-    os.environ.update(dict.fromkeys(_THREADS, str(threads)) | given)
-    try:
-        yield
-    finally:
-        for name in _THREADS:
-            if name not in given:
-                del os.environ[name]
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Block SIGINT: a process that is started meanwhile never receives Ctrl-C, which the command alone handles."""
     # Starting Python's tracker of shared resources would let interrupts through again.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.environ.update(dict.fromkeys(_THREADS, str(threads)) | given)
     try:
-        yield
+        process.start()
     finally:
+        for name in set(_THREADS) - set(given):
+            del os.environ[name]
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(connection: Connection) -> None:
-    """What a process does: one job after the other, until there are no more or it is stopped."""
+    """Do one job after the other in a process, until there are no more or it is stopped."""
     stopped = threading.Event()
 
     def stop(*_: object) -> None:
@@ -324,7 +308,7 @@ def _serve(connection: Connection) -> None:
         except BrokenPipeError:
             stop()
 
-    work: Callable[[Any, Tell], Any] | None = None
+    work: Callable[[Any, Send], Any] | None = None
     try:
         signal.signal(signal.SIGTERM, stop)
         threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -358,9 +342,8 @@ def _end_with_parent() -> None:
 class _Cluster(Workers):
     """Workers of a Dask cluster, which does jobs of lost workers again by itself."""
 
-    def __init__(self, client: Any, count: int, killed: type[Exception]):
-        self.count, self._killed = count, killed
-        self._executor = client.get_executor(pure=False)
+    def __init__(self, executor: Any, count: int, killed: type[Exception]):
+        self._executor, self.count, self._killed = executor, count, killed
 
     def processes_for(self, jobs: int) -> int:
         """One: a worker of a cluster may not start processes."""
@@ -390,10 +373,6 @@ class _Cluster(Workers):
                 else:
                     yield job, result
 
-    def close(self) -> None:
-        """Leave the cluster; what waits is not begun."""
-        self._executor.shutdown(wait=False)
-
 
 @contextmanager
 def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
@@ -410,8 +389,9 @@ def _cluster(address: str, patience_s: float) -> Iterator[_Cluster]:
         count = sum(client.nthreads().values())
         if count == 0:
             raise SetupError(f"the scheduler at {address} has no workers: start some with 'dask worker {address}'")
-        cluster = _Cluster(client, count, KilledWorker)
+        executor = client.get_executor(pure=False)
         try:
-            yield cluster
+            yield _Cluster(executor, count, KilledWorker)
         finally:
-            cluster.close()
+            # What waits is not begun.
+            executor.shutdown(wait=False)

@@ -103,16 +103,16 @@ def _measured(
         partial(_measure, calibrated, clouds),
         scans,
         workers=workers,
-        heard=lambda _: progress("measurements", next(numbers), len(scans)),
+        on_message=lambda _: progress("measurements", next(numbers), len(scans)),
     )
     return list(chain.from_iterable(found))
 
 
 def _measure(
-    calibrated: dict[tuple[str, str], AnyCalibration], clouds: Path, scan: ScanFile, tell: Callable[[None], None]
+    calibrated: dict[tuple[str, str], AnyCalibration], clouds: Path, scan: ScanFile, send: Callable[[None], None]
 ) -> list[Measurement]:
     found = measure_scan(scan, calibrated, clouds=clouds)
-    tell(None)
+    send(None)
     return found
 
 

@@ -23,7 +23,7 @@ from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.optics.design import nominal_setup, speckle_limit_um
 from uwlts.report.page_toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
-from uwlts.runtime.workers import Tell, work_through
+from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import json_text, written_aside
@@ -86,24 +86,24 @@ def compare_campaigns(
     """
     total, done = sum(len(_compared(folder)) for folder in folders), 0
 
-    def heard(_: None) -> None:
+    def on_message(_: None) -> None:
         nonlocal done
         done += 1
         progress(done, total)
 
-    return work_through(partial(_compare, again), folders, workers=workers, heard=heard)
+    return work_through(partial(_compare, again), folders, workers=workers, on_message=on_message)
 
 
 def _compared(folder: CampaignFolder) -> list[ScanFile]:
     return [scan for scan in folder.scans() if scan.thing in ("spheres", "plane")]
 
 
-def _compare(again: bool, folder: CampaignFolder, tell: Tell) -> JointResults:
-    """Results of a campaign; ``tell`` is called for every scan."""
+def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
+    """Results of a campaign; ``send`` is called for every scan."""
     path = folder.path / RESULTS
     if not again and up_to_date(path):
         for _ in _compared(folder):
-            tell(None)
+            send(None)
         return JointResults.read(path)
     sequential = calibrations(folder)
     joint, solve_s = joint_calibration(folder)
@@ -114,7 +114,7 @@ def _compare(again: bool, folder: CampaignFolder, tell: Tell) -> JointResults:
             spheres.append(_of_spheres(scan, {"joint": joint, "one_refraction": one, "two_refractions": two}))
         else:
             planes.append(_of_plane(scan, joint))
-        tell(None)
+        send(None)
     return JointResults(campaign=folder.path.name, solve_s=solve_s, spheres=spheres, planes=planes).keep(path)
 
 

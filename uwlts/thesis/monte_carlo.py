@@ -106,7 +106,7 @@ def propagate(
         partial(_trial, draw, scans, options, start, seed),
         range(trials),
         workers=workers,
-        heard=lambda _: progress(next(numbers), trials),
+        on_message=lambda _: progress(next(numbers), trials),
     )
     spacing = np.array([errors for errors in made if errors is not None])
     if trials - len(spacing) > trials // 10:
@@ -124,10 +124,10 @@ def _trial(
     start: CalibrationResult,
     seed: int,
     number: int,
-    tell: Callable[[None], None],
+    send: Callable[[None], None],
 ) -> list[float] | None:
     """Sphere spacing errors of one trial; None where its inputs give no calibration or no spheres."""
-    tell(None)
+    send(None)
     try:
         return _errors(draw, scans, options, start, np.random.default_rng([seed, number]))
     except (CalibrationError, EvaluationError):

@@ -18,40 +18,40 @@ from uwlts.runtime.workers import work_through
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def square(number, tell):
-    tell((number, os.getpid()))
+def square(number, send):
+    send((number, os.getpid()))
     time.sleep(0.02 * (number % 3))
     return number * number
 
 
-def fail(error, job, tell):
+def fail(error, job, send):
     if job == 1:
         raise error
     time.sleep(60)
 
 
-def end(how, job, tell):
+def end(how, job, send):
     os._exit(how) if how >= 0 else os.kill(os.getpid(), -how)
 
 
-def linger(folder, job, tell):
+def linger(folder, job, send):
     """Say so and wait; leave a mark when stopped."""
     try:
         (folder / f"{job}.begun").touch()
-        tell(job)
+        send(job)
         time.sleep(60)
     finally:
         (folder / f"{job}.stopped").touch()
 
 
-def hold_on(job, tell):
+def hold_on(job, send):
     """Wait whatever anybody says."""
-    tell(job)
+    send(job)
     while True:
         try:
             time.sleep(60)
         except KeyboardInterrupt:
-            tell("no")
+            send("no")
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +62,7 @@ def no_process_is_left():
 
 def test_results_come_in_the_order_of_the_jobs():
     heard = []
-    assert work_through(square, range(20), workers=3, heard=heard.append) == [n * n for n in range(20)]
+    assert work_through(square, range(20), workers=3, on_message=heard.append) == [n * n for n in range(20)]
     assert sorted(number for number, _ in heard) == list(range(20))
     processes = {process for _, process in heard}
     assert len(processes) == 3
@@ -72,7 +72,7 @@ def test_results_come_in_the_order_of_the_jobs():
 def test_fewer_jobs_than_processes():
     assert work_through(square, [], workers=4) == []
     heard = []
-    assert work_through(square, [3], workers=4, heard=heard.append) == [9]
+    assert work_through(square, [3], workers=4, on_message=heard.append) == [9]
     assert len(heard) == 1
 
 
@@ -107,7 +107,7 @@ def test_an_interrupt_stops_what_is_under_way_and_begins_nothing_more(tmp_path: 
 
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        work_through(partial(linger, tmp_path), range(9), workers=2, heard=interrupted)
+        work_through(partial(linger, tmp_path), range(9), workers=2, on_message=interrupted)
     assert time.monotonic() - start < 30
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.begun", "0.stopped", "1.begun", "1.stopped"]
     assert capfd.readouterr() == ("", "")
@@ -120,7 +120,7 @@ def test_what_does_not_end_is_killed(monkeypatch):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        work_through(hold_on, [0], heard=interrupted)
+        work_through(hold_on, [0], on_message=interrupted)
 
 
 @pytest.mark.parametrize("how", ["interrupt of all", "interrupt of the command", "kill"])
@@ -156,7 +156,7 @@ def test_processes_end_with_their_command(tmp_path: Path, how: str):
     assert len(list(tmp_path.glob("*.begun"))) == len(list(tmp_path.glob("*.stopped")))
 
 
-def threads(job, tell):
+def threads(job, send):
     return os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("OMP_NUM_THREADS")
 
 

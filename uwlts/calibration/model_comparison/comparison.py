@@ -16,7 +16,7 @@ from uwlts.calibration.polynomial_evidence import common_header
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.optics.window import require_index
-from uwlts.runtime.workers import Tell, work_through
+from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, opened_captures
 from uwlts.stripe import StripeOptions
 
@@ -133,13 +133,13 @@ def _predicted(
     """For each model its predictions by the way of holding out, or why there are none."""
     done = 0
 
-    def heard(message: object) -> None:
+    def on_message(message: object) -> None:
         nonlocal done
         done += 1
         progress(done)
 
     jobs = [(problem, candidate, way) for candidate in candidates for way in ways]
-    results = work_through(_work, jobs, workers=workers, heard=heard)
+    results = work_through(_work, jobs, workers=workers, on_message=on_message)
     found: dict[Candidate, dict[str, Prediction] | str] = {}
     for place, candidate in enumerate(candidates):
         own = results[place * len(ways) : (place + 1) * len(ways)]
@@ -149,13 +149,13 @@ def _predicted(
     return found
 
 
-def _work(job: tuple[JointProblem, Candidate, Split], tell: Tell) -> Prediction | str:
+def _work(job: tuple[JointProblem, Candidate, Split], send: Send) -> Prediction | str:
     try:
         return predict(*job)
     except CalibrationError as error:
         return str(error)
     finally:
-        tell(None)
+        send(None)
 
 
 def choice_of(found: dict[Candidate, dict[str, Prediction] | str], ways: Sequence[Split]) -> Choice:
