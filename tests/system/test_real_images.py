@@ -1,8 +1,6 @@
-"""Photographs that nobody of this project made, of the Ciclop scanner and of dots, and what the software makes of them.
+"""Import, target detection and stripe extraction on real images that others took (tests/data/README.md)."""
 
-They lie beside the project where their licence leaves them, and are not part of it.
-"""
-
+import re
 from pathlib import Path
 
 import cv2
@@ -15,10 +13,11 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
+from uwlts.targets import ChessboardTarget
 from uwlts.targets.detection import detect_lattice
 
-PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "shared" / "real" / "ciclop"
-pytestmark = pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason=f"the real images are not here: {PHOTOGRAPHS}")
+DATA = Path(__file__).resolve().parents[1] / "data"
+CICLOP_SIZE = (1280, 960)
 
 # The lens's image distance is only nominal.
 SENSOR = """
@@ -33,18 +32,31 @@ name = "ciclop"
 camera = { width_px = 960, height_px = 1280, pixel_size_um = 3.0, focal_length_mm = 4.3, stripe_along = "height", \
 window = { mounted = false } }
 """
+LASER_AND_BACKGROUND = 'laser = "laser.png"\nbackground = "laser-background.png"' + SENSOR
 
 
-def imported(tmp_path: Path, folder: str, told: str, *, tables: str = "") -> Capture:
-    description = tmp_path / "told.toml"
-    description.write_text(told + SENSOR + tables)
-    import_images(PHOTOGRAPHS / folder, tmp_path / "real.h5", description=description)
+def whole(cut_out: Path) -> np.ndarray:
+    """The cut-out at its place in an image of the Ciclop's full size, its rim continued outwards."""
+    x, y = map(int, re.search(r"_x(\d+)_y(\d+)", cut_out.name).groups())
+    image = cv2.imread(str(cut_out))
+    height, width = image.shape[:2]
+    below, right = CICLOP_SIZE[0] - y - height, CICLOP_SIZE[1] - x - width
+    return cv2.copyMakeBorder(image, y, below, x, right, cv2.BORDER_REPLICATE)
+
+
+def imported(tmp_path: Path, folder: str, description: str) -> Capture:
+    images = tmp_path / folder
+    images.mkdir()
+    for cut_out in sorted((DATA / "ciclop" / folder).iterdir()):
+        cv2.imwrite(str(images / f"{cut_out.name.split('_')[0]}.png"), whole(cut_out))
+    (tmp_path / "import.toml").write_text(description)
+    import_images(images, tmp_path / "real.h5", description=tmp_path / "import.toml")
     return Capture(tmp_path / "real.h5")
 
 
 def test_the_chessboard_gives_the_authors_camera(tmp_path: Path):
     target = '[target]\nkind = "chessboard"\ncolumns = 11\nrows = 6\nsquare_mm = 13.0\n'
-    with imported(tmp_path, "chessboard", 'lamp = "frame*.jpg"', tables=target) as capture:
+    with imported(tmp_path, "chessboard", 'lamp = "frame*.png"' + SENSOR + target) as capture:
         found = air_evidence([capture])
     assert len(found.images) == 16
     camera = solve_camera(
@@ -66,12 +78,11 @@ def test_the_chessboard_gives_the_authors_camera(tmp_path: Path):
 
 
 def test_the_stripe_runs_over_the_bust(tmp_path: Path):
-    told = 'laser = "laser.png"\nbackground = "laser_background.png"\n'
-    with imported(tmp_path, "bust", told) as capture:
+    with imported(tmp_path, "bust", LASER_AND_BACKGROUND) as capture:
         image, saturation = capture.image(0), capture.header.saturation_dn
     stripe = extract_stripe(image, stripe_along="height", saturation=saturation)
     lit, dark = (
-        cv2.imread(str(PHOTOGRAPHS / "bust" / name))[:, :, 2] for name in ("laser.png", "laser_background.png")
+        whole(DATA / "ciclop" / "bust" / f"{name}_x400_y0.png")[:, :, 2] for name in ("laser", "laser-background")
     )
     # By eye the line reaches from row 54 to 1118, hidden behind the chin and the collar.
     good = stripe.lines[(stripe.lines >= 54) & (stripe.lines <= 1118)]
@@ -84,8 +95,7 @@ def test_the_stripe_runs_over_the_bust(tmp_path: Path):
 
 @pytest.mark.parametrize(("peak", "column"), [(PeakRule.FIRST, 275), (PeakRule.LAST, 590)])
 def test_either_of_two_lines_on_the_board_is_straight(tmp_path: Path, peak: PeakRule, column: float):
-    told = 'laser = "laser-0*.png"\nbackground = "laser-background*.png"\n'
-    with imported(tmp_path, "board", told) as capture:
+    with imported(tmp_path, "board", LASER_AND_BACKGROUND) as capture:
         image, saturation = capture.image(0), capture.header.saturation_dn
     stripe = extract_stripe(image, stripe_along="height", options=StripeOptions(peak=peak), saturation=saturation)
     # The board fills the rows from 465 to 1000.
@@ -108,7 +118,7 @@ def test_either_of_two_lines_on_the_board_is_straight(tmp_path: Path, peak: Peak
     [("01", 6400, {98, 69}, 0.05), ("02", 1300, {41, 35}, 0.8), ("05", 4300, {85, 52}, 0.05)],
 )
 def test_dots_under_strong_distortion_are_numbered(number, points, columns_rows, residual_px):
-    image = cv2.imread(str(PHOTOGRAPHS.parent / "dot-patterns" / f"dot_pattern_{number}.jpg"), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(DATA / "dot-patterns" / f"dot_pattern_{number}.jpg"), cv2.IMREAD_GRAYSCALE)
     found = detect_lattice(image)
     assert len(found.indices) > points and set((np.ptp(found.indices, axis=0) + 1).tolist()) == columns_rows
     # A wrong number is a whole spacing off a smooth map of the numbers to the image, that is 25 px and more.
@@ -118,3 +128,15 @@ def test_dots_under_strong_distortion_are_numbered(number, points, columns_rows,
     centres = found.circles.centres
     away = np.linalg.norm(centres - terms @ np.linalg.lstsq(terms, centres, rcond=None)[0], axis=1)
     assert np.sqrt(np.mean(away**2)) < residual_px and away.max() < 2
+
+
+@pytest.mark.parametrize("frame", ["frame0014", "frame0016"])
+def test_a_board_beside_a_saturated_stripe_is_found(frame: str):
+    image = cv2.imread(str(DATA / "etna" / f"{frame}.png"), cv2.IMREAD_GRAYSCALE)
+    view = ChessboardTarget(columns=7, rows=6, square_mm=10.0).detect(image)
+    assert len(view.pixels) == 42
+    # The lens's distortion leaves less than half a pixel of a flat board's homography; a corner that is not one lies a
+    # good part of a square (80 to 110 px) away.
+    flat = cv2.findHomography(view.points_mm[:, :2], view.pixels)[0]
+    away = cv2.perspectiveTransform(view.points_mm[:, None, :2], flat)[:, 0] - view.pixels
+    assert np.sqrt(np.mean(away**2)) < 1.0 and np.linalg.norm(away, axis=1).max() < 3.0
