@@ -1,20 +1,26 @@
-"""The ``twin`` command: renders virtual recordings."""
+"""The ``twin`` command: renders virtual recordings.
 
+Most commands are functions of `twin` on the command line: parameters, defaults and descriptions are the functions' own.
+"""
+
+import inspect
+import re
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import or_
 from pathlib import Path
-from typing import Annotated, Literal
+from types import NoneType
+from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type_hints
 
 from cyclopts import App, Parameter
 
 import twin
 import uwlts
-from twin.options import CPU, use_variant
-from twin.recording.demonstration import FOLDER
-from twin.recording.recording import choose_options, choose_scene, choose_sensors
+from twin.options import CPU
 from twin.scene.campaign import campaign_names
 from twin.scene.description import load_scene, scene_names
-from uwlts.model.errors import DescriptionError
 from uwlts.model.library import names
 from uwlts.model.waters import WATERS
 from uwlts.runtime.console import run
@@ -25,236 +31,91 @@ app = App(
     version=uwlts.__version__,
     help_format="plaintext",
 )
+_SHOWING = ("show_progress", "report")
+"""Parameters of functions by which commands show their progress."""
 
 
-@app.command
-def simulate(
-    scene: str,
-    *,
-    sensor: str = "thesis",
-    out: Path,
-    as_built: str | None = None,
-    placement: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    medium: str | None = None,
-    spp: int = 16,
-    seed: int = 0,
-    water: float | str | None = None,
-    without: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    ideal: Annotated[bool, Parameter(negative="")] = False,
-    resume: Annotated[bool, Parameter(negative="")] = False,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
-    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
-) -> None:
-    """Render a scene into a capture, with the ground truth in a file beside it.
+def _command(function: Callable[..., object]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register what is decorated as a command with the parameters and the description of a function."""
+    hints, described = get_type_hints(function), _descriptions(function)
+    taken = {name: one for name, one in inspect.signature(function).parameters.items() if name not in _SHOWING}
+    kinds = {name: _typed(hints[name], described[name]) for name in taken}
 
-    Example: twin simulate spheres --sensor thesis --placement far --out spheres-far.h5
+    def register(command: Callable[..., None]) -> Callable[..., None]:
+        command.__doc__ = _sections(function)[0].replace("`", "") + f"{inspect.getdoc(command)}"
+        command.__annotations__ = {**kinds, "return": None}
+        parameters = [one.replace(annotation=kinds[name]) for name, one in taken.items()]
+        cast(Any, command).__signature__ = inspect.Signature(parameters, return_annotation=None)
+        app.command(command)
+        return command
 
-    Parameters
-    ----------
-    scene
-        Name of a scene (see: twin scenes) or path of its TOML file.
-    sensor
-        Name or path of the sensor description that the capture states.
-    out
-        Capture to write, such as capture.h5; the truth goes to capture.truth.h5. With several placements the name
-        holds {placement}.
-    as_built
-        Name or path of the sensor that is really rendered, if it differs from the description.
-    placement
-        Named place of the objects, such as near, standoff or far; several are recorded one after the other.
-    medium
-        Name of one of the sensor's media, in place of the scene's.
-    spp
-        Samples per lit pixel.
-    seed
-        Seed of all noise; the same seed gives the same capture.
-    water
-        What floats in the water, in place of the medium's own: pure, clear, coastal, harbour, jerlov-I to jerlov-9C,
-        or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
-    without
-        Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
-        fixed-pattern, noise.
-    ideal
-        Leave out all of these effects: a pinhole's sharp image without noise.
-    resume
-        Go on with an interrupted run.
-    overwrite
-        Replace existing files.
-    variant
-        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
-    """
-    twin.simulate(
-        scene,
-        sensor=sensor,
-        out=out,
-        as_built=as_built,
-        placement=placement,
-        medium=medium,
-        spp=spp,
-        seed=seed,
-        water=water,
-        without=without,
-        ideal=ideal,
-        resume=resume,
-        overwrite=overwrite,
-        variant=variant,
-        show_progress=True,
-        report=print,
-    )
+    return register
 
 
-@app.command
-def serve(
-    scene: str,
-    *,
-    sensor: str = "thesis",
-    as_built: str | None = None,
-    placement: str | None = None,
-    medium: str | None = None,
-    water: float | str | None = None,
-    spp: int = 16,
-    seed: int = 0,
-    without: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    ideal: Annotated[bool, Parameter(negative="")] = False,
-    stage_start: float | None = None,
-    lamp: bool | None = None,
-    speed_up: float = 1.0,
-    fault: Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="")] = (),
-    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
-) -> None:
-    """Serve a scene as hardware: a GigE Vision camera and a Grbl controller with stage and laser, until Ctrl-C.
+def _descriptions(function: Callable[..., object]) -> dict[str, str]:
+    """The docstring's description of each parameter; "As for `another`" leads to that function's."""
+    found = {}
+    for listed, block in re.findall(r"^(\w.*)\n((?:    .*\n?)+)", _sections(function)[2], flags=re.MULTILINE):
+        other = re.match(r"\s*As for `(\w+)`", block)
+        elsewhere = _descriptions(getattr(twin, other[1])) if other else {}
+        found |= {name: elsewhere.get(name, " ".join(block.split())) for name in listed.split(", ")}
+    return found
 
-    A frame shows what the camera sees where the stage stands, with the laser as it is. Camera and controller can be
-    reached from this machine only.
+
+def _sections(function: Callable[..., object]) -> list[str]:
+    """The docstring's summary, then titles and texts of its sections in turn."""
+    return re.split(r"^(\w+)\n-+\n", f"{inspect.getdoc(function)}\n", flags=re.MULTILINE)
+
+
+def _typed(hint: Any, described: str) -> Any:
+    """The annotation of a command's parameter: those of a function's types that can be given as text."""
+    kinds = get_args(hint) or (hint,)
+    shown = {"help": described.replace("`", "")}
+    if Sequence[str] in (hint, *kinds):
+        return Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="", **shown)]
+    if hint is bool:
+        return Annotated[bool, Parameter(negative="", **shown)]
+    if get_origin(hint) is not Literal:
+        hint = reduce(or_, (kind for kind in kinds if kind in (str, int, float, bool, NoneType)))
+    return Annotated[hint, Parameter(**shown)]
+
+
+@_command(twin.simulate)
+def simulate(scene: str, **options: Any) -> None:
+    """Example: twin simulate spheres --sensor thesis --placement far --out spheres-far.h5"""
+    twin.simulate(scene, **options, show_progress=True, report=print)
+
+
+@_command(twin.serve)
+def serve(scene: str, **options: Any) -> None:
+    """The command serves until Ctrl-C.
 
     Example: twin serve plane --placement near --fault drop@20
-
-    Parameters
-    ----------
-    scene
-        Name of a scene (see: twin scenes) or path of its TOML file.
-    sensor
-        Name or path of the sensor description that the sensor's software will be given.
-    as_built
-        Name or path of the sensor that is really rendered, if it differs from the description.
-    placement
-        Named place of the objects, such as near, standoff or far.
-    medium
-        Name of one of the sensor's media, in place of the scene's.
-    water
-        What floats in the water, in place of the medium's own: a name or a turbidity, as in twin simulate.
-    spp
-        Samples per lit pixel.
-    seed
-        Seed of all noise.
-    without
-        Effects to leave out, as in twin simulate; a moving stage does not blur the image in any case.
-    ideal
-        Leave out all effects: a pinhole's sharp image without noise.
-    stage_start
-        Stage position in mm at which the scene's motion starts; the middle of the travel is used unless given.
-    lamp
-        Whether the lamp is on while the laser is off; if the scene's motion has lamp images unless given.
-    speed_up
-        How much faster than real the stage moves.
-    fault
-        Faults as NAME[:ARGUMENT][@FRAME], each with the frame of that number, else with the first: drop, repeat or cut
-        (so many frames), delay (s), camera-disconnect, stage-disconnect, mute, stall, stop-short or lose-steps (steps),
-        alarm (number), hold, restart, garbage, break-laser.
-    variant
-        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     """
-    description = choose_scene(scene, placement=placement, medium=medium, water=water)
-    options = choose_options(spp=spp, seed=seed, without=without, ideal=ideal)
-    if not speed_up > 0:
-        raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
-    _, built = choose_sensors(sensor, as_built)
-    use_variant(variant)
-    from twin.devices.bench import parse_fault
-    from twin.devices.serve import serve as serve_twin
-    from twin.devices.serve import wait_for_end
-
-    faults = [parse_fault(text) for text in fault]
-    with serve_twin(
-        description,
-        built,
-        options=options,
-        stage_start_mm=stage_start,
-        lamp=lamp,
-        faults=faults,
-        speed_up=speed_up,
-        report=lambda line: print(line, flush=True),
-    ) as served:
+    with twin.serve(scene, **options, report=lambda line: print(line, flush=True)) as served:
         print("\n".join([*served.lines(), "serving; Ctrl-C ends it"]), flush=True)
-        wait_for_end(served)
+        served.wait_for_end()
     print(f"ended after {served.rates()}")
 
 
-@app.command
-def reproduce(
-    campaign: str | None = None,
-    *,
-    joint: Annotated[bool, Parameter(negative="")] = False,
-    out: Path | None = None,
-    campaigns: int = 2,
-    first: int = 0,
-    every: int = 1,
-    spp: int = 16,
-    trials: int = 100,
-    workers: int | None = None,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
-    variant: Literal["llvm_ad_mono", "cuda_ad_mono"] = CPU,
-) -> None:
-    """Render the thesis's whole evaluation, evaluate it by all its methods, and set its tables beside the results.
+@_command(twin.reproduce)
+def reproduce(campaign: str | None = None, **options: Any) -> None:
+    """Example: twin reproduce --campaigns 1 --every 10 --out runs/quick"""
+    _run_others(lambda: twin.reproduce(campaign, **options, show_progress=True))
 
-    Every campaign has imperfections and noise of its own. Run again, it goes on where it was stopped, and adds
-    campaigns if more are asked for. The report is OUT/report.html.
 
-    Example: twin reproduce --campaigns 1 --every 10 --out runs/quick
+@_command(twin.demo)
+def demo(*out: str) -> None:
+    """Example: twin demo"""
+    _run_others(lambda: twin.demo(*out))
 
-    Parameters
-    ----------
-    campaign
-        Name or path of the campaign's description; "thesis" unless given, or "joint" with --joint.
-    joint
-        Compare the joint calibration with the thesis's two ways on the same images; writes OUT/report.html and
-        summary.json.
-    out
-        Folder for campaigns and report; runs/CAMPAIGN unless given.
-    campaigns
-        How many campaigns there shall be.
-    first
-        Seed of the first one; the others follow.
-    every
-        Take only every n-th profile of the scans; calibrations keep all their images.
-    spp
-        Samples per lit pixel.
-    trials
-        Trials of the Monte-Carlo propagation of every campaign, 0 for none.
-    workers
-        Recordings rendered at a time; as many as there are processors unless given.
-    overwrite
-        Render and evaluate everything anew.
-    variant
-        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
-    """
+
+def _run_others(work: Callable[[], object]) -> None:
+    """Do what runs other commands, and exit as the one that fails, which has printed why."""
     try:
-        twin.reproduce(
-            campaign,
-            joint=joint,
-            out=out,
-            campaigns=campaigns,
-            first=first,
-            every=every,
-            spp=spp,
-            trials=trials,
-            workers=workers,
-            overwrite=overwrite,
-            variant=variant,
-            show_progress=True,
-        )
+        work()
     except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)  # the command has printed why
+        sys.exit(error.returncode)
 
 
 @app.command
@@ -307,25 +168,6 @@ def sweep(
         show_progress=True,
     )
     print("\n".join(result.lines()))
-
-
-@app.command
-def demo(*, out: Path = FOLDER) -> None:
-    """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
-
-    Runs exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html.
-
-    Example: twin demo
-
-    Parameters
-    ----------
-    out
-        Folder for all results.
-    """
-    try:
-        twin.demo(out)
-    except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)  # the command has printed why
 
 
 @app.command

@@ -4,13 +4,16 @@ Call `use_variant` before importing any module of the twin that renders: Mitsuba
 are imported.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 from twin.backend.llvm import prepare_llvm
 from uwlts.model.errors import DescriptionError, SetupError
 
 CPU = "llvm_ad_mono"
 GPU = "cuda_ad_mono"
+Variant = Literal["llvm_ad_mono", "cuda_ad_mono"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,11 @@ class Options:
             raise DescriptionError(f"spp is {self.spp}; take 1 to 65536 samples per lit pixel")
         if self.seed < 0:
             raise DescriptionError(f"seed is {self.seed}; it must not be negative")
+
+    @classmethod
+    def chosen(cls, *, spp: int, seed: int, without: Sequence[str], ideal: bool) -> "Options":
+        """Options with some effects, or with ``ideal`` all of them, left out."""
+        return cls(spp, seed, (NONE if ideal else ALL).without(*without))
 
 
 def use_variant(name: str = CPU) -> str:

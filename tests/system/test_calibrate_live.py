@@ -18,7 +18,6 @@ from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
 from twin.devices.gige_camera import GigeCamera
 from twin.devices.grbl_controller import GrblController
 from twin.devices.serve import ServedTwin, serve
-from twin.options import Options
 from twin.scene.description import load_scene
 from uwlts.calibration.sequential import calibrate_sequentially
 from uwlts.hardware.guided.plan import load_guided_plan
@@ -87,7 +86,7 @@ def sensor(folder: Path) -> Sensor:
 
 @pytest.fixture(scope="module")
 def served(folder: Path, sensor: Sensor) -> Iterator[ServedTwin]:
-    with serve(load_scene(folder / "target.toml"), sensor, options=Options(spp=4), speed_up=100.0) as running:
+    with serve(load_scene(folder / "target.toml"), sensor=sensor, spp=4, speed_up=100.0) as running:
         yield running
 
 

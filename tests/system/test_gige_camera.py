@@ -144,10 +144,10 @@ def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene
 @pytest.mark.parametrize(
     ("inject", "status", "message"),
     [
-        (lambda served: served.drop(2), "dropped", "before it were dropped"),
-        (lambda served: served.repeat(), "duplicated", "the previous frame once more"),
-        (lambda served: served.cut(), "short", "lost on the way"),
-        (lambda served: served.delay(0.3), "late", "more than a frame's period"),
+        (lambda served: served.inject("drop", 2), "dropped", "before it were dropped"),
+        (lambda served: served.inject("repeat"), "duplicated", "the previous frame once more"),
+        (lambda served: served.inject("cut"), "short", "lost on the way"),
+        (lambda served: served.inject("delay", delay_s=0.3), "late", "more than a frame's period"),
     ],
 )
 def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, status, message):
@@ -170,10 +170,10 @@ def test_with_skip_faults_are_counted_and_unusable_frames_passed_over(served, ca
     camera.configure(frame_rate_hz=10)
     camera.start(faults="skip")
     camera.grab(WAIT_S)
-    served.cut()
+    served.inject("cut")
     frames = [camera.grab(WAIT_S) for _ in range(4)]
     assert camera.counts.short == 1 and all(frame.status is FrameStatus.OK for frame in frames)
-    served.drop()
+    served.inject("drop")
     frames = [camera.grab(WAIT_S) for _ in range(4)]
     assert camera.counts.dropped == 1
     assert [frame.status for frame in frames].count(FrameStatus.DROPPED) == 1
@@ -185,7 +185,7 @@ def test_after_a_fault_the_next_trigger_gives_its_own_frame(scene, served, camer
     camera.start()
     camera.trigger()
     camera.grab(WAIT_S)
-    getattr(served, fault)()
+    served.inject(fault)
     scene.stage_mm = 1
     camera.trigger()
     with pytest.raises(HardwareError):
@@ -200,7 +200,7 @@ def test_the_frame_of_a_trigger_given_up_is_not_taken_for_the_next(scene, served
     camera.configure(trigger="software")
     camera.start()
     scene.stage_mm = 1
-    served.delay(0.6)
+    served.inject("delay", delay_s=0.6)
     camera.trigger()
     with pytest.raises(HardwareError, match="did not answer"):
         camera.grab(0.3)

@@ -75,7 +75,7 @@ def board(folder: Path) -> Scene:
 
 @pytest.fixture
 def served(board: Scene, sensor: Sensor) -> Iterator[ServedTwin]:
-    with serve(board, sensor, options=Options(spp=4), speed_up=50.0) as running:
+    with serve(board, sensor=sensor, spp=4, speed_up=50.0) as running:
         yield running
 
 

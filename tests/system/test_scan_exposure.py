@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from twin.devices.serve import ServedTwin, serve
-from twin.options import Options
 from twin.scene.description import Scene, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
@@ -96,7 +95,7 @@ def test_it_agrees_with_the_twin(folder, sensor, tmp_path, name, placement):
     motion = scene.motion
     way = (motion.count - 1) * motion.step_mm
     scene = scene.model_copy(update={"motion": motion.model_copy(update={"count": 3, "step_mm": way / 2})})
-    with serve(scene, sensor, options=Options(spp=16), speed_up=50.0) as served:
+    with serve(scene, sensor=sensor, spp=16, speed_up=50.0) as served:
         # A sphere that just touches the sheet, at the last position, is faint, and this is said.
         assert "saturated" not in scanned(scene, served, folder, tmp_path / "scan.h5")
         expected = served.exposure_ms
@@ -115,7 +114,7 @@ def test_it_agrees_with_the_twin(folder, sensor, tmp_path, name, placement):
 
 def test_what_comes_nearer_later_is_taken_again_with_a_shorter_exposure(folder, sensor, tmp_path):
     scene = load_scene(folder / "bar.toml")
-    with serve(scene, sensor, options=Options(spp=4), speed_up=50.0) as served:
+    with serve(scene, sensor=sensor, spp=4, speed_up=50.0) as served:
         said = scanned(scene, served, folder, tmp_path / "scan.h5")
     with Capture(tmp_path / "scan.h5") as scan:
         exposures = scan.exposure_ms
@@ -164,7 +163,7 @@ def refused(address: str) -> bool:
 
 
 def test_a_killed_scan_takes_its_page_with_it_and_leaves_the_laser_off(folder, sensor, tmp_path):
-    with serve(load_scene(folder / "bar.toml"), sensor, options=Options(spp=4), speed_up=50.0) as served:
+    with serve(load_scene(folder / "bar.toml"), sensor=sensor, spp=4, speed_up=50.0) as served:
         with watched(folder, served, tmp_path / "scan.h5", count=21) as scanning:
             lines = iter(scanning.stdout.readline, "")
             address = next(line for line in lines if line.startswith("open ")).split()[1].rstrip(",")
@@ -182,7 +181,7 @@ def test_a_killed_scan_takes_its_page_with_it_and_leaves_the_laser_off(folder, s
 
 def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, tmp_path):
     with (
-        serve(load_scene(folder / "bar.toml"), sensor, options=Options(spp=4), speed_up=50.0) as served,
+        serve(load_scene(folder / "bar.toml"), sensor=sensor, spp=4, speed_up=50.0) as served,
         watched(folder, served, tmp_path / "scan.h5", count=12) as scanning,
     ):
         lines = iter(scanning.stdout.readline, "")

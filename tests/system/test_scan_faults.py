@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from tests.system.in_process import uwlts
-from twin.devices.bench import NAMES, parse_fault
+from twin.devices.bench import NAMES
 from twin.devices.serve import ServedTwin, serve
-from twin.options import Options
 from twin.scene.description import Scene, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
@@ -85,8 +84,7 @@ def board(folder: Path) -> Scene:
 
 @contextmanager
 def serving(scene: Scene, sensor: Sensor, *faults: str) -> Iterator[ServedTwin]:
-    chosen = [parse_fault(text) for text in faults]
-    with serve(scene, sensor, options=Options(spp=4), speed_up=50.0, faults=chosen) as running:
+    with serve(scene, sensor=sensor, spp=4, speed_up=50.0, fault=faults) as running:
         yield running
 
 
@@ -147,8 +145,8 @@ def test_a_scan_meets_one_fault_after_the_other_and_goes_on_after_each(board, se
         for name in names:
             done = scan(plan, out, *(["--resume"] if kept else []))
             ended(done, STAGE_FAULTS[name])
-            served.controller.mute(False)
-            served.controller.break_laser(False)
+            served.controller.inject("mute", 0)
+            served.controller.inject("break-laser", 0)
             assert dark(served), name
             assert not out.exists()
             found = positions(part_path(out))
@@ -172,9 +170,7 @@ def test_frames_lost_on_their_way_are_taken_again(board, sensor, folder, tmp_pat
         frame += lost + 1
     count = len(LOST_FRAMES) + 2
     said: list[str] = []
-    with serve(
-        board, sensor, options=Options(spp=4), speed_up=50.0, faults=map(parse_fault, faults), report=said.append
-    ) as served:
+    with serve(board, sensor=sensor, spp=4, speed_up=50.0, fault=faults, report=said.append) as served:
         done = scan(written(folder, served, count=count), out)
         assert done.returncode == 0, done.stderr
         assert dark(served)
@@ -218,7 +214,7 @@ def test_a_laser_that_never_lights_is_noticed_before_anything_is_stored(board, s
         plan = written(folder, served, count=4, laser_ms=laser_ms)
         ended(scan(plan, out), "no laser light at any of 4 positions")
         assert len(positions(part_path(out))) == 0
-        served.controller.break_laser(False)
+        served.controller.inject("break-laser", 0)
         assert dark(served)
         assert scan(plan, out, "--resume").returncode == 0
         np.testing.assert_allclose(positions(out), planned(served, 4), atol=0.011)

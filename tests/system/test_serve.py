@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from twin.devices.bench import NAMES, Fault, Track, parse_fault
-from twin.devices.serve import ServedTwin, serve, wait_for_end
+from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene, load_scene
@@ -78,7 +78,7 @@ def board(described: Path) -> Scene:
 
 @pytest.fixture(scope="module")
 def served(board: Scene, sensor: Sensor) -> Iterator[ServedTwin]:
-    with serve(board, sensor, options=Options(spp=4), speed_up=FAST) as running:
+    with serve(board, sensor=sensor, spp=4, speed_up=FAST) as running:
         yield running
 
 
@@ -195,11 +195,11 @@ def test_a_laser_that_breaks_leaves_the_dark(served, stage, camera):
     stage.laser(True)
     bright = grab(camera).max()
     assert bright > 100
-    served.controller.break_laser()
+    served.controller.inject("break-laser")
     try:
         assert grab(camera).max() < 0.2 * bright
     finally:
-        served.controller.break_laser(False)
+        served.controller.inject("break-laser", 0)
 
 
 # Where the scene lies
@@ -225,7 +225,7 @@ def test_the_motion_lies_in_the_middle_of_the_travel_or_where_it_is_wanted(serve
 
 def test_a_detector_of_more_bits_is_refused(board, sensor):
     finer = sensor.model_copy(update={"detector": sensor.detector.model_copy(update={"bits": 10})})
-    with pytest.raises(DesignError, match=r"gives 8 bit, .* detector 10"), serve(board, finer):
+    with pytest.raises(DesignError, match=r"gives 8 bit, .* detector 10"), serve(board, sensor=finer):
         pass
 
 
@@ -263,10 +263,10 @@ def test_the_lamp_is_on_while_the_laser_is_off_and_frames_are_dropped_and_late(l
     """One camera only can be served: the module's one is away meanwhile."""
     served.camera.disconnect()
     said: list[str] = []
-    faults = [parse_fault(text) for text in ("drop@2", "delay:1@4", "alarm:1@4", "stage-disconnect@5")]
+    faults = ("drop@2", "delay:1@4", "alarm:1@4", "stage-disconnect@5")
     try:
         with (
-            serve(lamp_lit, sensor, options=Options(spp=1), faults=faults, speed_up=FAST, report=said.append) as twin,
+            serve(lamp_lit, sensor=sensor, spp=1, fault=faults, speed_up=FAST, report=said.append) as twin,
             open_camera(twin.camera.address) as camera,
         ):
             assert list(twin.exposure_ms) == ["lamp", "laser"]
@@ -303,11 +303,8 @@ def test_the_lamp_is_on_while_the_laser_is_off_and_frames_are_dropped_and_late(l
 def test_a_camera_that_is_gone_says_so_and_what_keeps_it_from_frames_ends_the_service(board, sensor, served):
     served.camera.disconnect()
     try:
-        faults = [parse_fault("camera-disconnect@2")]
-        with (
-            serve(board, sensor, options=Options(spp=1), faults=faults) as twin,
-            open_camera(twin.camera.address) as camera,
-        ):
+        faults = ["camera-disconnect@2"]
+        with serve(board, sensor=sensor, spp=1, fault=faults) as twin, open_camera(twin.camera.address) as camera:
             start(camera, 1.0)
             grab(camera)
             camera.trigger()
@@ -316,7 +313,7 @@ def test_a_camera_that_is_gone_says_so_and_what_keeps_it_from_frames_ends_the_se
             assert twin.camera.failure is None
             twin.camera.failure = ImageError("no frame can be made")
             with pytest.raises(ImageError, match="no frame can be made"):
-                wait_for_end(twin)
+                twin.wait_for_end()
     finally:
         served.camera.connect()
 

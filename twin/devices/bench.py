@@ -5,51 +5,47 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from twin.devices.gige_camera import GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
-from twin.recording.studio import Studio
 from twin.scene.description import Motion, Shot
-from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from uwlts.model.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
+
+if TYPE_CHECKING:  # it needs Mitsuba
+    from twin.recording.studio import Studio
 
 _FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """A fault's effect, and its argument unless given; None where it takes none.
+    """A fault's argument unless given, None where it takes none, and which arguments it takes."""
 
-    ``ahead`` is for what has to be known before the camera begins with a frame.
-    """
-
-    inject: Callable[[GrblController, GigeCamera, float], None]
     argument: float | None = None
     whole: bool = True
     signed: bool = False
-    ahead: bool = False
 
 
 _KINDS = {
-    "drop": _Kind(lambda stage, camera, frames: camera.drop(int(frames)), 1),
-    "repeat": _Kind(lambda stage, camera, frames: camera.repeat(int(frames)), 1),
-    "cut": _Kind(lambda stage, camera, frames: camera.cut(int(frames)), 1),
-    "delay": _Kind(lambda stage, camera, seconds: camera.delay(seconds), 1.0, whole=False, ahead=True),
-    "camera-disconnect": _Kind(lambda stage, camera, _: camera.disconnect()),
-    "stage-disconnect": _Kind(lambda stage, camera, _: stage.disconnect()),
-    "mute": _Kind(lambda stage, camera, _: stage.mute()),
-    "stall": _Kind(lambda stage, camera, _: stage.stall()),
-    "stop-short": _Kind(lambda stage, camera, steps: stage.stop_short(int(steps)), 40),
-    "lose-steps": _Kind(lambda stage, camera, steps: stage.lose_steps(int(steps)), 40, signed=True),
-    "alarm": _Kind(lambda stage, camera, code: stage.alarm(int(code)), 1),
-    "hold": _Kind(lambda stage, camera, _: stage.hold()),
-    "restart": _Kind(lambda stage, camera, _: stage.restart()),
-    "garbage": _Kind(lambda stage, camera, _: stage.garbage()),
-    "break-laser": _Kind(lambda stage, camera, _: stage.break_laser()),
+    "drop": _Kind(1),
+    "repeat": _Kind(1),
+    "cut": _Kind(1),
+    "delay": _Kind(1.0, whole=False),
+    "camera-disconnect": _Kind(),
+    "stage-disconnect": _Kind(),
+    "mute": _Kind(),
+    "stall": _Kind(),
+    "stop-short": _Kind(40),
+    "lose-steps": _Kind(40, signed=True),
+    "alarm": _Kind(1),
+    "hold": _Kind(),
+    "restart": _Kind(),
+    "garbage": _Kind(),
+    "break-laser": _Kind(),
 }
 NAMES = tuple(_KINDS)
 
@@ -65,24 +61,29 @@ class Fault:
     @property
     def ahead(self) -> bool:
         """Whether it has to be injected before its frame is begun, which is when the one before is done."""
-        return _KINDS[self.name].ahead
+        return self.name == "delay"
 
     def inject(self, stage: GrblController, camera: GigeCamera) -> None:
         """Let it happen."""
-        # Kinds without an argument ignore it.
-        _KINDS[self.name].inject(stage, camera, 0.0 if self.argument is None else self.argument)
+        value = 1 if self.argument is None else self.argument
+        match self.name:
+            case "drop" | "repeat" | "cut":
+                camera.inject(self.name, int(value))
+            case "delay":
+                camera.inject("delay", delay_s=value)
+            case "camera-disconnect":
+                camera.disconnect()
+            case _:
+                stage.inject(self.name, value)
 
     def __str__(self) -> str:
         return f"{self.name}{'' if self.argument is None else f':{self.argument:g}'} at frame {self.frame}"
 
 
 def parse_fault(text: str) -> Fault:
-    """A fault from NAME[:ARGUMENT][@FRAME]; the first frame and the kind's own argument unless given.
+    """A fault from NAME[:ARGUMENT][@FRAME], by default of the kind's own argument with the first frame.
 
-    Raises
-    ------
-    DescriptionError
-        There is no such fault, or its argument is none.
+    DescriptionError where there is no such fault, or its argument is none.
     """
     found = _FORM.fullmatch(text)
     if not found or found["name"] not in _KINDS:
@@ -117,10 +118,7 @@ class Track:
     def on(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
         """The motion in the middle of the travel, on a whole step, unless ``start_mm`` says where it starts.
 
-        Raises
-        ------
-        DescriptionError
-            The motion does not lie within the travel.
+        DescriptionError where the motion does not lie within the travel.
         """
         way_mm = (motion.count - 1) * motion.step_mm
         if start_mm is None:
@@ -173,36 +171,18 @@ class FrameRates:
 
 
 class Bench:
-    """Renders frames for a stage; used by one thread.
+    """Frames of a studio for a stage whose ``state()`` is true at the moment of the call; used by one thread.
 
-    Parameters
-    ----------
-    studio
-        Sensor and scene.
-    state
-        What is true of stage and laser at the moment of the call.
-    track
-        Where the scene lies on the stage.
-    lamp
-        Whether the lamp is on while the laser is off.
-
-    Raises
-    ------
-    DesignError
-        The detector does not have 8 bit.
+    ``track`` is where the scene lies on the stage; the lamp is on while the laser is off if ``lamp``. DesignError where
+    the detector does not have 8 bit.
     """
 
-    def __init__(self, studio: Studio, *, state: Callable[[], StageState], track: Track, lamp: bool):
-        detector, camera = studio.sensor.detector, studio.sensor.camera
-        if detector.bits != 8:
-            raise DesignError(f"the served camera gives 8 bit, the sensor's detector {detector.bits}: set bits = 8")
+    def __init__(self, studio: "Studio", *, state: Callable[[], StageState], track: Track, lamp: bool):
+        bits = studio.sensor.detector.bits
+        if bits != 8:
+            raise DesignError(f"the served camera gives 8 bit, the sensor's detector {bits}: set bits = 8")
         self.rates = FrameRates()
         self._studio, self._state, self._track, self._lamp = studio, state, track, lamp
-        self._pattern = (
-            fixed_pattern(detector, height=camera.height_px, width=camera.width_px)
-            if studio.options.effects.fixed_pattern
-            else None
-        )
         self._travelled_mm = math.nan
         self._seen: dict[str, np.ndarray] = {}
 
@@ -211,20 +191,14 @@ class Bench:
         began, state, known = time.perf_counter(), self._state(), len(self._seen)
         at_rest = self._track.shot(state.position_mm, "laser").travelled_mm == self._travelled_mm
         light = exposure_ms * self._electrons_per_ms(state)
-        effects, seed = self._studio.options.effects, self._studio.options.seed
-        rng = np.random.default_rng([seed, _NOISE, self.rates.frames]) if effects.noise else None
-        image = grey_values(
-            light, self._studio.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern
-        )
-        self._count(repeated=at_rest and len(self._seen) == known, seconds=time.perf_counter() - began)
-        return image
-
-    def _count(self, *, repeated: bool, seconds: float) -> None:
-        rates = replace(self.rates, frames=self.rates.frames + 1)
-        if repeated:
+        noise_seed = [self._studio.options.seed, _NOISE, self.rates.frames]
+        image = self._studio.detected(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        seconds, rates = time.perf_counter() - began, replace(self.rates, frames=self.rates.frames + 1)
+        if at_rest and len(self._seen) == known:
             self.rates = replace(rates, repeating_s=rates.repeating_s + seconds)
         else:
             self.rates = replace(rates, rendered=rates.rendered + 1, rendering_s=rates.rendering_s + seconds)
+        return image
 
     def _electrons_per_ms(self, state: StageState) -> np.ndarray:
         """Mean photo-electrons per ms (H, W), without noise; the latest place's are kept."""
@@ -242,23 +216,16 @@ class Bench:
 
     def _light(self, light: Literal["lamp", "laser", "day"], state: StageState) -> np.ndarray:
         if light not in self._seen:
-            if light == "day":
-                self._seen[light] = self._daylight(self._track.shot(state.position_mm, "lamp"))
-            else:
-                self._seen[light] = self._rendered(self._track.shot(state.position_mm, light))
+            shot, options = (
+                self._track.shot(state.position_mm, "laser" if light == "laser" else "lamp"),
+                self._studio.options,
+            )
+            # Whole um, which are all different places; seeds must not be negative.
+            place = round(1e3 * shot.travelled_mm) % 2**32
+            seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
+            self._seen[light] = (
+                self._studio.daylight_electrons_per_ms(shot)
+                if light == "day"
+                else self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
+            )
         return self._seen[light]
-
-    def _rendered(self, shot: Shot) -> np.ndarray:
-        options = self._studio.options
-        # Whole um, which are all different places; seeds must not be negative.
-        place = round(1e3 * shot.travelled_mm) % 2**32
-        seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
-        return self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
-
-    def _daylight(self, shot: Shot) -> np.ndarray:
-        """What is left when laser and lamp are off."""
-        studio, sensor = self._studio, self._studio.sensor
-        if not (studio.options.effects.ambient and sensor.lamp.ambient_w_per_m2 > 0):
-            return np.zeros((sensor.camera.height_px, sensor.camera.width_px), np.float32)
-        irradiance = studio.renderer.daylight(studio.pose(shot), spp=studio.options.spp)
-        return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)

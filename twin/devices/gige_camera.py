@@ -5,13 +5,14 @@ import socket
 import struct
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -28,18 +29,10 @@ _LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
 def image_packets(
     image: np.ndarray, *, time_ns: int, number: int, region: tuple[int, int, int, int], packet_bytes: int
 ) -> list[bytes]:
-    """Leader, parts of the region, and trailer of an image.
+    """Leader, parts of the region, and trailer of an image (H, W) of uint8.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        The whole image.
-    time_ns, number
-        Its time stamp in ns, and its number of 16 bits.
-    region
-        Left, top, width and height in px; what lies beyond the image is dark.
-    packet_bytes
-        Size of a packet with all its headers.
+    ``time_ns`` is its time stamp, ``number`` its number of 16 bits, ``region`` left, top, width and height in px, of
+    which what lies beyond the image is dark, and ``packet_bytes`` the size of a packet with all its headers.
     """
     x, y, width, height = region
     seen = np.zeros((height, width), np.uint8)
@@ -120,17 +113,6 @@ class _Shot:
     time_ns: int
 
 
-@dataclass(frozen=True)
-class _Faults:
-    """Numbers of the next frames that are lost, repeated, lack packets, or come late by so many seconds."""
-
-    drop: int = 0
-    repeat: int = 0
-    cut: int = 0
-    delay: int = 0
-    delay_s: float = 0.0
-
-
 class GigeCamera:
     """Serves a camera of 8 bit; a context manager.
 
@@ -165,7 +147,7 @@ class GigeCamera:
         self.failure: BaseException | None = None
         self._frame = frame
         self._size = (height_px, width_px)
-        self._maker, self._model, self._serial = maker, model, serial
+        self._texts = tuple(names.values())
         self._library = _functions()
         # The library keeps no reference to it.
         self._callback = _FILL(self._fill)
@@ -173,9 +155,9 @@ class GigeCamera:
         self._stream: socket.socket
         self._camera = 0
         self._lock = threading.Lock()
-        self._faults = _Faults()
+        self._faults: Counter[str] = Counter()
+        self._delay_s = 0.0
         self._number = first_number - 1
-        self._sent = 0
         self._making: Future[_Shot] | None = None
         self._answer: _Shot | None = None
         self._last: _Shot | None = None
@@ -195,30 +177,23 @@ class GigeCamera:
                 raise HardwareError("the camera is disconnected: its exposure is not known")
             return 1e-3 * self._read(_Register.EXPOSURE_US)
 
-    @property
-    def frames_sent(self) -> int:
-        """Number of frames sent, wholly or in part."""
-        return self._sent
+    def inject(
+        self, fault: Literal["drop", "repeat", "cut", "delay"], frames: int = 1, *, delay_s: float = 0.0
+    ) -> None:
+        """Let a fault come with each of the next frames.
 
-    def drop(self, frames: int = 1) -> None:
-        """Lose the next frames altogether."""
-        self._inject(drop=frames)
-
-    def repeat(self, frames: int = 1) -> None:
-        """Send the frame before, with its time stamp, in place of each of the next frames."""
-        self._inject(repeat=frames)
-
-    def cut(self, frames: int = 1) -> None:
-        """Lose a tenth of the packets of each of the next frames."""
-        self._inject(cut=frames)
-
-    def delay(self, seconds: float, frames: int = 1) -> None:
-        """Begin the exposure of each of the next frames so much later."""
-        self._inject(delay=frames, delay_s=seconds)
-
-    def _inject(self, **faults: float) -> None:
+        "drop" loses them altogether, "repeat" sends the frame before with its time stamp in place of each, "cut" loses
+        a tenth of their packets, and "delay" begins their exposures ``delay_s`` later.
+        """
         with self._lock:
-            self._faults = replace(self._faults, **faults)
+            self._faults[fault] = frames
+            self._delay_s = delay_s if fault == "delay" else self._delay_s
+
+    def _meets(self, fault: str) -> bool:
+        """Whether a fault comes with the frame at hand, which is then counted; only under the lock."""
+        met = self._faults[fault] > 0
+        self._faults[fault] -= met
+        return met
 
     def disconnect(self) -> None:
         """Be gone, as if the cable were pulled: nothing is sent and no command answered any more."""
@@ -239,28 +214,24 @@ class GigeCamera:
         self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stream.bind((LOOPBACK, 0))
         with _nothing_beyond_loopback():
-            self._server = library.arv_gv_fake_camera_new(LOOPBACK.encode(), self._serial.encode())
+            self._server = library.arv_gv_fake_camera_new(LOOPBACK.encode(), self._texts[-1][0].encode())
         if not library.arv_gv_fake_camera_is_running(self._server):
             self.disconnect()
             raise HardwareError(f"Aravis's camera does not start on {LOOPBACK}: is the loopback interface up?")
         self._silence_library()
         self._camera = library.arv_gv_fake_camera_get_fake_camera(self._server)
         height, width = self._size
-        texts = {
-            _Register.MAKER: (self._maker, _NAME_BYTES),
-            _Register.MODEL: (self._model, _NAME_BYTES),
-            _Register.DEVICE_ID: (self._serial, _SERIAL_BYTES),
-        }
-        for register, (text, room) in texts.items():
+        for register, (text, room) in zip(
+            (_Register.MAKER, _Register.MODEL, _Register.DEVICE_ID), self._texts, strict=True
+        ):
             library.arv_fake_camera_write_memory(self._camera, register, room, text.encode().ljust(room, b"\0"))
-        numbers = {
-            _Register.SENSOR_WIDTH: width,
-            _Register.WIDTH: width,
-            _Register.SENSOR_HEIGHT: height,
-            _Register.HEIGHT: height,
-            _Register.PACKET_SIZE: _PACKET_BYTES,
-        }
-        for register, number in numbers.items():
+        for register, number in (
+            (_Register.SENSOR_WIDTH, width),
+            (_Register.WIDTH, width),
+            (_Register.SENSOR_HEIGHT, height),
+            (_Register.HEIGHT, height),
+            (_Register.PACKET_SIZE, _PACKET_BYTES),
+        ):
             library.arv_fake_camera_write_register(self._camera, register, number)
         library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
@@ -273,16 +244,15 @@ class GigeCamera:
         with self._lock:
             if self._server is None:
                 return
-            faults = self._faults
-            if faults.repeat and self._last is not None:
-                shot, faults = self._last, replace(faults, repeat=faults.repeat - 1)
+            if self._last is not None and self._meets("repeat"):
+                shot = self._last
             self._last = shot
             self._number = self._number % _LAST_NUMBER + 1
-            self._faults = replace(faults, drop=max(faults.drop - 1, 0), cut=max(faults.cut - 1, 0))
+            dropped, shortened = self._meets("drop"), self._meets("cut")
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
             host, port, packet_bytes = map(self._read, names)
             x, y, width, height = map(self._read, _REGION)
-        if not faults.drop:
+        if not dropped:
             packets = image_packets(
                 shot.image,
                 time_ns=shot.time_ns,
@@ -290,11 +260,10 @@ class GigeCamera:
                 region=(x, y, width, height),
                 packet_bytes=packet_bytes & 0xFFFF,
             )
-            if faults.cut:
+            if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]
             send_paced(self._stream, packets, (socket.inet_ntoa(struct.pack(">I", host)), port & 0xFFFF))
-            self._sent += 1
 
     def _due(self, exposure_ms: float) -> _Shot | None:
         """The image to send now, if it is ready; else it is being made."""
@@ -334,10 +303,8 @@ class GigeCamera:
 
     def _make(self, exposure_ms: float) -> _Shot:
         with self._lock:
-            faults = self._faults
-            self._faults = replace(faults, delay=max(faults.delay - 1, 0))
-        if faults.delay:
-            self._stopping.wait(faults.delay_s)
+            delay_s = self._delay_s if self._meets("delay") else 0.0
+        self._stopping.wait(delay_s)
         began_ns = time.monotonic_ns()
         image = self._frame(exposure_ms)
         if image.shape != self._size or image.dtype != np.uint8:

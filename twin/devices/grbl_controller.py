@@ -102,8 +102,6 @@ class GrblController:
             speed = self._firmware.axis.at(self._now())[1]
             return StageState(self._firmware.stage_mm, speed != 0, power > 0, power, self._port_open)
 
-    # Faults
-
     def disconnect(self) -> None:
         """Pull the cable out: the line is gone and, with it, the controller's power."""
         with self._lock:
@@ -112,50 +110,36 @@ class GrblController:
                 self._powered = False
                 os.close(self._master)
 
-    def mute(self, silent: bool = True) -> None:
-        """Break the wire on which the controller answers; it still receives."""
-        with self._lock:
-            self._muted = silent
+    def inject(self, fault: str, value: float = 1, *, noise: bytes = b"\xff\xfe<Id|MPos:1#\x80,0\r\n") -> None:
+        """Let a fault of ``twin serve --fault`` happen, of as many steps or with the number ``value``.
 
-    def stall(self) -> None:
-        """Let the current or next movement stand still until a reset, while the controller says it runs."""
+        A value of 0 repairs "mute" and "break-laser"; ``noise`` is what "garbage" puts on the line.
+        """
+        firmware = self._firmware
         with self._lock:
-            self._firmware.axis.stick(self._now())
-
-    def stop_short(self, steps: int) -> None:
-        """End the next movement this many steps before its target: commands or pulses lost in the controller."""
-        with self._lock:
-            self._firmware.short_steps = steps
-
-    def lose_steps(self, steps: int) -> None:
-        """Let the motor slip by this many steps, signed; the controller, which measures nothing, cannot know."""
-        with self._lock:
-            self._firmware.shift_mm += steps * self._firmware.step_mm
-
-    def alarm(self, code: int) -> None:
-        """Raise an alarm."""
-        with self._lock:
-            self._firmware.raise_alarm(code)
-
-    def garbage(self, data: bytes = b"\xff\xfe<Id|MPos:1#\x80,0\r\n") -> None:
-        """Put noise on the line to the computer."""
-        with self._lock:
-            self._say(data)
-
-    def restart(self) -> None:
-        """Restart as after a dip of the supply: the laser goes off, position and queue are forgotten."""
-        with self._lock:
-            self._firmware.restart()
-
-    def hold(self) -> None:
-        """Press the feed hold button, or let noise do so."""
-        with self._lock:
-            self._firmware.hear(b"!")
-
-    def break_laser(self, broken: bool = True) -> None:
-        """Let no light come out, whatever the pin says."""
-        with self._lock:
-            self._laser_broken = broken
+            match fault:
+                case "stage-disconnect":
+                    self.disconnect()
+                case "mute":  # the wire on which the controller answers breaks; it still receives
+                    self._muted = bool(value)
+                case "stall":  # until a reset, while the controller reports that it runs
+                    firmware.axis.stick(self._now())
+                case "stop-short":  # commands or pulses lost in the controller
+                    firmware.short_steps = int(value)
+                case "lose-steps":  # the motor slips; the controller, which measures nothing, cannot know
+                    firmware.shift_mm += int(value) * firmware.step_mm
+                case "alarm":
+                    firmware.raise_alarm(int(value))
+                case "garbage":
+                    self._say(noise)
+                case "restart":  # as after a dip of the supply
+                    firmware.restart()
+                case "hold":  # the button, or noise on its line
+                    firmware.hear(b"!")
+                case "break-laser":  # no light comes out, whatever the pin says
+                    self._laser_broken = bool(value)
+                case _:
+                    raise ValueError(f"a stage has no fault '{fault}'")
 
     # The line
 

@@ -2,19 +2,20 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 
-from twin.devices.bench import Bench, Fault, FrameRates, Track
+from twin.devices.bench import Bench, FrameRates, Track, parse_fault
 from twin.devices.gige_camera import GigeCamera
 from twin.devices.grbl_controller import GrblController
-from twin.options import Options
-from twin.recording.studio import Studio
-from twin.scene.description import Scene
-from uwlts.model.sensor import Sensor
+from twin.options import CPU, Options, Variant, use_variant
+from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
+from twin.scene.description import altered
+from uwlts.model.errors import DescriptionError
 
 _STEPS_PER_MM, _TRAVEL = 100, 130
 _WATCH_S = 0.2
@@ -44,101 +45,120 @@ class ServedTwin:
             f"exposure: {suited}",
         ]
 
+    def wait_for_end(self) -> None:
+        """Return at Ctrl-C, or when the process is asked to terminate; raise what kept the camera from making a frame.
+
+        A shell makes programs in its background ignore Ctrl-C; a service must not.
+        """
+        ended = threading.Event()
+        before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            while not ended.wait(_WATCH_S):
+                if self.camera.failure is not None:
+                    raise self.camera.failure
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
 
 @contextmanager
 def serve(
-    scene: Scene,
-    sensor: Sensor,
+    scene: AnyScene,
     *,
-    options: Options = Options(),
-    stage_start_mm: float | None = None,
+    sensor: AnySensor = "thesis",
+    as_built: AnySensor | None = None,
+    placement: str | None = None,
+    medium: str | None = None,
+    water: float | str | None = None,
+    spp: int = 16,
+    seed: int = 0,
+    without: Sequence[str] = (),
+    ideal: bool = False,
+    stage_start: float | None = None,
     lamp: bool | None = None,
-    faults: Iterable[Fault] = (),
     speed_up: float = 1.0,
+    fault: Sequence[str] = (),
+    variant: Variant = CPU,
     report: Callable[[str], None] = lambda line: None,
 ) -> Iterator[ServedTwin]:
-    """Serve a sensor before a scene within a ``with``; everything listens on this machine alone.
+    """Serve a scene as hardware: a GigE Vision camera and a Grbl controller with stage and laser.
+
+    A frame shows what the camera sees where the stage stands, with the laser as it is. Camera and controller can be
+    reached from this machine only.
 
     Parameters
     ----------
-    stage_start_mm
-        Stage position at which the scene's motion starts; such that it lies in the middle of the travel unless given.
-        There the stage stands at first.
+    sensor
+        Name or path of the sensor description that the sensor's software will be given.
+    placement
+        Named place of the objects, such as near, standoff or far.
+    without
+        Effects to leave out, as for `simulate`; a moving stage does not blur the image in any case.
+    ideal
+        Leave out all effects: a pinhole's sharp image without noise.
+    stage_start
+        Stage position in mm at which the scene's motion starts; the middle of the travel is used unless given. There
+        the stage stands at first.
     lamp
         Whether the lamp is on while the laser is off; if the scene's motion has lamp images unless given.
     speed_up
         How much faster than real the stage moves.
+    fault
+        Faults as NAME[:ARGUMENT][@FRAME], each with the frame of that number, else with the first: drop, repeat or cut
+        (so many frames), delay (s), camera-disconnect, stage-disconnect, mute, stall, stop-short or lose-steps (steps),
+        alarm (number), hold, restart, garbage, break-laser.
     report
         Called with a line of text for every fault, by the camera's thread.
+    scene, as_built, medium, water, spp, seed, variant
+        As for `simulate`.
+
+    Returns
+    -------
+    context manager of ServedTwin
+        Its addresses and exposures; the scene is served within the ``with``.
 
     Raises
     ------
     DescriptionError, DesignError
-        The sensor or the scene cannot work, or the motion does not fit the stage.
+        A description, name or option is wrong, the sensor cannot work, or the motion does not fit the stage.
     HardwareError
         Another camera is served on this machine.
     SetupError
-        Aravis is not installed.
+        Aravis is not installed, or Mitsuba cannot use the variant.
     """
-    track = Track.on(sensor.stage, scene.motion, start_mm=stage_start_mm)
-    lamp = "lamp" in scene.motion.lights if lamp is None else lamp
-    studio = Studio(sensor, _at_rest(scene, lamp=lamp), options)
-    settings = {_STEPS_PER_MM: 1 / sensor.stage.resolution_mm, _TRAVEL: sensor.stage.travel_mm}
+    described = choose_scene(scene, placement=placement, medium=medium, water=water)
+    options = Options.chosen(spp=spp, seed=seed, without=without, ideal=ideal)
+    if not speed_up > 0:
+        raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
+    _, built = choose_sensors(sensor, as_built)
+    faults = [parse_fault(text) for text in fault]
+    use_variant(variant)
+    from twin.recording.studio import Studio
+
+    track = Track.on(built.stage, described.motion, start_mm=stage_start)
+    lamp = "lamp" in described.motion.lights if lamp is None else lamp
+    # The controller moves the stage, and a frame may ask for any light.
+    at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
+    studio = Studio(built, altered(described, motion=at_rest), options)
+    settings = {_STEPS_PER_MM: 1 / built.stage.resolution_mm, _TRAVEL: built.stage.travel_mm}
     controller = GrblController(settings=settings, position_mm=track.start_mm, speed_up=speed_up)
     bench = Bench(studio, state=controller.state, track=track, lamp=lamp)
-    frames = _FaultyFrames(bench, tuple(faults), report)
-    built = sensor.camera
-    camera = GigeCamera(frames, width_px=built.width_px, height_px=built.height_px)
-    frames.join(controller, camera)
-    with controller, camera:
-        yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)
+    numbers = count(1)
 
+    def inject(number: int, *, ahead: bool) -> None:
+        for each in faults:
+            if (each.frame, each.ahead) == (number, ahead):
+                each.inject(controller, camera)
+                report(f"fault: {each}")
 
-def wait_for_end(served: ServedTwin) -> None:
-    """Return at Ctrl-C, or when the process is asked to terminate; raise what kept the camera from making a frame.
-
-    A shell makes programs in its background ignore Ctrl-C; a service must not.
-    """
-    ended = threading.Event()
-    before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        while not ended.wait(_WATCH_S):
-            if served.camera.failure is not None:
-                raise served.camera.failure
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _at_rest(scene: Scene, *, lamp: bool) -> Scene:
-    """The scene with all its lights at a stage that the controller moves."""
-    lights = ("lamp", "laser") if lamp else ("laser",)
-    return scene.model_copy(
-        update={"motion": scene.motion.model_copy(update={"lights": lights, "speed_mm_per_s": 0.0})}
-    )
-
-
-class _FaultyFrames:
-    """The bench's frames, each with the faults that come with it."""
-
-    def __init__(self, bench: Bench, faults: tuple[Fault, ...], report: Callable[[str], None]):
-        self._bench, self._faults, self._report = bench, faults, report
-        self._begun = 0
-
-    def join(self, controller: GrblController, camera: GigeCamera) -> None:
-        """Give the devices that faults are injected into."""
-        self._devices = controller, camera
-        self._inject(1, ahead=True)
-
-    def __call__(self, exposure_ms: float) -> np.ndarray:
-        self._begun += 1
-        self._inject(self._begun, ahead=False)
-        image = self._bench.frame(exposure_ms)
-        self._inject(self._begun + 1, ahead=True)
+    def frame(exposure_ms: float) -> np.ndarray:
+        number = next(numbers)
+        inject(number, ahead=False)
+        image = bench.frame(exposure_ms)
+        inject(number + 1, ahead=True)
         return image
 
-    def _inject(self, frame: int, *, ahead: bool) -> None:
-        for fault in self._faults:
-            if (fault.frame, fault.ahead) == (frame, ahead):
-                fault.inject(*self._devices)
-                self._report(f"fault: {fault}")
+    camera = GigeCamera(frame, width_px=built.camera.width_px, height_px=built.camera.height_px)
+    inject(1, ahead=True)
+    with controller, camera:
+        yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)

@@ -51,9 +51,15 @@ def commands(out: Path) -> list[tuple[str, str]]:
 
 
 def demo(out: str | Path = FOLDER) -> Path:
-    """Run the demo into a folder; returns its report.
+    """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
 
-    Runs exactly the commands that it prints, two at a time; each could be typed by hand.
+    Runs exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html,
+    whose path is returned.
+
+    Parameters
+    ----------
+    out
+        Folder for all results.
 
     Raises
     ------

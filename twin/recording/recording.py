@@ -12,13 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.options import ALL, CPU, NONE, Options, use_variant
+from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import load_sensor, validated
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.truth import Truth
+
+AnyScene = str | Path | Scene
+AnySensor = str | Path | Sensor
+FRAME_DATA = ("stage_mm", "laser_on", "exposure_ms", "time_s")
 
 
 @dataclass(frozen=True)
@@ -53,61 +57,37 @@ class Recording:
 
 
 def render(
-    scene: str | Path | Scene,
+    scene: AnyScene,
     *,
-    sensor: str | Path | Sensor = "thesis",
-    as_built: str | Path | Sensor | None = None,
+    sensor: AnySensor = "thesis",
+    as_built: AnySensor | None = None,
     placement: str | None = None,
     medium: str | None = None,
     spp: int = 16,
     seed: int = 0,
-    water: str | float | None = None,
+    water: float | str | None = None,
     without: Sequence[str] = (),
     ideal: bool = False,
     frames: Sequence[int] | None = None,
-    variant: str = CPU,
+    variant: Variant = CPU,
 ) -> Recording:
     """Render a scene into arrays; the images are those that `simulate` writes with the same arguments.
 
     Parameters
     ----------
-    scene
-        Name of a scene, path of its TOML file, or the scene itself.
-    sensor
-        Name, path or description of the sensor.
-    as_built
-        The sensor that is really rendered, if it differs from the description.
-    placement
-        Named place of the objects, such as "near", in place of the scene's.
-    medium
-        Name of one of the sensor's media, in place of the scene's.
-    spp
-        Samples per lit pixel.
-    seed
-        Seed of all noise; the same seed gives the same images.
-    water
-        What floats in the water, in place of the medium's own: the name of a water, or a turbidity from 0 to 3.
-    without
-        Effects to leave out, by the names of `twin.options.Effects` ("multiple-scattering").
-    ideal
-        Leave out all effects: a pinhole's sharp image without noise.
     frames
         Numbers of the scan's images to render, from 0 on; all of them unless given.
-    variant
-        Mitsuba variant, "llvm_ad_mono" (CPU) or "cuda_ad_mono" (NVIDIA GPU).
+    scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
+        As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
 
     Raises
     ------
-    DescriptionError
-        A description, name or option is wrong.
-    DesignError
-        The sensor cannot measure the scene.
-    SetupError
-        Mitsuba cannot use the variant on this machine.
+    DescriptionError, DesignError, SetupError
+        As for `simulate`.
     """
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     _, built = choose_sensors(sensor, as_built)
-    options = choose_options(spp=spp, seed=seed, without=without, ideal=ideal)
+    options = Options.chosen(spp=spp, seed=seed, without=without, ideal=ideal)
     shots = list(enumerate(described.motion.shots()))
     if frames is not None:
         if not frames or not all(0 <= number < len(shots) for number in frames):
@@ -120,11 +100,8 @@ def render(
     taken = [studio.frame(shot, number) for number, shot in shots]
     truths = [studio.truth(shot) for _, shot in shots]
     return Recording(
-        images=np.stack([frame.image for frame in taken]),
-        stage_mm=np.array([frame.stage_mm for frame in taken]),
-        laser_on=np.array([frame.laser_on for frame in taken]),
-        exposure_ms=np.array([frame.exposure_ms for frame in taken]),
-        time_s=np.array([frame.time_s for frame in taken]),
+        np.stack([frame.image for frame in taken]),
+        *(np.array([getattr(frame, name) for frame in taken]) for name in FRAME_DATA),
         truth=truth_of_recording(studio, truths, first=shots[0][1]),
         sensor=studio.sensor,
         medium=studio.medium,
@@ -133,48 +110,77 @@ def render(
 
 
 def simulate(
-    scene: str | Path | Scene,
+    scene: AnyScene,
     *,
     out: str | Path,
-    sensor: str | Path | Sensor = "thesis",
-    as_built: str | Path | Sensor | None = None,
+    sensor: AnySensor = "thesis",
+    as_built: AnySensor | None = None,
     placement: str | Sequence[str] = (),
     medium: str | None = None,
     spp: int = 16,
     seed: int = 0,
-    water: str | float | None = None,
+    water: float | str | None = None,
     without: Sequence[str] = (),
     ideal: bool = False,
     resume: bool = False,
     overwrite: bool = False,
-    variant: str = CPU,
+    variant: Variant = CPU,
     show_progress: bool = False,
     report: Callable[[str], object] = lambda line: None,
 ) -> list[Path]:
-    """Render a scene into a capture, with the ground truth in a file beside it; returns the captures' paths.
+    """Render a scene into a capture, with the ground truth in a file beside it.
 
     Parameters
     ----------
+    scene
+        Name of a scene (see: twin scenes) or path of its TOML file.
     out
         Capture to write, such as capture.h5; the truth goes to capture.truth.h5. With several placements the name
-        holds ``{placement}``.
+        holds {placement}.
+    sensor
+        Name or path of the sensor description that the capture states.
+    as_built
+        Name or path of the sensor that is really rendered, if it differs from the description.
     placement
-        Named place of the objects, or several, which are recorded one after the other.
+        Named place of the objects, such as near, standoff or far; several are recorded one after the other.
+    medium
+        Name of one of the sensor's media, in place of the scene's.
+    spp
+        Samples per lit pixel.
+    seed
+        Seed of all noise; the same seed gives the same capture.
+    water
+        What floats in the water, in place of the medium's own: pure, clear, coastal, harbour, jerlov-I to jerlov-9C,
+        or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
+    without
+        Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
+        fixed-pattern, noise.
+    ideal
+        Leave out all of these effects: a pinhole's sharp image without noise.
     resume
         Go on with an interrupted run.
     overwrite
         Replace existing files.
+    variant
+        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     show_progress
         Draw a progress bar on the terminal.
     report
         Called with a line of text for each file that is written.
-    scene, sensor, as_built, medium, spp, seed, water, without, ideal, variant
-        As for `render`; the capture states ``sensor``.
+
+    Returns
+    -------
+    list of Path
+        The captures.
 
     Raises
     ------
-    DescriptionError, DesignError, SetupError
-        As for `render`.
+    DescriptionError
+        A description, name or option is wrong.
+    DesignError
+        The sensor cannot measure the scene.
+    SetupError
+        Mitsuba cannot use the variant on this machine.
     OutputError
         A file exists already, or cannot be written.
     """
@@ -183,38 +189,22 @@ def simulate(
     if len(places) > 1 and "{placement}" not in out.name:
         raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
     described = [choose_scene(scene, placement=place, medium=medium, water=water) for place in places]
-    paths = [out.with_name(out.name.replace("{placement}", each.placement)) for each in described]
     nominal, built = choose_sensors(sensor, as_built)
-    options = choose_options(spp=spp, seed=seed, without=without, ideal=ideal)
+    options = Options.chosen(spp=spp, seed=seed, without=without, ideal=ideal)
     use_variant(variant)
     from twin.recording.studio import record_scene
 
-    for each, path in zip(described, paths, strict=True):
-        bar = (
-            progress_bar(f"{each.title}, {each.placement}") if show_progress else nullcontext(lambda done, total: None)
-        )
-        with bar as progress:
-            record_scene(
-                each,
-                nominal,
-                path,
-                as_built=built,
-                options=options,
-                overwrite=overwrite,
-                resume=resume,
-                progress=progress,
-            )
+    files, paths = {"overwrite": overwrite, "resume": resume}, []
+    for each in described:
+        path = out.with_name(out.name.replace("{placement}", each.placement))
+        with progress_bar(f"{each.title}, {each.placement}") if show_progress else nullcontext(None) as progress:
+            record_scene(each, nominal, path, as_built=built, options=options, progress=progress, **files)
         report(f"wrote {path}")
+        paths.append(path)
     return paths
 
 
-def choose_scene(
-    scene: str | Path | Scene,
-    *,
-    placement: str | None = None,
-    medium: str | None = None,
-    water: str | float | None = None,
-) -> Scene:
+def choose_scene(scene: AnyScene, *, placement: str | None, medium: str | None, water: float | str | None) -> Scene:
     """The scene with what is given in place of its own placement, medium and water."""
     if not isinstance(scene, Scene):
         return load_scene(scene, placement=placement, medium=medium, water=water)
@@ -223,7 +213,7 @@ def choose_scene(
     return validated(Scene, scene.model_dump() | changes, scene.title)
 
 
-def choose_sensors(sensor: str | Path | Sensor, as_built: str | Path | Sensor | None) -> tuple[Sensor, Sensor]:
+def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Sensor, Sensor]:
     """The sensor as described and as built, whose images must fit each other; DescriptionError where they do not."""
     nominal = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
     if as_built is None:
@@ -234,8 +224,3 @@ def choose_sensors(sensor: str | Path | Sensor, as_built: str | Path | Sensor | 
         names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
         raise DescriptionError(f"'{names[0]}' has another image size or stripe orientation than '{names[1]}'")
     return nominal, built
-
-
-def choose_options(*, spp: int, seed: int, without: Sequence[str], ideal: bool) -> Options:
-    """Options of rendering, with some effects or all of them left out."""
-    return Options(spp=spp, seed=seed, effects=(NONE if ideal else ALL).without(*without))

@@ -6,9 +6,10 @@ import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
-from twin.options import CPU, Options, use_variant
+from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
 from uwlts.model.errors import DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
@@ -34,33 +35,37 @@ def reproduce(
     trials: int = 100,
     workers: int | None = None,
     overwrite: bool = False,
-    variant: str = CPU,
+    variant: Variant = CPU,
     show_progress: bool = False,
 ) -> Path:
-    """Render the thesis's whole evaluation and evaluate it with ``uwlts thesis``; returns the report.
+    """Render the thesis's whole evaluation, evaluate it by all its methods, and set its tables beside the results.
+
+    Every campaign has imperfections and noise of its own. Run again, it goes on where it was stopped, and adds
+    campaigns if more are asked for. The report is OUT/report.html, whose path is returned.
 
     Parameters
     ----------
     campaign
         Name or path of the campaign's description; "thesis" unless given, or "joint" with ``joint``.
     joint
-        Compare the joint calibration with the thesis's two ways on the same images.
+        Compare the joint calibration with the thesis's two ways on the same images; writes OUT/report.html and
+        summary.json.
     out
         Folder for campaigns and report; runs/CAMPAIGN unless given. What is complete in it is not rendered again.
-    campaigns, first
-        Number of campaigns, and the seed of the first one; the others follow.
+    campaigns
+        Number of campaigns.
+    first
+        Seed of the first campaign; the others follow.
     every
         Take only every n-th profile of the scans; calibrations keep all their images.
-    spp
-        Samples per lit pixel.
     trials
         Trials of the Monte-Carlo propagation of every campaign, at least 20, or 0 for none.
     workers
         Recordings rendered at a time; as many as there are processors unless given.
     overwrite
         Render and evaluate everything anew.
-    variant
-        Mitsuba variant, "llvm_ad_mono" (CPU) or "cuda_ad_mono" (NVIDIA GPU).
+    spp, variant
+        As for `simulate`.
     show_progress
         Draw progress bars on the terminal.
 
@@ -105,26 +110,20 @@ def reproduce(
 
 @dataclass(frozen=True)
 class _Job:
-    """A take to render into a file."""
+    """A take to render into a file, with its number of images and its files: capture, truth, unfinished capture."""
 
     take: Take
     path: Path
-    options: Options
+    spp: int
     variant: str
 
-    def files(self) -> tuple[Path, Path, Path]:
-        """Capture, truth and unfinished capture."""
-        return self.path, truth_path(self.path), part_path(self.path)
-
-    def complete(self) -> bool:
-        """Whether the recording is there as a whole."""
-        capture, truth, part = self.files()
-        return capture.is_file() and truth.is_file() and not part.exists()
-
+    @property
     def images(self) -> int:
-        """Number of images of the recording."""
-        motion = self.take.scene.motion
-        return motion.count * len(motion.lights)
+        return self.take.scene.motion.count * len(self.take.scene.motion.lights)
+
+    @property
+    def files(self) -> tuple[Path, Path, Path]:
+        return self.path, truth_path(self.path), part_path(self.path)
 
 
 def record_campaigns(
@@ -142,54 +141,42 @@ def record_campaigns(
     """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; returns these folders.
 
     Complete recordings stay as they are and interrupted ones are gone on with; ``overwrite`` removes those of the
-    seeds and renders all anew. ``progress(done, total)`` counts images.
-
-    Raises
-    ------
-    DescriptionError
-        The folder holds a campaign that was rendered differently, or the campaign's descriptions are wrong.
-    DesignError
-        The sensor cannot measure a scene.
-    OutputError
-        A file cannot be written.
-    SetupError
-        A process that renders was ended from outside.
+    seeds and renders all anew. ``progress(done, total)`` counts images. DescriptionError where the folder holds a
+    campaign that was rendered differently, or a description is wrong; DesignError where the sensor cannot measure a
+    scene; OutputError where a file cannot be written; SetupError where a process that renders was ended from outside.
     """
     folders = [folder / f"campaign-{seed}" for seed in seeds]
     jobs = [
-        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed), variant)
+        _Job(take, place / f"{take.name}.h5", spp, variant)
         for seed, place in zip(seeds, folders, strict=True)
         for take in takes(campaign, seed=seed, every=every)
     ]
     plan = {"campaign": campaign.model_dump(mode="json"), "every": every, "spp": spp, "variant": variant}
-    _keep_to_plan(folder, json.loads(json.dumps(plan)), jobs, overwrite=overwrite)
+    _keep_to_plan(folder, plan, {file for job in jobs for file in job.files}, overwrite=overwrite)
     for place in folders:
         place.mkdir(exist_ok=True)
     if overwrite:
         # All at once and not one by one: what an interrupted run leaves must not be taken for its own.
-        for path in (path for job in jobs for path in job.files()):
+        for path in (path for job in jobs for path in job.files):
             path.unlink(missing_ok=True)
-    waiting = [job for job in jobs if not job.complete()]
-    total = sum(job.images() for job in jobs)
-    done = total - sum(job.images() for job in waiting)
-    progress(done, total)
-
-    def count(_: None) -> None:
-        nonlocal done
-        done += 1
-        progress(done, total)
-
     # The longest first, so that no process is left alone with a long one at the end.
-    work_through(_record, sorted(waiting, key=_Job.images, reverse=True), workers=workers, on_message=count)
+    waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
+    waiting.sort(key=lambda job: job.images, reverse=True)
+    total = sum(job.images for job in jobs)
+    counted = count(total - sum(job.images for job in waiting))
+    progress(next(counted), total)
+    work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
     return folders
 
 
-def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, overwrite: bool) -> None:
-    """Write the settings of a folder's campaigns, or check that they are the same as before."""
+def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, overwrite: bool) -> None:
+    """Write the settings of a folder's campaigns, or check that they are the same as before; ``files`` are theirs."""
     path = folder / PLAN
+    text = json.dumps(plan, indent=2) + "\n"
+    plan = json.loads(text)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        recorded = sorted(folder.glob("campaign-*/*.h5*"))
+        recorded = set(folder.glob("campaign-*/*.h5*"))
         content = path.read_bytes() if path.is_file() else b"null"
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
@@ -199,22 +186,19 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], jobs: list[_Job], *, ov
         known = None
     if known == plan:
         return
-    if recorded:
-        how = f"that {PLAN} does not describe"
-        if isinstance(known, dict):
-            how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
-        if not overwrite:
-            raise DescriptionError(
-                f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start "
-                "afresh"
-            )
-        kept = set(recorded) - {file for job in jobs for file in job.files()}
-        if kept:
-            raise DescriptionError(
-                f"{folder} would keep recordings {how}, such as {min(kept)}: give another folder, or remove them first"
-            )
+    how = f"that {PLAN} does not describe"
+    if isinstance(known, dict):
+        how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
+    if recorded and not overwrite:
+        raise DescriptionError(
+            f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start afresh"
+        )
+    if kept := recorded - files:
+        raise DescriptionError(
+            f"{folder} would keep recordings {how}, such as {min(kept)}: give another folder, or remove them first"
+        )
     with written_aside(path, overwrite=True) as aside:
-        aside.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
+        aside.write_text(text, encoding="utf-8")
 
 
 def _record(job: _Job, report: Callable[[None], None]) -> None:
@@ -225,15 +209,16 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
     from twin.recording.studio import record_scene
 
     dr.set_thread_count(1)
+    take = job.take
     try:
-        # What is there of an incomplete recording is a part to go on with, or lacks its truth.
         record_scene(
-            job.take.scene,
-            job.take.sensor,
+            take.scene,
+            take.sensor,
             job.path,
-            as_built=job.take.built,
-            options=job.options,
+            as_built=take.built,
+            options=Options(spp=job.spp, seed=take.seed),
             overwrite=True,
+            # What is there of an incomplete recording is a part to go on with, or lacks its truth.
             resume=part_path(job.path).exists(),
             progress=lambda images, total: report(None),
         )

@@ -13,7 +13,7 @@ from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
 from twin.recording.truth import FrameTruth, depth_map, no_stripe, true_stripe
-from twin.scene.description import Printed, Scene, Shot
+from twin.scene.description import Printed, Scene, Shot, altered
 from twin.scene.pattern import shift_points
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.speckle import Speckle, coherence
@@ -43,18 +43,11 @@ def medium_of(sensor: Sensor, scene: Scene) -> Medium:
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
     """The sensor with its camera's window in place or taken off."""
-    window = sensor.camera.window.model_copy(update={"mounted": mounted})
-    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
+    return altered(sensor, camera={"window": {"mounted": mounted}})
 
 
 def check_scene(renderer: Renderer, scene: Scene) -> None:
-    """Refuse a scene whose objects the sensor cannot measure, with numbers.
-
-    Raises
-    ------
-    DesignError
-        All objects lie outside the depth of the measuring volume, or the scan never brings the sheet to them.
-    """
+    """DesignError where objects lie outside the measuring volume's depth, or no scan brings the sheet to them."""
     volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
     # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
     nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
@@ -90,25 +83,19 @@ class Studio:
             else None
         )
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
-        shortest_s = self._shortest_period_s()
+        shortest_s = max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
         motion = scene.motion
-        if motion.speed_mm_per_s > 0 and motion.count > 1 and self.period_s < shortest_s * (1 - 1e-9):
+        # Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out.
+        moving = motion.speed_mm_per_s > 0
+        self.period_s = (
+            abs(motion.step_mm) / motion.speed_mm_per_s if moving else self.sensor.stage.settling_s + shortest_s
+        )
+        if moving and motion.count > 1 and self.period_s < shortest_s * (1 - 1e-9):
             raise DesignError(
                 f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached after "
                 f"{1e3 * self.period_s:.3g} ms, but the camera needs {1e3 * shortest_s:.3g} ms from frame to frame: "
                 "travel more slowly, in longer steps, or with shorter exposures"
             )
-
-    @property
-    def period_s(self) -> float:
-        """Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out."""
-        motion = self.scene.motion
-        if motion.speed_mm_per_s > 0:
-            return abs(motion.step_mm) / motion.speed_mm_per_s
-        return self.sensor.stage.settling_s + self._shortest_period_s()
-
-    def _shortest_period_s(self) -> float:
-        return max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
 
     def pose(self, shot: Shot) -> np.ndarray:
         """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
@@ -133,13 +120,19 @@ class Studio:
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) of a shot."""
         if shot.light == "lamp":
-            irradiance = self.renderer.irradiance("lamp", self.pose(shot), spp=spp, travel=travel)
-        else:
-            frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
-            irradiance = frame.irradiance(self._grain(frame, shot) if self.options.effects.speckle else 1.0)
-        return electrons_per_ms(
-            irradiance, self.sensor.camera, self.sensor.detector, wavelength_nm=self.sensor.laser.wavelength_nm
-        )
+            return self._electrons(self.renderer.irradiance("lamp", self.pose(shot), spp=spp, travel=travel))
+        frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
+        return self._electrons(frame.irradiance(self._grain(frame, shot) if self.options.effects.speckle else 1.0))
+
+    def daylight_electrons_per_ms(self, shot: Shot) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W) that are left when laser and lamp are off."""
+        if not (self.options.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
+            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        return self._electrons(self.renderer.daylight(self.pose(shot), spp=self.options.spp))
+
+    def _electrons(self, irradiance: np.ndarray) -> np.ndarray:
+        sensor = self.sensor
+        return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
 
     def _grain(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
         """Speckle factors (P,) of the stripe's pixels."""
@@ -167,13 +160,17 @@ class Studio:
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
         self._shift_points(shot, index)
-        rng = np.random.default_rng([self.options.seed, index]) if self.options.effects.noise else None
         walks = np.random.SeedSequence([self.options.seed, index])
         exposure = self.exposure_ms[shot.light]
-        light = exposure * self.electrons_per_ms(
+        light = self.electrons_per_ms(
             shot, spp=self.options.spp, seed=int(walks.generate_state(1)[0]), travel=self.travel(shot.light)
         )
-        return grey_values(light, self.sensor.detector, exposure_ms=exposure, rng=rng, pattern=self._pattern)
+        return self.detected(exposure * light, exposure_ms=exposure, noise_seed=[self.options.seed, index])
+
+    def detected(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
+        """Grey values (H, W) of mean photo-electrons (H, W), with the noise of a seed if noise is rendered."""
+        rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
+        return grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
 
     def truth(self, shot: Shot) -> FrameTruth:
         """What every profile line of a shot truly shows."""
@@ -221,31 +218,6 @@ def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], *, first: S
     return Truth(**stacked, depth_mm=depth_map(studio.renderer, studio.pose(first)))
 
 
-def _header(name: str, nominal: Sensor, studio: Studio, scene: Scene) -> CaptureHeader:
-    """What an operator would note in the capture: nominal values only."""
-    window_mounted = studio.sensor.camera.window.mounted
-    return CaptureHeader(
-        name=name,
-        sensor=with_window(nominal, mounted=window_mounted),
-        medium_name=scene.medium,
-        medium=medium_of(nominal, scene),
-        stage_direction=scene.motion.recorded_direction(),
-        saturation_dn=nominal.detector.full_scale_dn(),
-        target=scene.target,
-        artefact=scene.artefact,
-        provenance={
-            "source": "twin",
-            "seed": studio.options.seed,
-            "spp": studio.options.spp,
-            "effects": studio.options.effects.names(),
-            "variant": mi.variant(),
-            "mitsuba": version("mitsuba"),
-            "drjit": version("drjit"),
-            "uwlts": version("uwlts"),
-        },
-    )
-
-
 def record_scene(
     scene: Scene,
     sensor: Sensor,
@@ -255,26 +227,38 @@ def record_scene(
     options: Options = Options(),
     overwrite: bool = False,
     resume: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: Progress | None = None,
 ) -> None:
     """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
 
     Images show ``as_built`` (the sensor itself unless given), the capture states ``sensor``. An interrupted run leaves
     ``path.part`` with all complete frames; ``resume`` goes on from there and gives the same capture as an undisturbed
-    run. ``progress(done, total)`` is called after every frame.
-
-    Raises
-    ------
-    DesignError, DescriptionError
-        The sensor or the scene cannot work.
-    OutputError
-        A file exists already, or cannot be written.
+    run. ``progress(done, total)`` is called after every frame. DesignError and DescriptionError where the sensor or the
+    scene cannot work; OutputError where a file exists already, or cannot be written.
     """
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):
         raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
     studio = Studio(as_built or sensor, scene, options)
-    header = _header(path.stem, sensor, studio, scene)
+    # What an operator would note: nominal values only.
+    header = CaptureHeader(
+        name=path.stem,
+        sensor=with_window(sensor, mounted=studio.sensor.camera.window.mounted),
+        medium_name=scene.medium,
+        medium=medium_of(sensor, scene),
+        stage_direction=scene.motion.recorded_direction(),
+        saturation_dn=sensor.detector.full_scale_dn(),
+        target=scene.target,
+        artefact=scene.artefact,
+        provenance={
+            "source": "twin",
+            "seed": studio.options.seed,
+            "spp": studio.options.spp,
+            "effects": studio.options.effects.names(),
+            "variant": mi.variant(),
+            **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
+        },
+    )
     shots = list(scene.motion.shots())
     truths: list[FrameTruth] = []
     dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
@@ -284,7 +268,8 @@ def record_scene(
             truths.append(studio.truth(shot))
             if index >= done:
                 writer.append(studio.frame(shot, index))
-            progress(index + 1, len(shots))
-        truth_header = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
+            if progress is not None:
+                progress(index + 1, len(shots))
+        described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
         truth = truth_of_recording(studio, truths, first=shots[0])
-        write_truth(truth_path(path), truth_header, truth, overwrite=overwrite or resume)
+        write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self, cast
+from typing import Annotated, Literal, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
@@ -19,6 +19,7 @@ from uwlts.model.library import find, names, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Positive, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
+Kind = TypeVar("Kind", bound=Description)
 Reflectance = Annotated[float, Field(ge=0, le=1)]
 Finish = Literal["diffuse", "painted", "pvc", "metal"]
 
@@ -26,6 +27,19 @@ TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
 """GGX roughness: a satin paint, an extruded pipe, ground steel."""
 TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
 """Rms heights in um. Light out of a diffuse body has run through some um of it, whatever its surface."""
+
+
+def altered(described: Kind, **changes: object) -> Kind:
+    """A copy with values replaced, unvalidated; a table of changes goes to the description that it is meant for."""
+    inner = {name: getattr(described, name) for name in changes}
+    return described.model_copy(
+        update={
+            name: altered(inner[name], **change)
+            if isinstance(change, dict) and isinstance(inner[name], Description)
+            else change
+            for name, change in changes.items()
+        }
+    )
 
 
 class Pose(Description):

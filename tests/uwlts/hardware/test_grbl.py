@@ -402,7 +402,7 @@ def test_the_laser_follows_and_its_power_is_a_share(controller, stage):
 
 
 def test_a_laser_that_gives_no_light_is_seen_by_the_twin_alone(controller, stage):
-    controller.break_laser()
+    controller.inject("break-laser")
     stage.laser(True)
     assert not controller.state().laser_on and stage.laser_power == 1.0
 
@@ -441,16 +441,16 @@ def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(cont
     ("fault", "message", "recovers"),
     [
         (lambda c: c.disconnect(), "connection is lost.*CANNOT be switched", False),
-        (lambda c: c.stall(), "stall: the stage has stood at", True),
-        (lambda c: c.alarm(1), "ALARM:1, hard limit.*home", True),
-        (lambda c: c.alarm(3), "ALARM:3, reset while moving", True),
-        (lambda c: c.garbage(), "garbage on the line", True),
-        (lambda c: c.garbage(b"x" * 300), "garbage on the line", True),
-        (lambda c: c.garbage(b"ok\r\nok\r\n"), "came although nothing was sent", True),
-        (lambda c: c.restart(), "restarted by itself", True),
-        (lambda c: c.mute(), "silence: 3 status queries", False),
-        (lambda c: c.hold(), "feed hold", True),
-        (lambda c: c.lose_steps(-80 * 400), "missed steps: the limit switch at 0 mm is pressed", True),
+        (lambda c: c.inject("stall"), "stall: the stage has stood at", True),
+        (lambda c: c.inject("alarm", 1), "ALARM:1, hard limit.*home", True),
+        (lambda c: c.inject("alarm", 3), "ALARM:3, reset while moving", True),
+        (lambda c: c.inject("garbage"), "garbage on the line", True),
+        (lambda c: c.inject("garbage", noise=b"x" * 300), "garbage on the line", True),
+        (lambda c: c.inject("garbage", noise=b"ok\r\nok\r\n"), "came although nothing was sent", True),
+        (lambda c: c.inject("restart"), "restarted by itself", True),
+        (lambda c: c.inject("mute"), "silence: 3 status queries", False),
+        (lambda c: c.inject("hold"), "feed hold", True),
+        (lambda c: c.inject("lose-steps", -80 * 400), "missed steps: the limit switch at 0 mm is pressed", True),
     ],
 )
 def test_a_fault_while_moving_is_named_and_the_laser_is_off(controller, stage, fault, message, recovers):
@@ -473,16 +473,16 @@ def test_a_fault_while_moving_is_named_and_the_laser_is_off(controller, stage, f
 
 
 def test_a_movement_that_ends_short_by_more_than_a_step_is_named(controller, stage):
-    controller.stop_short(1)
+    controller.inject("stop-short", 1)
     assert stage.move_to(10.0, feed_mm_per_min=900.0) == pytest.approx(10.0 - STEP_MM, abs=1e-9)
-    controller.stop_short(3)
+    controller.inject("stop-short", 3)
     with pytest.raises(HardwareError, match=r"missed steps: 19\.962 mm read back where 20\.000 mm .* -3 steps"):
         stage.move_to(20.0, feed_mm_per_min=900.0)
     assert not controller.state().laser_on
 
 
 def test_noise_at_rest_leaves_the_position_to_be_unlocked(controller, stage):
-    controller.garbage()
+    controller.inject("garbage")
     with pytest.raises(HardwareError, match="garbage"):
         stage.position_mm()
     assert stage.unlock() == 2.0
@@ -580,13 +580,13 @@ def test_closing_is_confirmed_or_an_error(controller):
     # A controller whose port is closed and opened within 2 ms does not notice and must be woken, which takes 2.5 s.
     assert wait_for(lambda: not controller.state().port_open)
     with pytest.raises(HardwareError, match="does not restart on Ctrl-X"), GrblStage(controller.port):
-        controller.mute()
+        controller.inject("mute")
 
 
 def test_an_error_in_the_body_is_not_hidden_by_closing(controller):
     with pytest.raises(OSError, match="disk full"), GrblStage(controller.port) as stage:
         stage.home()
         stage.laser(True)
-        controller.mute()
+        controller.inject("mute")
         raise OSError(errno.ENOSPC, "disk full")
     assert wait_for(lambda: not controller.state().laser_on, 0.5)
