@@ -90,7 +90,7 @@ def test_beside_another_calibration_and_without_a_joint_estimate(folder: Path):
     assert "Against nominal.json" in (folder / "cert.html").read_text(encoding="utf-8")
     plain = run("certificate", "nominal.json", folder=folder)
     assert plain.returncode == 0, plain.stderr
-    assert "what lengths measured by it are worth is not known" in plain.stdout
+    assert "the uncertainty of lengths measured by it is not known" in plain.stdout
     wrong = run("certificate", "nominal.json", "--check", "nominal.json", folder=folder)
     assert wrong.returncode == 2
     assert "is JSON but not a certificate" in wrong.stderr

@@ -2,34 +2,24 @@
 
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from markupsafe import Markup
+from matplotlib.axes import Axes
 
 import uwlts
-from uwlts.measurement.evaluation_file import ArtefactFigures, TruthComparisons, TruthFigures
-from uwlts.model.calibration import Calibration
+from uwlts.measurement.evaluation_file import TruthComparisons
 from uwlts.model.errors import OutputError
 from uwlts.report import plot
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference, gather_campaign, load_reference
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
-from uwlts.report.page_toolkit import (
-    Comparison,
-    FigureCollector,
-    InteractiveFigure,
-    Tile,
-    png_data_uri,
-    render_page,
-    svg_of,
-    write_page,
-)
+from uwlts.report.page_toolkit import Comparison, FigureCollector, Tile, png_data_uri, render_page, svg_of, write_page
 from uwlts.report.pictures import MeasurementPictures, draw_pictures, write_pictures
-from uwlts.report.summary_file import TruthSummary, summary, write_summary
+from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table, true_window_distance
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
@@ -109,8 +99,8 @@ def report_page(
     campaign: Campaign, reference: Reference | None = None, *, pictures: Sequence[MeasurementPictures] | None = None
 ) -> str:
     """The page as text; ``pictures`` are those of `draw_pictures`, drawn unless given."""
-    collected = FigureCollector()
-    rows = summary_table(campaign, reference)
+    collected, rows = FigureCollector(), summary_table(campaign, reference)
+    drawn = zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)
     return render_page(
         "uwlts.report",
         "campaign.html.j2",
@@ -121,11 +111,8 @@ def report_page(
         groups=_grouped(rows),
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
-        measurements=[
-            _measurement(measurement, drawn, collected)
-            for measurement, drawn in zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)
-        ],
-        calibration=_calibrations(campaign),
+        measurements=[_measurement(measurement, each, collected) for measurement, each in drawn],
+        calibration=_calibrations(campaign) if campaign.calibrations else None,
         true_window=true_window_distance(campaign) is not None,
         seconds=svg_of(plot.seconds(campaign.seconds)) if campaign.seconds else None,
         seconds_in_all=sum(campaign.seconds.values()),
@@ -133,62 +120,42 @@ def report_page(
     )
 
 
-@dataclass(frozen=True)
-class _MeasurementSection:
-    """What the page shows of one measurement; what it lacks is None."""
-
-    name: str
-    facts: list[tuple[str, str]]
-    stripe: str | None
-    no_stripe: str
-    cloud: InteractiveFigure | None
-    histogram: Markup | None
-    along: Markup | None
-    deviation_from: str
-    figures: Comparison | None
-    truth: Comparison | None
+def _drawn(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:
+    """A plot as SVG; None if there is nothing to draw."""
+    try:
+        return svg_of(draw(shown, **options))
+    except plot.NothingToDrawError:
+        return None
 
 
-@dataclass(frozen=True)
-class _ResidualPlots:
-    """Plots of one calibration's residuals with their captions."""
-
-    name: str
-    plots: list[tuple[Markup, str]]
-
-
-@dataclass(frozen=True)
-class _CalibrationSection:
-    """What the page shows of all calibrations."""
-
-    parameters: Comparison
-    residuals: Comparison
-    warnings: list[tuple[str, str]]
-    curve: Markup | None
-    groups: list[_ResidualPlots]
-
-
-def _measurement(
-    measurement: Measurement, pictures: MeasurementPictures, collected: FigureCollector
-) -> _MeasurementSection:
-    cloud, judged, capture = measurement.cloud, measurement.judged, measurement.capture
-    coloured = cloud is not None and cloud.deviation_mm is not None and bool(np.isfinite(cloud.deviation_mm).any())
-    shown = None
+def _measurement(measurement: Measurement, pictures: MeasurementPictures, collected: FigureCollector) -> dict[str, Any]:
+    """Parts of a measurement's section; what it lacks is None."""
+    cloud, evaluation = measurement.cloud, None if measurement.judged is None else measurement.judged.evaluation
+    truth = None if measurement.judged is None else measurement.judged.truth
+    shown = figures = None
     if cloud is not None and pictures.cloud is not None:
         figure, caption = plot.interactive_cloud(cloud)
         shown = collected.add(figure, caption, webgl=True, still=png_data_uri(pictures.cloud))
-    return _MeasurementSection(
-        name=measurement.name,
-        facts=_facts(measurement),
-        stripe=None if pictures.stripe is None else png_data_uri(pictures.stripe),
-        no_stripe="no image of its capture shows a stripe" if capture else "its capture is not in the folder",
-        cloud=shown,
-        histogram=svg_of(plot.deviation_histogram(cloud)) if cloud is not None and coloured else None,
-        along=svg_of(plot.along_stripe(cloud)) if cloud is not None and plot.has_profile(cloud) else None,
-        deviation_from="the artefact's fitted surface" if judged and judged.evaluation else "the true surface",
-        figures=None if judged is None or judged.evaluation is None else _figure_table(judged.evaluation),
-        truth=None if judged is None or judged.truth is None else _truth_table(judged.truth),
-    )
+    if evaluation is not None:
+        rows = [
+            (name, "", (small_length(value, signed="error" in name or "SSE" in name),))
+            for name, value in evaluation.figures_mm.items()
+        ]
+        figures = Comparison(("value",), tuple(rows))
+    recorded = measurement.capture is not None
+    no_stripe = "no image of its capture shows a stripe" if recorded else "its capture is not in the folder"
+    return {
+        "name": measurement.name,
+        "facts": _facts(measurement),
+        "stripe": None if pictures.stripe is None else png_data_uri(pictures.stripe),
+        "no_stripe": no_stripe,
+        "cloud": shown,
+        "histogram": None if cloud is None else _drawn(plot.deviation_histogram, cloud),
+        "along": None if cloud is None else _drawn(plot.along_stripe, cloud),
+        "deviation_from": "the artefact's fitted surface" if evaluation else "the true surface",
+        "figures": figures,
+        "truth": None if truth is None else _truth_table(truth),
+    }
 
 
 def _facts(measurement: Measurement) -> list[tuple[str, str]]:
@@ -196,8 +163,7 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
     facts = []
     if judged is not None and judged.artefact is not None:
         artefact = judged.artefact.model_dump(mode="json", exclude_none=True)
-        kind = artefact.pop("kind")
-        facts.append(("artefact", f"{kind}: {_pairs(artefact)}"))
+        facts.append(("artefact", f"{artefact.pop('kind')}: {_pairs(artefact)}"))
     if capture is not None:
         laser = len(capture.laser_images)
         facts.append(("capture", f"{capture.path.name}, {capture.images} images, {laser} with the laser on"))
@@ -216,64 +182,50 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
     return facts
 
 
-def _truth(truth: TruthFigures) -> list[tuple[str, str]]:
-    return [
-        (f"points within {1e3 * truth.tolerance_mm:g} µm", f"{100 * truth.share_within_tolerance:.2f} %"),
-        ("mean distance", small_length(truth.mean_mm, signed=True)),
-        ("standard deviation", small_length(truth.std_mm)),
-        ("rms distance", small_length(truth.rms_mm)),
-        ("95 % are closer than", small_length(truth.p95_mm)),
-        ("99 % are closer than", small_length(truth.p99_mm)),
-        ("largest distance", small_length(truth.largest_mm)),
-        ("points compared", f"{truth.matched:,}"),
-        ("points where no stripe is visible", f"{truth.false_points:,}"),
-        ("visible stripe points not found", f"{truth.missed:,}"),
+def _truth_table(compared: TruthComparisons) -> Comparison:
+    """Distances to the true surface as measured, and after the best fit if there is one."""
+    columns = {"as measured": compared, "after best fit": compared.after_best_fit}
+    shown = {heading: truth for heading, truth in columns.items() if truth is not None}
+    texts = [
+        {
+            f"points within {1e3 * truth.tolerance_mm:g} µm": f"{100 * truth.share_within_tolerance:.2f} %",
+            "mean distance": small_length(truth.mean_mm, signed=True),
+            "standard deviation": small_length(truth.std_mm),
+            "rms distance": small_length(truth.rms_mm),
+            "95 % are closer than": small_length(truth.p95_mm),
+            "99 % are closer than": small_length(truth.p99_mm),
+            "largest distance": small_length(truth.largest_mm),
+            "points compared": f"{truth.matched:,}",
+            "points where no stripe is visible": f"{truth.false_points:,}",
+            "visible stripe points not found": f"{truth.missed:,}",
+        }
+        for truth in shown.values()
     ]
+    rows = zip(texts[0], zip(*(column.values() for column in texts), strict=True), strict=True)
+    return Comparison(tuple(shown), tuple((words, "", values) for words, values in rows))
 
 
-def _truth_table(truth: TruthComparisons) -> Comparison:
-    columns = {"as measured": truth} | ({"after best fit": truth.after_best_fit} if truth.after_best_fit else {})
-    described = [_truth(found) for found in columns.values()]
-    rows = tuple((entries[0][0], "", tuple(text for _, text in entries)) for entries in zip(*described, strict=True))
-    return Comparison(tuple(columns), rows)
-
-
-def _figure_table(evaluation: ArtefactFigures) -> Comparison:
-    rows = [
-        (name, "", (small_length(value, signed="error" in name or "SSE" in name),))
-        for name, value in evaluation.figures_mm.items()
-    ]
-    return Comparison(("value",), tuple(rows))
-
-
-def _calibrations(campaign: Campaign) -> _CalibrationSection | None:
-    if not campaign.calibrations:
-        return None
+def _calibrations(campaign: Campaign) -> dict[str, Any]:
+    """Parts of the section about all calibrations."""
     by_name = {found.name: found.calibration for found in campaign.calibrations}
-    true_mm = true_window_distance(campaign)
-    return _CalibrationSection(
-        parameters=parameter_table(campaign),
-        residuals=residual_table(campaign.calibrations),
-        warnings=[(name, text) for name, each in by_name.items() for text in _warnings(each.provenance)],
-        curve=svg_of(plot.window_curves(by_name, true_mm=true_mm)) if plot.has_window_curve(by_name) else None,
-        groups=[_ResidualPlots(name, _residual_plots(calibration)) for name, calibration in by_name.items()],
-    )
-
-
-def _residual_plots(calibration: Calibration) -> list[tuple[Markup, str]]:
-    plots = []
-    for found in plot.residual_lists(calibration):
-        words = words_of(found.name)
-        caption = _CAPTIONS.get(
-            f"{found.group} {found.name}", f"{found.group}: {words}." if found.group else f"{words}."
-        )
-        plots.append((svg_of(plot.residuals(calibration, which=found)), caption))
-    return plots
-
-
-def _warnings(provenance: dict[str, Any]) -> list[str]:
-    found = provenance.get("warnings")
-    return [_value(text) for text in found] if isinstance(found, list) else []
+    warnings, groups = [], []
+    for name, calibration in by_name.items():
+        found = calibration.provenance.get("warnings")
+        warnings += [(name, _value(text)) for text in found] if isinstance(found, list) else []
+        plots = []
+        for each in plot.residual_lists(calibration):
+            words = words_of(each.name)
+            caption = f"{each.group}: {words}." if each.group else f"{words}."
+            caption = _CAPTIONS.get(f"{each.group} {each.name}", caption)
+            plots.append((svg_of(plot.residuals(calibration, which=each)), caption))
+        groups.append({"name": name, "plots": plots})
+    return {
+        "parameters": parameter_table(campaign),
+        "residuals": residual_table(campaign.calibrations),
+        "warnings": warnings,
+        "curve": _drawn(plot.window_curves, by_name, true_mm=true_window_distance(campaign)),
+        "groups": groups,
+    }
 
 
 def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
@@ -292,14 +244,12 @@ def _provenance(campaign: Campaign) -> list[tuple[str, str]]:
     entries = [("report", f"uwlts {uwlts.__version__}, Python {platform.python_version()}, {libraries}")]
     for found in campaign.calibrations:
         entries.append((f"calibration {found.name}", f"digest {found.digest}; {_pairs(found.calibration.provenance)}"))
-    entries += [(f"capture {capture.path.name}", _recorded(capture)) for capture in campaign.captures]
+    for capture in campaign.captures:
+        header = capture.header
+        of = f"'{header.name}', sensor '{header.sensor.name}', {header.medium_name}"
+        origin = _pairs(header.provenance) or "origin unknown"
+        entries.append((f"capture {capture.path.name}", f"{of}; {origin}"))
     return entries
-
-
-def _recorded(capture: GatheredCapture) -> str:
-    header = capture.header
-    of = f"'{header.name}', sensor '{header.sensor.name}', {header.medium_name}"
-    return f"{of}; {_pairs(header.provenance) or 'origin unknown'}"
 
 
 def _pairs(table: dict[str, Any]) -> str:
@@ -307,23 +257,18 @@ def _pairs(table: dict[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_value, value)) or "none"
-    if isinstance(value, dict):
-        return f"({_pairs(value)})"
-    if is_number(value):
-        return f"{value:g}" if isinstance(value, float) else str(value)
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    match value:
+        case list():
+            return ", ".join(map(_value, value)) or "none"
+        case dict():
+            return f"({_pairs(value)})"
+        case str():
+            return value
+        case float() if is_number(value):
+            return f"{value:g}"
+        case _:
+            return json.dumps(value, ensure_ascii=False)
 
-
-_TILES = {
-    "sphere_spacing_error_mm": "Sphere spacing error",
-    "probing_error_mm": "Probing error",
-    "std_mm": "Standard deviation",
-    "step_height_error_mm": "Step height error",
-    "pipe_diameter_error_mm": "Pipe diameter error",
-    "plane_range_error_mm": "Plane range error",
-}
 
 _EXPLANATIONS = {
     "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free "
@@ -352,73 +297,63 @@ _PUBLISHED = (
 def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile]:
     """The key figures that the campaign has."""
     content = summary(campaign, reference)
-    published = content.published
+    published, truth, window = content.published, content.truth, content.window_distance_mm
     tiles = []
-    for key, name in _TILES.items():
-        found = content.figure(key)
-        count = len(found.by_measurement)
-        if found.mean_abs is not None:
-            note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
-            others = None if published is None else published.figure(key)
-            theirs = None if others is None or others.mean_abs is None else small_length(others.mean_abs)
-            if theirs and others and len(others.by_measurement) < count:
-                theirs += f" for {len(others.by_measurement)} of them"
-            tiles.append(Tile(name, small_length(found.mean_abs), _with_published(note, reference, theirs)))
-    if content.truth.share_within_tolerance is not None:
-        tiles.append(_truth_tile(content.truth))
-    window = content.window_distance_mm
+
+    def add(name: str, value: str, note: str, theirs: str | None = None) -> None:
+        if reference is not None and theirs:
+            note += f"\n{reference.title}: {theirs}"
+        tiles.append(Tile(name, value, note))
+
+    for key, (name, _, _) in KEY_FIGURES.items():
+        found, others = content.figure(key), None if published is None else published.figure(key)
+        if found.mean_abs is None:
+            continue
+        count, theirs = len(found.by_measurement), None
+        if others is not None and others.mean_abs is not None:
+            fewer = len(others.by_measurement) < count
+            theirs = small_length(others.mean_abs) + (f" for {len(others.by_measurement)} of them" if fewer else "")
+        note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
+        add(name, small_length(found.mean_abs), note, theirs)
+    if truth.share_within_tolerance is not None:
+        # After the best-fit motion if there is one: the datum is the calibration's own choice.
+        fitted = truth.after_best_fit.share_within_tolerance
+        note = f"rms distance {small_length(truth.rms_mm)}"
+        if fitted is not None:
+            note = (
+                f"rms distance {small_length(truth.after_best_fit.rms_mm)} after a best-fit motion; in the sensor's "
+                f"own coordinates {small_length(truth.rms_mm)}"
+            )
+        share = truth.share_within_tolerance if fitted is None else fitted
+        add(f"Points within {1e3 * (truth.tolerance_mm or 0):g} µm of the truth", f"{100 * share:.2f} %", note)
     if window.estimated is not None:
         true = "" if window.true is None else f"true {fixed(window.true)} mm"
         theirs = "" if published is None else ", ".join(f"{value:g} mm" for value in published.window_distance_mm)
-        note = _with_published(true, reference, theirs)
-        tiles.append(Tile("Window distance", f"{fixed(window.estimated)} mm", note))
+        add("Window distance", f"{fixed(window.estimated)} mm", true, theirs)
     return tiles
-
-
-def _with_published(note: str, reference: Reference | None, theirs: str | None) -> str:
-    return f"{note}\n{reference.title}: {theirs}" if reference is not None and theirs else note
-
-
-def _truth_tile(truth: TruthSummary) -> Tile:
-    """Agreement with truth after the best-fit motion if there is one: the datum is the calibration's own choice."""
-    fitted = truth.after_best_fit.share_within_tolerance is not None
-    shown = truth.after_best_fit if fitted else truth
-    note = f"rms distance {small_length(shown.rms_mm)}"
-    if fitted:
-        note += f" after a best-fit motion; in the sensor's own coordinates {small_length(truth.rms_mm)}"
-    name = f"Points within {1e3 * (truth.tolerance_mm or 0):g} µm of the truth"
-    return Tile(name, f"{100 * (shown.share_within_tolerance or 0):.2f} %", note)
 
 
 def introduction(campaign: Campaign) -> list[tuple[str, str]]:
     """Sensor, medium, calibration and origin of the images, each in a sentence."""
     recorded = [m.capture for m in campaign.measurements if m.capture is not None] or list(campaign.captures)
     judged = [m.judged for m in campaign.measurements if m.judged is not None]
-    facts = []
-    if sensors := _once([_sensor(capture) for capture in recorded] or [j.sensor for j in judged if j.sensor]):
-        facts.append(("Sensor", "; ".join(sensors)))
     indices = [text for m in campaign.measurements if (text := _index(m)) is not None]
-    if media := _once([_medium(capture) for capture in recorded] + indices):
-        facts.append(("Medium", "; ".join(media)))
-    if origins := _once([_origin(capture) for capture in recorded]):
-        facts.append(("Images", "; ".join(origins)))
-    calibration = campaign.main_calibration
-    if calibration is not None:
-        window = calibration.calibration.window
-        seen = (
-            "no window"
-            if window is None
-            else (
-                f"window {fixed(window.distance_mm)} mm from the entrance pupil, "
-                + (
-                    "glass plate with two refractions"
-                    if window.refractions == 2
-                    else "taken as one refracting interface"
-                )
+    found = {
+        "Sensor": [_sensor(capture) for capture in recorded] or [j.sensor for j in judged if j.sensor],
+        "Medium": [_medium(capture) for capture in recorded] + indices,
+        "Images": [_origin(capture) for capture in recorded],
+    }
+    facts = [(name, "; ".join(dict.fromkeys(texts))) for name, texts in found.items() if texts]
+    main = campaign.main_calibration
+    if main is not None:
+        window, source = main.calibration.window, main.calibration.provenance.get("source")
+        seen = "no window"
+        if window is not None:
+            model = (
+                "glass plate with two refractions" if window.refractions == 2 else "taken as one refracting interface"
             )
-        )
-        source = calibration.calibration.provenance.get("source")
-        facts.append(("Calibration", f"{calibration.name}: {seen}" + (f" ({source})" if source else "")))
+            seen = f"window {fixed(window.distance_mm)} mm from the entrance pupil, {model}"
+        facts.append(("Calibration", f"{main.name}: {seen}" + (f" ({source})" if source else "")))
     return facts
 
 
@@ -461,7 +396,3 @@ def _origin(capture: GatheredCapture) -> str:
         effects = provenance.get("effects")
         return "rendered by the digital twin" + (", sharp and without noise" if effects == [] else "")
     return f"recorded by {source}" if isinstance(source, str) else "of unknown origin"
-
-
-def _once(texts: list[str]) -> list[str]:
-    return list(dict.fromkeys(texts))

@@ -3,16 +3,15 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import TypedDict
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, JsonValue, field_serializer
+from pydantic import BaseModel, ConfigDict, JsonValue, PlainSerializer
 
 import uwlts
 from uwlts.calibration.joint.next_shot import Outlook, next_shots
-from uwlts.calibration.joint.observability import format_weaknesses, lengths_over, regions, weaknesses
+from uwlts.calibration.joint.observability import Weakness, format_weaknesses, lengths_over, regions, weaknesses
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
@@ -25,12 +24,11 @@ from uwlts.storage.capture_sources import sha256_of
 from uwlts.storage.files import read_json
 
 FORMAT = "uwlts-certificate"
-
-
 VERSION = 1
-
-
 _SEAL = "sha256"
+# Shots that are listed besides the best one of each kind.
+_BEST_SHOTS = 3
+NOT_JOINT = "the calibration was not estimated jointly: the uncertainty of lengths measured by it is not known"
 
 
 def canonical(content: Mapping[str, JsonValue]) -> bytes:
@@ -56,7 +54,7 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 
 
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
-    """What speaks against a certificate and against its belonging to a calibration's file; nothing where all is well.
+    """Objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
 
     Raises
     ------
@@ -78,14 +76,8 @@ def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     return against
 
 
-NOT_JOINT = "the calibration was not estimated jointly: what lengths measured by it are worth is not known"
-
-
-# Shots that are listed besides the best one of each kind.
-_BEST_SHOTS = 3
-
-
 _Pair = tuple[float, float]
+_Medium = Annotated[Medium, PlainSerializer(lambda medium: medium.model_dump(mode="json", exclude_none=True))]
 
 
 class _Stored(BaseModel):
@@ -118,19 +110,15 @@ class ParameterRow(_Stored):
 class CalibratedMedium(_Stored):
     """A medium and its refractive index."""
 
-    medium: Medium
+    medium: _Medium
     index: float
-
-    @field_serializer("medium")
-    def _stored_medium(self, medium: Medium) -> dict[str, JsonValue]:
-        return medium.model_dump(mode="json", exclude_none=True)
 
 
 class Validity(_Stored):
     """A region that the evidence covers, in which medium, and how well its index is known."""
 
     name: str
-    medium: Medium
+    medium: _Medium
     through_window: bool
     index: float
     index_std: float | None
@@ -139,21 +127,6 @@ class Validity(_Stored):
     z_mm: _Pair
     outline_mm: tuple[_Pair, ...]
     stripe_points: int
-
-    @field_serializer("medium")
-    def _stored_medium(self, medium: Medium) -> dict[str, JsonValue]:
-        return medium.model_dump(mode="json", exclude_none=True)
-
-
-class WeaknessRow(_Stored):
-    """Parameters that the evidence determines badly; see `uwlts.calibration.joint.observability.Weakness`."""
-
-    parameters: tuple[str, ...]
-    confused: bool
-    cost_mm: float
-    length_mm: float
-    along: str
-    depth_mm: float
 
 
 class NextShot(_Stored):
@@ -166,7 +139,7 @@ class NextShot(_Stored):
 
 
 class Certificate(_Stored):
-    """What every certificate says. Fields that are not given are left out of the file."""
+    """Content of every certificate. Fields that are not given are left out of the file."""
 
     format: str
     version: int
@@ -197,13 +170,13 @@ class JointCertificate(Certificate):
     lengths: tuple[LengthUncertainty, ...] = ()
     lengths_std_mm: float | None = None
     cannot_tell: tuple[str, ...] = ()
-    weaknesses: tuple[WeaknessRow, ...] = ()
+    weaknesses: tuple[Weakness, ...] = ()
     next_shots: tuple[NextShot, ...] = ()
     sha256: str = ""
 
 
 class SequentialCertificate(Certificate):
-    """Certificate of a calibration in steps, which knows no uncertainty of lengths."""
+    """Certificate of a calibration in steps, which gives no uncertainty of lengths."""
 
     remark: str
     use: str
@@ -213,21 +186,6 @@ class SequentialCertificate(Certificate):
 
 
 AnyCertificate = JointCertificate | SequentialCertificate
-
-
-class _Shared(TypedDict):
-    """Fields of `Certificate`."""
-
-    format: str
-    version: int
-    sensor: str
-    issued: str
-    software: str
-    calibration: CertifiedFile
-    wavelength_nm: float
-    made_from: dict[str, JsonValue]
-    parameters: tuple[ParameterRow, ...]
-    uncertainty_known: bool
 
 
 def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
@@ -246,30 +204,30 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
     CalibrationError
         Its joint estimate is damaged.
     """
-    shared: _Shared = {
-        "format": FORMAT,
-        "version": VERSION,
-        "sensor": calibration.sensor_name,
-        "issued": issued,
-        "software": f"uwlts {uwlts.__version__}",
-        "calibration": CertifiedFile(
+    base = Certificate(
+        format=FORMAT,
+        version=VERSION,
+        sensor=calibration.sensor_name,
+        issued=issued,
+        software=f"uwlts {uwlts.__version__}",
+        calibration=CertifiedFile(
             file=Path(path).name,
             sha256=sha256_of(path),
             digest=calibration_digest(calibration),
             date=calibration.provenance.get("date"),
             software=calibration.provenance.get("software"),
         ),
-        "wavelength_nm": calibration.wavelength_nm,
-        "made_from": calibration.provenance,
-        "parameters": parameter_rows(calibration),
-        "uncertainty_known": calibration.joint is not None,
-    }
-    content = _sequential(shared, calibration) if calibration.joint is None else _joint(shared, calibration)
-    return content.model_copy(update={"sha256": seal_of(content.in_file())})
+        wavelength_nm=calibration.wavelength_nm,
+        made_from=calibration.provenance,
+        parameters=parameter_rows(calibration),
+        uncertainty_known=calibration.joint is not None,
+    )
+    content = (_sequential if calibration.joint is None else _joint)(base, calibration)
+    return content.model_copy(update={_SEAL: seal_of(content.in_file())})
 
 
 def certificate_lines(content: AnyCertificate) -> list[str]:
-    """The gist of a certificate for the terminal."""
+    """The main statements of a certificate for the terminal."""
     if content.remark is not None:
         return [content.remark]
     assert isinstance(content, JointCertificate)
@@ -294,17 +252,16 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     camera, window = calibration.camera, calibration.window
     std = calibration.figures("camera").get("std")
     known = std if isinstance(std, dict) else {}
-    names = ("f",) if camera.fx_px == camera.fy_px else ("fx", "fy")
-    values = {"f": camera.fx_px, "fx": camera.fx_px, "fy": camera.fy_px, "cx": camera.cx_px, "cy": camera.cy_px}
-    values |= camera.distortion.model_dump()
-    shown = [*names, "cx", "cy", *(name for name, value in camera.distortion.model_dump().items() if value)]
-    rows = [_row(parameter_of(name), values[name], _number(known.get(name)), None) for name in shown]
+    values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
+    values |= {"cx": camera.cx_px, "cy": camera.cy_px}
+    values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
+    rows = [_row(parameter_of(name), value, _number(known.get(name))) for name, value in values.items()]
     if window is not None:
         distance_std = _number(calibration.figures("window").get("std_mm"))
-        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, distance_std, None))
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, distance_std))
         if window.refractions == 2:
-            rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm, None, None))
-            rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index, None, None))
+            rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm))
+            rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index))
     return tuple(rows)
 
 
@@ -312,7 +269,7 @@ def _number(value: JsonValue) -> float | None:
     return value if isinstance(value, int | float) else None
 
 
-def _row(key: ParameterKey, value: float, std: float | None, before: float | None) -> ParameterRow:
+def _row(key: ParameterKey, value: float, std: float | None = None, before: float | None = None) -> ParameterRow:
     quantity = key.quantity
     return ParameterRow(
         name=key.text,
@@ -324,30 +281,27 @@ def _row(key: ParameterKey, value: float, std: float | None, before: float | Non
     )
 
 
-def _sequential(shared: _Shared, calibration: Calibration) -> SequentialCertificate:
+def _sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
     window = calibration.window
-    shown = ("rms_px", "rms_mm", "max_mm", "images")
-    rms: dict[str, dict[str, JsonValue]] = {
-        step: {
-            key: number
-            for key, value in calibration.figures(step).items()
-            if key in shown and (number := _number(value)) is not None
-        }
-        for step in calibration.residuals
-    }
+    rms: dict[str, dict[str, JsonValue]] = {}
+    for step in calibration.residuals:
+        figures = calibration.figures(step)
+        shown = {key: figures[key] for key in figures if key in ("rms_px", "rms_mm", "max_mm", "images")}
+        if numbers := {key: value for key, value in shown.items() if _number(value) is not None}:
+            rms[step] = numbers
     return SequentialCertificate(
-        **shared,
+        **dict(base),
         remark=NOT_JOINT,
         use=f"in {calibration.medium_kind} only" if window is None else "in air and in water",
         media=tuple(CalibratedMedium(medium=found.medium, index=found.index) for found in calibration.media),
-        residuals={step: table for step, table in rms.items() if table},
+        residuals=rms,
     )
 
 
-def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
+def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
     joint, found = require_joint(calibration), regions(calibration)
     content = JointCertificate(
-        **shared,
+        **dict(base),
         validity=tuple(_validity(in_use(calibration, region)) for region in found),
         scatter_px=joint.scatter_px,
         shared_variance=joint.shared_variance,
@@ -355,12 +309,10 @@ def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
         strays=joint.outlier_count,
         images=joint.images,
     )
-    if not found:
-        remark = "the calibration does not tell what volume its evidence covers: calibrate again"
-        return content.model_copy(update={"remark": remark})
-    if not found[0].has_area():
-        remark = "the stripes of the evidence cover no area: what lengths are worth is not known"
-        return content.model_copy(update={"remark": remark})
+    if not found or not found[0].has_area():
+        no_area = "the stripes of the evidence cover no area: the uncertainty of lengths is not known"
+        none = "the calibration does not state which volume its evidence covers: calibrate again"
+        return content.model_copy(update={"remark": no_area if found else none})
     use = in_use(calibration, found[0])
     lengths, known = lengths_over(calibration, use.known, found[0]), use.known
     weak = weaknesses(lengths, known.parameters.keys, known.covariance)
@@ -369,10 +321,7 @@ def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
             "lengths": tuple(length_uncertainties(use)),
             "lengths_std_mm": float(np.sqrt(np.mean(lengths.std_mm(known.covariance) ** 2))),
             "cannot_tell": tuple(format_weaknesses(weak)),
-            "weaknesses": tuple(
-                WeaknessRow.model_validate(asdict(each) | {"parameters": tuple(key.text for key in each.parameters)})
-                for each in weak
-            ),
+            "weaknesses": tuple(weak),
             "next_shots": _shots(next_shots(calibration)),
         }
     )
@@ -380,13 +329,11 @@ def _joint(shared: _Shared, calibration: Calibration) -> JointCertificate:
 
 def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
     """The best shots, and the best of each kind, in their order."""
-    kinds: dict[str, Outlook] = {}
-    for outlook in outlooks:
-        kinds.setdefault(outlook.words.split(",")[0], outlook)
+    kinds = [outlook.words.split(",")[0] for outlook in outlooks]
     return tuple(
         NextShot(words=o.words.rstrip(","), before_mm=o.before_mm, after_mm=o.after_mm, advice=o.advice())
-        for place, o in enumerate(outlooks)
-        if place < _BEST_SHOTS or any(o is best for best in kinds.values())
+        for place, (kind, o) in enumerate(zip(kinds, outlooks, strict=True))
+        if place < _BEST_SHOTS or kind not in kinds[:place]
     )
 
 

@@ -3,9 +3,10 @@
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -18,7 +19,7 @@ from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
 from uwlts.report.certificate_volume import LengthUncertainty, change_from, form_of, in_use, require_same_sensor
-from uwlts.report.numbers import fixed
+from uwlts.report.numbers import as_fine_as, fixed
 from uwlts.report.page_toolkit import (
     COLOURS,
     INK,
@@ -104,70 +105,55 @@ def certificate_page(
         parameters=_parameters(content.parameters, before),
         before=None if before is None else before[0],
         lengths=_length_rows(content.lengths) if isinstance(content, JointCertificate) else [],
-        drawn=_pictures(content, calibration, before) if isinstance(content, JointCertificate) else _Pictures(),
+        drawn=_pictures(content, calibration, before) if isinstance(content, JointCertificate) else {},
     )
 
 
-@dataclass(frozen=True)
-class _Pictures:
-    """Pictures of the page; ``worst`` are the images whose residuals lie farthest above their kind."""
-
-    correlation: Markup | None = None
-    residuals: Markup | None = None
-    worst: tuple[ImageFit, ...] = ()
-    lengths: Markup | None = None
-    maps: tuple[Markup, ...] = ()
-    changes: tuple[Markup, ...] = ()
-    largest_change_um: float | None = None
-
-
-def _pictures(content: JointCertificate, calibration: Calibration, before: tuple[str, Calibration] | None) -> _Pictures:
+def _pictures(
+    content: JointCertificate, calibration: Calibration, before: tuple[str, Calibration] | None
+) -> dict[str, Any]:
+    """Pictures of the page by name; ``worst`` are the images whose residuals lie farthest above their kind."""
     joint = require_joint(calibration)
     fits = [image for image in content.images if image.rms_px is not None]
     fits.sort(key=lambda image: -(image.rms_px or 0.0) / content.scatter_px[image.kind])
-    drawn = _Pictures(
-        correlation=correlation_picture(joint.parameters, joint.covariance_matrix()),
-        residuals=image_residuals(content.images) if content.images else None,
-        worst=tuple(fits[:_WORST_IMAGES]),
-    )
+    drawn: dict[str, Any] = {
+        "correlation": correlation_picture(joint.parameters, joint.covariance_matrix()),
+        "residuals": image_residuals(content.images) if content.images else None,
+        "worst": fits[:_WORST_IMAGES],
+    }
     if not content.lengths:
         return drawn
     region = regions(calibration)[0]
     form = form_of(in_use(calibration, region))
-    maps = [
-        heat_map(f"u({axis}), {what}", form.at_mm, 1e3 * values[..., place])
-        for what, values in (("calibration", form.calibration_mm), ("single point", form.point_mm))
-        for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
-    ] + [
-        heat_map(f"u of {form.short_mm:g} mm along {axis}", form.at_mm, 1e3 * values)
-        for axis, values in (("Y", form.along_y_mm), ("Z", form.along_z_mm))
-    ]
-    drawn = replace(drawn, lengths=length_chart(content.lengths), maps=tuple(maps))
-    if before is None:
-        return drawn
-    change = change_from(calibration, before[1], region)
-    changes = [
-        heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., place], signed=True)
-        for place, axis in ((1, "Y"), (2, "Z"), (0, "X"))
-    ]
-    return replace(drawn, changes=tuple(changes), largest_change_um=1e3 * change.largest_mm)
+    maps = {
+        f"u({axis}), {name}": values[..., "XYZ".index(axis)]
+        for name, values in (("calibration", form.calibration_mm), ("single point", form.point_mm))
+        for axis in "YZX"
+    }
+    maps |= {
+        f"u of {form.short_mm:g} mm along Y": form.along_y_mm,
+        f"u of {form.short_mm:g} mm along Z": form.along_z_mm,
+    }
+    drawn["lengths"] = length_chart(content.lengths)
+    drawn["maps"] = [heat_map(title, form.at_mm, 1e3 * values) for title, values in maps.items()]
+    if before is not None:
+        change = change_from(calibration, before[1], region)
+        drawn["largest_change_um"] = 1e3 * change.largest_mm
+        drawn["changes"] = [
+            heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., "XYZ".index(axis)], signed=True)
+            for axis in "YZX"
+        ]
+    return drawn
 
 
-def _parameters(
-    rows: Sequence[ParameterRow], before: tuple[str, Calibration] | None
-) -> list[tuple[str, str, str, str, str, str, str]]:
+def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | None) -> list[tuple[str, ...]]:
     """Words, unit, value, standard uncertainty, that before; value and uncertainty by the other calibration."""
     other = {} if before is None else {row.name: row for row in parameter_rows(before[1])}
-    shown = [
-        (row.words, row.unit, *_with_std(row), _number(row.std_before), *_with_std(other.get(row.name))) for row in rows
-    ]
-    mine = {row.name for row in rows}
-    shown += [
-        (row.words, row.unit, MISSING, MISSING, MISSING, *_with_std(row))
-        for name, row in other.items()
-        if name not in mine
-    ]
-    return shown
+    shown = []
+    for row in rows:
+        known = MISSING if row.std_before is None else as_fine_as(row.std_before, row.std_before, digits=2)
+        shown.append((row.words, row.unit, *_with_std(row), known, *_with_std(other.pop(row.name, None))))
+    return shown + [(row.words, row.unit, MISSING, MISSING, MISSING, *_with_std(row)) for row in other.values()]
 
 
 def _with_std(row: ParameterRow | None) -> tuple[str, str]:
@@ -176,32 +162,16 @@ def _with_std(row: ParameterRow | None) -> tuple[str, str]:
         return MISSING, MISSING
     if row.std is None or not row.std > 0:
         return f"{row.value:.6g}", MISSING
-    decimals = max(0, 1 - math.floor(math.log10(row.std)))
-    return fixed(row.value, decimals), fixed(row.std, decimals)
-
-
-def _number(value: float | None) -> str:
-    return MISSING if value is None else fixed(value, max(0, 1 - math.floor(math.log10(value))))
+    return as_fine_as(row.value, row.std, digits=2), as_fine_as(row.std, row.std, digits=2)
 
 
 def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:
     """Length, and for X, Y and Z its expanded uncertainties in µm; a dash where it does not fit."""
-    table = {(row.length_mm, row.axis): row for row in lengths}
-    rows = []
-    for length in dict.fromkeys(sorted(row.length_mm for row in lengths)):
-        found = [table.get((length, axis)) for axis in "XYZ"]
-        rows.append(
-            (
-                length,
-                [
-                    (MISSING, MISSING)
-                    if row is None
-                    else (fixed(1e3 * row.calibration_mm, 1), fixed(1e3 * row.point_mm, 1))
-                    for row in found
-                ],
-            )
-        )
-    return rows
+    table = {(r.length_mm, r.axis): (fixed(1e3 * r.calibration_mm, 1), fixed(1e3 * r.point_mm, 1)) for r in lengths}
+    return [
+        (length, [table.get((length, axis), (MISSING, MISSING)) for axis in "XYZ"])
+        for length in sorted({row.length_mm for row in lengths})
+    ]
 
 
 def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool = False) -> Markup:
@@ -256,10 +226,10 @@ def image_residuals(images: Sequence[ImageFit]) -> Markup:
     kinds = list(dict.fromkeys(image.kind for image in images))
     rows = math.ceil(len(kinds) / 2)
     figure, panels = new_figure(9.0, 2.7 * rows, rows=rows, columns=min(2, len(kinds)))
-    for number, (ax, kind) in enumerate(zip(panels, kinds, strict=False)):
+    for colour, ax, kind in zip(cycle(COLOURS), panels, kinds, strict=False):
         rms = [image.rms_px for image in images if image.kind == kind]
         values = [np.nan if value is None else value for value in rms]
-        ax.plot(range(1, len(values) + 1), values, "o", color=COLOURS[number % len(COLOURS)], markersize=4)
+        ax.plot(range(1, len(values) + 1), values, "o", color=colour, markersize=4)
         ax.set(title=kind, xlabel="image", ylabel="residual (rms) / px")
         ax.set_ylim(bottom=0)
     for ax in panels[len(kinds) :]:
@@ -270,14 +240,12 @@ def image_residuals(images: Sequence[ImageFit]) -> Markup:
 def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
     """Expanded uncertainty over length, for each axis."""
     figure, panels = new_figure(9.0, 3.2, columns=2)
-    for ax, title, name in zip(
-        panels, ("surfaces: the calibration alone", "single points"), ("calibration_mm", "point_mm"), strict=True
-    ):
-        for number, axis in enumerate("XYZ"):
-            known = [each for each in lengths if each.axis == axis]
-            y = [1e3 * getattr(each, name) for each in known]
-            if known:
-                ax.plot([each.length_mm for each in known], y, "o-", color=COLOURS[number], label=f"along {axis}")
+    shown = {"surfaces: the calibration alone": "calibration_mm", "single points": "point_mm"}
+    for ax, (title, name) in zip(panels, shown.items(), strict=True):
+        for colour, axis in zip(COLOURS, "XYZ", strict=False):
+            along = {each.length_mm: 1e3 * getattr(each, name) for each in lengths if each.axis == axis}
+            if along:
+                ax.plot(along.keys(), along.values(), "o-", color=colour, label=f"along {axis}")
         ax.set(title=title, xlabel="length / mm", ylabel="expanded uncertainty (k = 2) / µm")
         ax.set_ylim(bottom=0)
     legend_below(figure)

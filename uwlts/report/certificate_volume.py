@@ -17,20 +17,18 @@ from uwlts.optics.reconstruction import points_on_sheet
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
 # Places tried along each axis for the largest uncertainty, which changes slowly over the volume.
 _PLACES = 9
+# Mesh of the maps: rows along Z, columns along Y; finer meshes look the same.
+_ROWS, _COLUMNS = 17, 21
+_SHORT_SHARE = 0.25
+"""Of the volume's depth and width: a length whose uncertainty is shown where it is measured."""
 
 
 @dataclass(frozen=True)
 class LengthUncertainty:
-    """Expanded uncertainties (k = 2) in mm of one length along one axis, the largest over the volume.
+    """Expanded uncertainties (k = 2) in mm of one length along X, Y or Z, the largest over the volume.
 
-    Attributes
-    ----------
-    axis : {"X", "Y", "Z"}
-    length_mm : float
-    calibration_mm : float
-        By the calibration alone, as for points averaged over surfaces; along X by the stage alone.
-    point_mm : float
-        With the noise of a single stripe centre at each end.
+    ``calibration_mm`` is by the calibration alone, as for points averaged over surfaces; along X by the stage alone.
+    ``point_mm`` includes the noise of a single stripe centre at each end.
     """
 
     axis: str
@@ -59,11 +57,10 @@ def in_use(calibration: Calibration, region: Region) -> InUse:
     """A joint calibration in one of its regions; CalibrationError where it is damaged."""
     known = estimate_in(calibration, region)
     uncertainty = calibration.origin().known_before
-    covariance, index = known.covariance.copy(), index_key(known)
-    if index in known.parameters.keys:
-        place = known.parameters.keys.index(index)
+    covariance, keys = known.covariance.copy(), known.parameters.keys
+    if (index := index_key(known)) in keys:
         drift = region.medium.index_per_kelvin(calibration.wavelength_nm) * uncertainty.drift_k
-        covariance[place, place] += drift**2
+        covariance[keys.index(index), keys.index(index)] += drift**2
     scatter = require_joint(calibration).scatter_px
     noise = next((scatter[kind] for kind in (STRIPE, STEP, *SCANNED) if kind in scatter), 0.0)
     return InUse(calibration, region, known, covariance, uncertainty, noise)
@@ -76,22 +73,17 @@ def index_key(known: StoredEstimate) -> MediumIndex | None:
 
 def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
     """Every length that fits into the volume, along X, Y and Z."""
-    found = [_along_x(length, use.uncertainty) for length in LENGTHS_MM]
+    found = []
     for axis in "YZ":
         for length in LENGTHS_MM:
             ends = ends_over(use.region, axis, length)
             if len(ends):
-                known = lengths_of(use, ends)
-                found.append(
-                    LengthUncertainty(
-                        axis,
-                        length,
-                        2 * float(known.std_mm(use.covariance).max()),
-                        2 * float(known.std_mm(use.covariance, noise_px=use.noise_px).max()),
-                    )
-                )
-    fitting = {each.length_mm for each in found if each.axis != "X"}
-    return [each for each in found if each.length_mm in fitting]
+                std = [lengths_of(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)]
+                found.append(LengthUncertainty(axis, length, *(2 * float(each.max()) for each in std)))
+    # Along the stage's motion the same place of the sheet sees both ends, so that only the stage counts.
+    position, scale = np.sqrt(2.0) * use.uncertainty.stage_position_mm, use.uncertainty.stage_scale
+    along_x = {length: 2 * float(np.hypot(position, scale * length)) for length in sorted({e.length_mm for e in found})}
+    return [LengthUncertainty("X", length, stage, stage) for length, stage in along_x.items()] + found
 
 
 def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
@@ -99,12 +91,6 @@ def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
     points = points_at(use.calibration, use.known, ends.reshape(-1, 2))
     first = 2 * np.arange(len(ends))
     return lengths_between(points, first, first + 1)
-
-
-def _along_x(length_mm: float, uncertainty: Uncertainty) -> LengthUncertainty:
-    """A length along the stage's motion: the same place of the sheet sees both ends, so that only the stage counts."""
-    std = float(np.hypot(np.sqrt(2.0) * uncertainty.stage_position_mm, uncertainty.stage_scale * length_mm))
-    return LengthUncertainty("X", length_mm, 2 * std, 2 * std)
 
 
 def ends_over(region: Region, axis: str, length_mm: float) -> np.ndarray:
@@ -124,26 +110,13 @@ def ends_over(region: Region, axis: str, length_mm: float) -> np.ndarray:
     return np.array(found).reshape(-1, 2, 2)
 
 
-# Mesh of the maps: rows along Z, columns along Y; finer meshes look the same.
-_ROWS, _COLUMNS = 17, 21
-_SHORT_SHARE = 0.25
-"""Of the volume's depth and width: a length whose uncertainty is shown where it is measured."""
-
-
 @dataclass(frozen=True, eq=False)
 class Form:
-    """Standard uncertainties over a mesh (R, C) of the sheet, mm.
+    """Standard uncertainties in mm over a mesh (R, C) of the sheet, whose Y and Z are ``at_mm`` (R, C, 2).
 
-    Attributes
-    ----------
-    at_mm : (R, C, 2)
-        Y and Z.
-    calibration_mm, point_mm : (R, C, 3)
-        Of X, Y and Z of a point: by the calibration alone, and with the stripe's noise.
-    short_mm : float
-        A length that fits well into the volume.
-    along_y_mm, along_z_mm : (R, C)
-        Of that length by the calibration, about each point as far as the volume reaches.
+    ``calibration_mm`` and ``point_mm`` (R, C, 3) are those of X, Y and Z of a point, by the calibration alone and with
+    the stripe's noise. ``along_y_mm`` and ``along_z_mm`` (R, C) are those of the length ``short_mm``, which fits well
+    into the volume, by the calibration and about each point as far as the volume reaches.
     """
 
     at_mm: np.ndarray
@@ -164,13 +137,15 @@ def form_of(use: InUse) -> Form:
     values, vectors = np.linalg.eigh(use.covariance / np.outer(scale, scale))
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     moved = without_rigid_motion(at, (points.by_parameters @ root).transpose(2, 0, 1))
-    calibration = np.sqrt(np.sum(moved**2, axis=0))
-    noise = points.by_px * use.noise_px
-    short = _round_length(_SHORT_SHARE * float(np.ptp(use.region.outline_mm, axis=0).min()))
+    calibration = np.sqrt(np.sum(moved**2, axis=0)).reshape(*mesh.shape[:2], 3)
+    noise = (points.by_px * use.noise_px).reshape(calibration.shape)
+    longest = _SHORT_SHARE * float(np.ptp(use.region.outline_mm, axis=0).min())
+    power = 10.0 ** np.floor(np.log10(longest))
+    short = float(max(step * power for step in (1, 2, 5) if step * power <= longest))
     return Form(
         at_mm=mesh,
-        calibration_mm=calibration.reshape(*mesh.shape[:2], 3),
-        point_mm=np.hypot(calibration, noise).reshape(*mesh.shape[:2], 3),
+        calibration_mm=calibration,
+        point_mm=np.hypot(calibration, noise),
         short_mm=short,
         along_y_mm=_of_short(use, mesh, np.array([short, 0.0])),
         along_z_mm=_of_short(use, mesh, np.array([0.0, short])),
@@ -201,24 +176,12 @@ def _of_short(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
     return lengths_of(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
 
 
-def _round_length(length_mm: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten within a length."""
-    power = 10.0 ** np.floor(np.log10(length_mm))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= length_mm))
-
-
 @dataclass(frozen=True, eq=False)
 class Change:
-    """How points of the same pixels lie by a calibration against another one, mm.
+    """Displacement in mm of points of the same pixels by a calibration against another one.
 
-    Attributes
-    ----------
-    at_mm : (R, C, 2)
-        Y and Z.
-    moved_mm : (R, C, 3)
-        In X, Y and Z of the OCS, with a rigid motion of all taken out.
-    largest_mm : float
-        Before that.
+    ``moved_mm`` (R, C, 3) is that in X, Y and Z of the OCS at Y and Z ``at_mm`` (R, C, 2), with a rigid motion of all
+    taken out; ``largest_mm`` is the largest distance before that.
     """
 
     at_mm: np.ndarray
@@ -228,28 +191,25 @@ class Change:
 
 def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
     """CalibrationError where two calibrations cannot be of one sensor."""
-    for name, pair in {
-        "image size": [f"{c.camera.width_px} x {c.camera.height_px} px" for c in (calibration, other)],
-        "stripe_along": [c.stripe_along for c in (calibration, other)],
+    sizes = [f"{c.camera.width_px} x {c.camera.height_px} px" for c in (calibration, other)]
+    for name, (one, two) in {
+        "image size": sizes,
+        "stripe_along": (calibration.stripe_along, other.stripe_along),
     }.items():
-        if pair[0] != pair[1]:
+        if one != two:
             raise CalibrationError(
-                f"the calibrations are of different sensors: {name} is {pair[0]} in one and {pair[1]} in the other"
+                f"the calibrations are of different sensors: {name} is {one} in one and {two} in the other"
             )
 
 
 def change_from(calibration: Calibration, other: Calibration, region: Region) -> Change:
-    """What a calibration changed against another one, in its region.
+    """Change of a calibration against another one, in its region.
 
-    Raises
-    ------
-    CalibrationError
-        The other one is of another sensor, or sees no sheet somewhere in the region.
+    Raises CalibrationError: the other one is of another sensor, or sees no sheet somewhere in the region.
     """
     require_same_sensor(calibration, other)
-    known: StoredEstimate = estimate_in(calibration, region)
     mesh = region.mesh(_ROWS, _COLUMNS)
-    pixels = pixels_at(calibration, known, mesh.reshape(-1, 2))
+    pixels = pixels_at(calibration, estimate_in(calibration, region), mesh.reshape(-1, 2))
     points = []
     for each in (calibration, other):
         through = each if region.view.window else each.model_copy(update={"window": None})

@@ -1,21 +1,20 @@
 """Reads what the commands have left in a campaign's folder, and published values to set beside it."""
 
-import json
-import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import BeforeValidator, Field, FiniteFloat, Strict, TypeAdapter, ValidationError
 
 from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError, DescriptionError
-from uwlts.model.library import find, read_table
-from uwlts.model.sensor import Sensor
+from uwlts.model.errors import CaptureError, problems_of
+from uwlts.model.library import find, read_table, validated
+from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
@@ -25,6 +24,9 @@ _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"
 
 CALIBRATION = "calibration"
 """Name under which a reference lists values of calibrations."""
+
+_Number = Annotated[FiniteFloat, Strict()]
+_SECONDS = TypeAdapter(dict[str, Annotated[_Number, Field(ge=0)]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +104,7 @@ class Campaign:
 
     @property
     def main_measurements(self) -> tuple[Measurement, ...]:
-        """Measurements made with the main calibration, or without word of any."""
+        """Measurements made with the main calibration, or with an unknown one."""
         return tuple(m for m in self.measurements if m.digest in (None, self.main_digest))
 
     @property
@@ -141,8 +143,11 @@ def gather_campaign(folder: str | Path) -> Campaign:
         )
     by_digest = {calibration.digest: calibration for calibration in calibrations}
     measurements = []
-    for name, own in sorted(_paired(clouds, judged).items()):
-        measurements.append(_measurement(name, clouds.get(own or ""), judged.get(name), captures, by_digest))
+    for name, cloud in sorted(_paired(clouds, judged).items()):
+        recorded = None if cloud is None else cloud.metadata.get("capture")
+        capture = captures.get(recorded) if isinstance(recorded, str) else None
+        found = Measurement(name, cloud, judged.get(name), capture or captures.get(f"{name}.h5"), None)
+        measurements.append(replace(found, calibration=by_digest.get(found.digest or "")))
     return Campaign(
         folder=folder,
         measurements=tuple(measurements),
@@ -171,63 +176,46 @@ def _calibration(path: Path) -> GatheredCalibration:
     return GatheredCalibration(path.stem, calibration, calibration_digest(calibration))
 
 
-def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, str | None]:
-    """Name of the cloud of every measurement: an evaluation and its cloud, or a cloud without any evaluation.
+def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, PointCloud | None]:
+    """Cloud of every measurement by its name: an evaluation and its cloud, or a cloud without any evaluation.
 
     The cloud has the evaluation's name, or the one it gives. Where it holds no deviations, a copy of it that does, as
     the evaluation writes it, takes its place.
     """
-    pairs: dict[str, str | None] = {}
+    pairs: dict[str, PointCloud | None] = {}
     taken = set()
     for name, found in judged.items():
         source = name if name in clouds else Path(found.cloud).stem
-        pairs[name] = source if source in clouds else None
-        if source not in clouds:
-            continue
+        pairs[name] = plain = clouds.get(source)
         taken.add(source)
-        if clouds[source].deviation_mm is None:
+        if plain is not None and plain.deviation_mm is None:
             for copy, cloud in clouds.items():
-                same = np.array_equal(cloud.points_mm, clouds[source].points_mm)
+                same = np.array_equal(cloud.points_mm, plain.points_mm)
                 if same and cloud.deviation_mm is not None and copy not in judged:
-                    pairs[name] = copy
+                    pairs[name] = cloud
                     taken.add(copy)
-    return pairs | {name: name for name in clouds if name not in taken and name not in judged}
-
-
-def _measurement(
-    name: str,
-    cloud: PointCloud | None,
-    judged: EvaluationRecord | None,
-    captures: dict[str, GatheredCapture],
-    calibrations: dict[str, GatheredCalibration],
-) -> Measurement:
-    recorded = None if cloud is None else cloud.metadata.get("capture")
-    capture = captures.get(recorded) if isinstance(recorded, str) else None
-    found = Measurement(name, cloud, judged, capture or captures.get(f"{name}.h5"), None)
-    return Measurement(name, cloud, judged, found.capture, calibrations.get(found.digest or ""))
+    return pairs | {name: cloud for name, cloud in clouds.items() if name not in taken and name not in judged}
 
 
 def _seconds(path: Path) -> dict[str, float]:
-    if not path.is_file():
-        return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"{path} cannot be read, or is truncated: {error}") from error
-    numbers = isinstance(content, dict) and all(
-        isinstance(value, int | float) and math.isfinite(value) and value >= 0 for value in content.values()
-    )
-    if not numbers:
-        raise CaptureError(f'{path} must hold the seconds of each stage by name: {{"render": 12.3, ...}}')
-    return {stage: float(value) for stage, value in content.items()}
+        return _SECONDS.validate_json(path.read_bytes()) if path.is_file() else {}
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        expected = 'the seconds of each stage by name: {"render": 12.3, ...}'
+        raise CaptureError(f"{path} must hold {expected}; {problems_of(error)}") from error
 
 
-@dataclass(frozen=True)
-class Reference:
+def _several(value: object) -> tuple[object, ...]:
+    return tuple(value) if isinstance(value, list) else (value,)
+
+
+class Reference(Description):
     """Published values in mm: by measurement, then by figure; several where several were published."""
 
     title: str
-    figures: dict[str, dict[str, tuple[float, ...]]]
+    figures: dict[str, dict[str, Annotated[tuple[_Number, ...], BeforeValidator(_several)]]]
 
     def values(self, measurements: tuple[str, ...], figure: str) -> tuple[float, ...]:
         """Values of a figure under the first of these names that has any; none are an empty tuple."""
@@ -237,28 +225,8 @@ class Reference:
 def load_reference(name_or_path: str | Path) -> Reference:
     """Published values by name (``thesis``) or path of a TOML file.
 
-    Raises
-    ------
-    DescriptionError
-        Nothing has this name, or the file does not hold lists of numbers by measurement and figure.
+    Raises DescriptionError: nothing has this name, or the file holds anything but numbers by measurement and figure.
     """
     path = find(name_or_path, "references")
     table = read_table(path, "references")
-    title = table.pop("title", path.stem)
-    if not isinstance(title, str):
-        raise DescriptionError(f"{path}: title is {title!r}; expected text")
-    return Reference(title, {name: _published_figures(path, name, found) for name, found in table.items()})
-
-
-def _published_figures(path: Path, name: str, found: Any) -> dict[str, tuple[float, ...]]:
-    if not isinstance(found, dict):
-        raise DescriptionError(f'{path}: {name} is {found!r}; expected a table ["{name}"] of figures')
-    return {figure: _numbers(f"{path}: {name}.{figure}", values) for figure, values in found.items()}
-
-
-def _numbers(place: str, found: Any) -> tuple[float, ...]:
-    values = found if isinstance(found, list) else [found]
-    for value in values:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise DescriptionError(f"{place} holds {value!r}; expected finite numbers in mm")
-    return tuple(map(float, values))
+    return validated(Reference, {"title": table.pop("title", path.stem), "figures": table}, path)

@@ -4,20 +4,18 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import JsonValue
 
 from uwlts.measurement.evaluation_file import FORMAT as EVALUATION_FORMAT
 from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CaptureError, DescriptionError
-from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.model.sensor import Camera, Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.design import (
     depth_mm,
     depth_per_pixel_mm,
@@ -50,6 +48,8 @@ class Quantity(NamedTuple):
 def design(sensor: str | Path | Sensor, *, medium: str) -> list[Quantity]:
     """Resolution, line length, depth range and speckle limit of a sensor in one of its media by the design formulas.
 
+    Depths and ranges run along the camera's axis unless named otherwise.
+
     Raises
     ------
     DescriptionError
@@ -57,20 +57,9 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[Quantity]:
     DesignError
         As `nominal_setup`.
     """
-    described = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
-    return design_table(described, described.medium(medium))
-
-
-def design_table(sensor: Sensor, medium: Medium) -> list[Quantity]:
-    """What the formulas say of a sensor in a medium; depths and ranges along the camera's axis unless named otherwise.
-
-    Raises
-    ------
-    DesignError
-        As `nominal_setup`.
-    """
+    sensor = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
     camera = sensor.camera
-    setup, leaning = nominal_setup(sensor, medium)
+    setup, leaning = nominal_setup(sensor, sensor.medium(medium))
     window, tangent = setup.window, math.tan(setup.triangulation_angle_rad)
     sides = {"width": camera.width_px, "height": camera.height_px}
     along = sides.pop(camera.stripe_along)
@@ -169,7 +158,7 @@ def _json_lines(path: Path) -> list[str]:
 
 
 def capture_lines(capture: Capture) -> list[str]:
-    """What a capture holds."""
+    """Content of a capture."""
     header, camera = capture.header, capture.header.sensor.camera
     laser = int(capture.laser_on.sum())
     lines = [
@@ -184,15 +173,15 @@ def capture_lines(capture: Capture) -> list[str]:
             f"stage from {capture.stage_mm.min():.3f} to {capture.stage_mm.max():.3f} mm along OCS "
             f"{tuple(round(x, 4) for x in header.stage_direction)}; exposure {exposures} ms"
         )
-    for name, thing in (("target", header.target), ("artefact", header.artefact)):
-        if thing:
-            lines.append(f"{name}: {', '.join(f'{key} {value}' for key, value in thing.items())}")
-    lines.append(f"recorded by: {', '.join(f'{key} {value}' for key, value in header.provenance.items()) or 'unknown'}")
+    origin = header.provenance or {"unknown": ""}
+    for name, table in {"target": header.target, "artefact": header.artefact, "recorded by": origin}.items():
+        if table:
+            lines.append(f"{name}: {', '.join(f'{key} {value}'.rstrip() for key, value in table.items())}")
     return lines
 
 
 def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
-    """What a ground-truth file holds."""
+    """Content of a ground-truth file."""
     frames, lines = truth.status.shape
     visible = int(np.count_nonzero(truth.status == TruthStatus.VISIBLE))
     return [
@@ -202,7 +191,7 @@ def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
 
 
 def cloud_lines(cloud: PointCloud) -> list[str]:
-    """What a cloud holds."""
+    """Content of a cloud."""
     if len(cloud) == 0:
         return ["cloud without points", *(f"{key}: {value}" for key, value in cloud.metadata.items())]
     low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
@@ -214,7 +203,7 @@ def cloud_lines(cloud: PointCloud) -> list[str]:
 
 
 def calibration_lines(calibration: Calibration) -> list[str]:
-    """What a calibration says, with its residuals."""
+    """Parameters and residuals of a calibration."""
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
     d = camera.distortion
     lines = [
@@ -233,35 +222,36 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         lines.append(
             f"window: {window.refractions} refraction(s), {window.distance_mm:.3f} mm from the entrance pupil{glass}"
         )
-    figures = {
-        "camera": ("rms_px", "px"),
-        "sheet": ("rms_mm", "mm"),
-        "window": ("std_mm", "mm standard uncertainty of d"),
-    }
-    for step, (name, unit) in figures.items():
+    lines += _figure_lines(
+        calibration,
+        camera=("rms_px", "camera residual: {:.4f} px"),
+        sheet=("rms_mm", "sheet residual: {:.4f} mm"),
+        window=("std_mm", "window: {:.3f} mm standard uncertainty of d"),
+    )
+    if (joint := calibration.joint) is not None:
+        lines.append("joint estimate, with standard uncertainties after and before:")
+        for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
+            known = "" if before is None else f" ({before:.2g})"
+            lines.append(f"  {key.text.replace('_', ' ')}: {value:.6g} ± {std:.2g}{known}")
+        scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
+        lines.append(f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out")
+    return lines
+
+
+def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:
+    """Figures by their steps, each with its name and its text; ValueError if one is no number."""
+    lines = []
+    for step, (name, text) in shown.items():
         value = calibration.figures(step).get(name)
+        if not isinstance(value, int | float | None):
+            raise ValueError(f"{value!r}")
         if value is not None:
-            number = _number(value)
-            lines.append(
-                f"window: {number:.3f} {unit}" if step == "window" else f"{step} residual: {number:.4f} {unit}"
-            )
-    return lines + _joint_lines(calibration.joint)
-
-
-def _joint_lines(joint: JointEstimate | None) -> list[str]:
-    """Parameters of a joint estimate with their standard uncertainties, before and after."""
-    if joint is None:
-        return []
-    lines = ["joint estimate, with standard uncertainties after and before:"]
-    for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
-        known = "" if before is None else f" ({before:.2g})"
-        lines.append(f"  {key.text.replace('_', ' ')}: {value:.6g} ± {std:.2g}{known}")
-    scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
-    return [*lines, f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out"]
+            lines.append(text.format(value))
+    return lines
 
 
 def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
-    """What a calibration by polynomials says, with its residuals."""
+    """Range and residuals of a calibration by polynomials."""
     last = calibration.first_line + len(calibration.domains_px) - 1
     reached = sum(domain is not None for domain in calibration.domains_px)
     low, high = calibration.depth_range_mm
@@ -271,21 +261,16 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
         f"degree {calibration.degree}, for {reached} of the lines {calibration.first_line} to {last}, Z from {low:.1f} "
         f"to {high:.1f} mm",
     ]
-    for name, what in (("depth", "Z(position)"), ("along", "Y(Z)"), ("map", "target's points on the plate")):
-        value = calibration.figures(name).get("rms_mm")
-        if value is not None:
-            lines.append(f"{what}: residual {_number(value):.4f} mm (rms)")
-    return lines
-
-
-def _number(value: JsonValue) -> float:
-    if not isinstance(value, int | float):
-        raise ValueError(f"{value!r}")
-    return value
+    return lines + _figure_lines(
+        calibration,
+        depth=("rms_mm", "Z(position): residual {:.4f} mm (rms)"),
+        along=("rms_mm", "Y(Z): residual {:.4f} mm (rms)"),
+        map=("rms_mm", "target's points on the plate: residual {:.4f} mm (rms)"),
+    )
 
 
 def evaluation_lines(record: EvaluationRecord) -> list[str]:
-    """What an evaluation says."""
+    """Figures of an evaluation."""
     lines = [f"evaluation of {record.cloud}"]
     if evaluation := record.evaluation:
         for name, value in evaluation.figures_mm.items():
@@ -305,7 +290,7 @@ def evaluation_lines(record: EvaluationRecord) -> list[str]:
 
 
 def sensor_lines(sensor: Sensor) -> list[str]:
-    """What a sensor can do in each of its media; the line length for both ways to turn the camera."""
+    """Views of a sensor in each of its media; the line length for both ways to turn the camera."""
     laser = sensor.laser
     lines = [f"sensor '{sensor.name}': {sensor.notes}", f"image {sensor.camera.width_px} x {sensor.camera.height_px}"]
     if laser.baseline_mm is not None:
@@ -317,18 +302,15 @@ def sensor_lines(sensor: Sensor) -> list[str]:
             f"view from {view.nearest_mm:.1f} to {view.farthest_mm:.1f} mm"
         )
         for along, side in (("width", sensor.camera.width_px), ("height", sensor.camera.height_px)):
-            turned = sensor.model_copy(update={"camera": _turned(sensor.camera, along)})
+            camera = sensor.camera.model_copy(update={"stripe_along": along})
+            turned = sensor.model_copy(update={"camera": camera})
             length = view_of_sheet(turned, medium).line_length_mm
             chosen = " (this sensor)" if along == sensor.camera.stripe_along else ""
             lines.append(f"  line length at the stand-off, stripe along the {side} side: {length:.1f} mm{chosen}")
     return lines
 
 
-def _turned(camera: Camera, along: str) -> Camera:
-    return camera.model_copy(update={"stripe_along": along})
-
-
-def _medium(medium: Any, sensor: Sensor) -> str:
+def _medium(medium: Medium, sensor: Sensor) -> str:
     index = medium.refractive_index(sensor.laser.wavelength_nm)
     water = f", {medium.temperature_c:g} degC, {medium.salinity_g_kg:g} g/kg" if medium.kind in ("fresh", "sea") else ""
     return f"{medium.kind}, n {index:.5f}{water}"

@@ -1,7 +1,7 @@
 """Results of a model comparison: figures as a file, lines for a terminal, and a page to read."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,7 @@ import uwlts
 from uwlts.calibration.model_comparison.candidates import DIMENSIONS, Candidate, distortion_words
 from uwlts.calibration.model_comparison.comparison import Choice, Comparison, Judged
 from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE
-from uwlts.calibration.model_comparison.scores import POINTS, STRIPES, PolynomialScore
+from uwlts.calibration.model_comparison.scores import POINTS, STRIPES, PolynomialScore, Score
 from uwlts.report.numbers import fixed, small_length
 from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
 from uwlts.storage.files import json_text
@@ -25,23 +25,10 @@ class _Content(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class HeldOutScore(_Content):
-    """Root mean square misses of a model in images held out in one way.
+@dataclass(frozen=True)
+class HeldOutScore(Score):
+    """A score, and what the model misses besides the best, in quadrature, with its standard error; None if as good."""
 
-    Attributes
-    ----------
-    px, mm : dict
-        Of the target's points and of the stripes, in the image and on the object.
-    all_mm, std_mm : float
-        Of both together, and its standard error.
-    adds_mm, adds_std_mm : float or None
-        What the model misses besides the best, in quadrature, with its standard error; None where it is as good.
-    """
-
-    px: dict[str, float]
-    mm: dict[str, float]
-    all_mm: float
-    std_mm: float
     adds_mm: float | None
     adds_std_mm: float | None
 
@@ -106,14 +93,7 @@ def _row(comparison: Comparison, judged: Judged) -> ModelRow:
     scores = {}
     for where, score in judged.scores.items():
         cost = adds(choice, judged.candidate, choice.best(), where)
-        scores[where] = HeldOutScore(
-            px=score.px,
-            mm=score.mm,
-            all_mm=score.all_mm,
-            std_mm=score.std_mm,
-            adds_mm=None if cost is None else cost[0],
-            adds_std_mm=None if cost is None else cost[1],
-        )
+        scores[where] = HeldOutScore(**vars(score), adds_mm=cost and cost[0], adds_std_mm=cost and cost[1])
     return ModelRow(
         model=model,
         parameters=judged.parameters,
@@ -154,12 +134,15 @@ def lines_of(content: ModelComparisonContent) -> list[str]:
 
 
 def _cells(score: HeldOutScore) -> str:
-    everything = f"{fixed(1e3 * score.all_mm, 1)} ± {fixed(1e3 * score.std_mm, 1)}"
-    cost = "as good"
+    everything, cost = _in_um(score.all_mm, score.std_mm), "as good"
     if score.adds_mm is not None and score.adds_std_mm is not None:
-        cost = f"{fixed(1e3 * score.adds_mm, 1)} ± {fixed(1e3 * score.adds_std_mm, 1)}"
+        cost = _in_um(score.adds_mm, score.adds_std_mm)
     points, stripes = (fixed(score.px[kind], 4) if kind in score.px else MISSING for kind in (POINTS, STRIPES))
     return f"{points:>8}{stripes:>9}{everything:>15}{cost:>14}"
+
+
+def _in_um(value_mm: float, std_mm: float) -> str:
+    return f"{fixed(1e3 * value_mm, 1)} ± {fixed(1e3 * std_mm, 1)}"
 
 
 def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = False) -> None:
@@ -174,7 +157,7 @@ def models_page(content: ModelComparisonContent) -> str:
 
 
 def _picture(content: ModelComparisonContent) -> Markup | None:
-    """What each model adds, by its number in the table; None where no model adds anything."""
+    """The share that each model adds, by its number in the table; None where no model adds anything."""
     shown = {}
     for where in _WAYS:
         scores = [(number, row.score(where)) for number, row in enumerate(content.models, start=1)]
@@ -184,20 +167,14 @@ def _picture(content: ModelComparisonContent) -> Markup | None:
     if not shown:
         return None
     figure, panels = new_figure(5.6 * len(shown), 3.4, columns=len(shown))
+    label = "adds to the misses of the best, with standard error"
+    # Both pictures number all models, including those that add nothing.
+    count = len(content.models)
     for axes, (where, adding) in zip(panels, shown.items(), strict=True):
         number, adds_um, error_um = zip(*adding, strict=True)
-        axes.errorbar(
-            number, adds_um, error_um, fmt="o", capsize=2.5, label="adds to the misses of the best, with standard error"
-        )
-        # Both pictures number all models, including those that add nothing.
-        axes.set(
-            title=f"{where} the calibrated volume",
-            xlabel="model",
-            ylabel="adds / µm",
-            yscale="log",
-            xlim=(0.5, len(content.models) + 0.5),
-            xticks=range(1, len(content.models) + 1),
-        )
+        axes.errorbar(number, adds_um, error_um, fmt="o", capsize=2.5, label=label)
+        axes.set(title=f"{where} the calibrated volume", xlabel="model", ylabel="adds / µm", yscale="log")
+        axes.set(xlim=(0.5, count + 0.5), xticks=range(1, count + 1))
     legend_below(figure)
     return svg_of(figure)
 
@@ -221,7 +198,7 @@ def adds(choice: Choice, candidate: Candidate, other: Candidate, where: str) -> 
 
 
 def verdicts(choice: Choice) -> list[str]:
-    """For everything that was modelled in several ways what is needed, and which model to take."""
+    """Sentences on what is needed of everything that was modelled in several ways, and on the model to take."""
     usual, said = Candidate(), []
     known = {each.candidate: each for each in choice.judged}
     for name, (part, lacking) in _PARTS.items():

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
 from uwlts.report.page_toolkit import MISSING
@@ -33,9 +34,9 @@ def plain(value: float) -> str:
     return f"{value:.4g}"
 
 
-def as_fine_as(value: float, scale: float) -> str:
-    """A number with as many decimals as three significant digits of a scale have."""
-    decimals = 2 - math.floor(math.log10(scale)) if scale > 0 else 3
+def as_fine_as(value: float, scale: float, *, digits: int = 3) -> str:
+    """A number with as many decimals as the significant digits of a scale have."""
+    decimals = digits - 1 - math.floor(math.log10(scale)) if scale > 0 else 3
     return fixed(value, max(0, decimals))
 
 
@@ -53,6 +54,20 @@ def words_of(name: str) -> str:
 def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value from JSON is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def number_list(value: Any) -> list[float | None] | None:
+    """A list of finite numbers from JSON, None for missing ones; None if the value is anything else."""
+    return value if isinstance(value, list) and all(each is None or is_number(each) for each in value) else None
+
+
+def entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
+    """Group, name and value of the entries of nested tables; a group is the names of its tables."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from entries_of(value, f"{group} {name}".strip())
+        else:
+            yield group, name, value
 
 
 def unit_for(spread_mm: float) -> tuple[str, float]:

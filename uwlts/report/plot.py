@@ -6,9 +6,9 @@ Every function draws into ``ax``, or into a new figure in the style of the pages
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import cycle, product
 from typing import TYPE_CHECKING, Any, Literal, assert_never
 
 import numpy as np
@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.model.calibration import Calibration
-from uwlts.report.numbers import as_fine_as, is_number, unit_for, unit_of, words_of
+from uwlts.report.numbers import as_fine_as, entries_of, number_list, unit_for, unit_of, words_of
 from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, RED, figure_of, new_figure, plain_text, typographic
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
@@ -66,6 +66,10 @@ _INTERVALS, _LEAST_IN_INTERVAL = 120, 5
 _FLAT = 1.2
 # Pixels shown beside a stripe; image lines and pixels beside it in the enlarged part.
 _AROUND_PX, _LINES_ENLARGED, _AROUND_ENLARGED_PX = 24, 44, 7
+
+
+class NothingToDrawError(ValueError):
+    """A cloud or calibration does not hold what a plot shows."""
 
 
 def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviation") -> Axes3D:
@@ -193,14 +197,12 @@ def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
             **_xyz(points[~unknown]),
             mode="markers",
             name="evaluated",
-            marker={
-                "size": 2,
-                "color": deviation[~unknown],
-                "colorscale": [[at, "rgb({}, {}, {})".format(*rgb)] for at, rgb in STOPS],
-                "cmin": -factor * limit,
-                "cmax": factor * limit,
-                "colorbar": {"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
-            },
+            marker_size=2,
+            marker_color=deviation[~unknown],
+            marker_colorscale=[[at, "rgb({}, {}, {})".format(*rgb)] for at, rgb in STOPS],
+            marker_cmin=-factor * limit,
+            marker_cmax=factor * limit,
+            marker_colorbar={"title": {"text": f"deviation<br>/ {unit}"}, "thickness": 16, "len": 0.8},
             hovertemplate=f"{place}<br>deviation %{{marker.color:.4g}} {unit}<extra></extra>",
         )
         shown += f" The colours end at {LIMIT_STD:g} standard deviations, ±{factor * limit:.3g} {unit}."
@@ -219,33 +221,21 @@ def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
             else " The file holds no deviations; let the evaluation write a coloured cloud to see them here."
         )
     low, high = cloud_limits(cloud.points_mm)
-    axes = {
-        f"{name}axis": {
-            "title": {"text": f"{name.upper()} / mm"},
-            "gridcolor": FAINT,
-            "color": INK,
-            "range": [low[number], high[number]],
-            "nticks": 8 if number == 1 else 5,
-        }
-        for number, name in enumerate("xyz")
-    }
+    for name, start, end in zip("xyz", low, high, strict=True):
+        axis = {"title": {"text": f"{name.upper()} / mm"}, "gridcolor": FAINT, "color": INK, "range": [start, end]}
+        figure.update_layout({f"scene_{name}axis": axis | {"nticks": 8 if name == "y" else 5}})
     figure.update_layout(
         template="none",
         height=520,
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         showlegend=False,
         font={"size": 12, "color": INK},
-        scene={
-            **axes,
-            "aspectmode": "manual",
-            "aspectratio": _xyz(2.7 * (high - low) / (high - low).max()),
-            "dragmode": "orbit",
-            "camera": {
-                "eye": _xyz(-1.6 * view_direction()),
-                "up": {"x": 0, "y": 0, "z": -1},
-                "projection": {"type": "orthographic"},
-            },
-        },
+        scene_aspectmode="manual",
+        scene_aspectratio=_xyz(2.7 * (high - low) / (high - low).max()),
+        scene_dragmode="orbit",
+        scene_camera_eye=_xyz(-1.6 * view_direction()),
+        scene_camera_up={"x": 0, "y": 0, "z": -1},
+        scene_camera_projection_type="orthographic",
     )
     return figure, f"{shown} X: direction of the scan; Y: along the stripe; Z: away from the sensor."
 
@@ -293,9 +283,7 @@ def stripe(
     ax.grid(visible=False)
     if stripe is None or not len(stripe.lines):
         return ax
-    lines = stripe.lines
-    if enlarged:
-        lines = lines[_brightest(stripe, min(_LINES_ENLARGED, len(lines)))]
+    lines = _shown_lines(stripe, enlarged=enlarged)
     centres = stripe.centre_px[lines]
     left, right, top, bottom = stripe_window(stripe, grey.shape, enlarged=enlarged)
     ax.set(xlim=(left - 0.5, right + 0.5), ylim=(bottom + 0.5, top - 0.5))
@@ -312,23 +300,23 @@ def stripe(
 
 def stripe_window(stripe: Stripe, shape: Sequence[int], *, enlarged: bool = False) -> tuple[int, int, int, int]:
     """First and last line, first and last pixel that `stripe` shows of an image of a shape (pixels, lines)."""
-    chosen, margin = stripe.lines, _AROUND_PX
-    if enlarged:
-        chosen, margin = chosen[_brightest(stripe, min(_LINES_ENLARGED, len(chosen)))], _AROUND_ENLARGED_PX
-    centres = stripe.centre_px[chosen]
+    lines, margin = _shown_lines(stripe, enlarged=enlarged), _AROUND_ENLARGED_PX if enlarged else _AROUND_PX
+    centres = stripe.centre_px[lines]
     return (
-        max(0, int(chosen.min()) - 2),
-        min(shape[1] - 1, int(chosen.max()) + 2),
+        max(0, int(lines.min()) - 2),
+        min(shape[1] - 1, int(lines.max()) + 2),
         max(0, int(np.floor(centres.min())) - margin),
         min(shape[0] - 1, int(np.ceil(centres.max())) + margin),
     )
 
 
-def _brightest(stripe: Stripe, count: int) -> np.ndarray:
-    """Indices into the stripe's lines: the ``count`` neighbouring image lines with the most light in the stripe."""
-    amplitude = np.nan_to_num(stripe.amplitude)
-    first = int(np.argmax(np.convolve(amplitude, np.ones(count), mode="valid")))
-    return np.flatnonzero((stripe.lines >= first) & (stripe.lines < first + count))
+def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
+    """Image lines that are shown: all of the stripe, or enlarged the neighbouring ones with the most light in it."""
+    if not enlarged:
+        return stripe.lines
+    count = min(_LINES_ENLARGED, len(stripe.lines))
+    first = int(np.argmax(np.convolve(np.nan_to_num(stripe.amplitude), np.ones(count), mode="valid")))
+    return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
 
 
 def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
@@ -336,12 +324,12 @@ def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
 
     Raises
     ------
-    ValueError
+    NothingToDrawError
         No point of the cloud has a deviation.
     """
-    finite = _known_deviations(cloud)
+    _, finite = _evaluated(cloud)
     if not len(finite):
-        raise ValueError("no point of the cloud has a deviation: evaluate it first")
+        raise NothingToDrawError("no point of the cloud has a deviation: evaluate it first")
     ax = _axes(ax)
     mean, std = float(finite.mean()), float(finite.std())
     unit, factor = unit_for(std)
@@ -368,14 +356,19 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
 
     Raises
     ------
-    ValueError
+    NothingToDrawError
         No interval has enough points.
     """
-    if not has_profile(cloud):
-        raise ValueError("too few points of the cloud have a deviation: evaluate it first")
-    ax = _axes(ax)
-    edges, count, place, deviation = _intervals(cloud)
+    points, deviation = _evaluated(cloud)
+    y = points[:, 1]
+    edges = np.linspace(y.min(), y.max(), _INTERVALS + 1) if len(y) else np.zeros(_INTERVALS + 1)
+    place = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, _INTERVALS - 1)
+    count = np.bincount(place, minlength=_INTERVALS)
     enough = count >= _LEAST_IN_INTERVAL
+    # Points of one Y have no profile.
+    if edges[0] == edges[-1] or not enough.any():
+        raise NothingToDrawError("too few points of the cloud have a deviation: evaluate it first")
+    ax = _axes(ax)
     mean = np.bincount(place, deviation, _INTERVALS)[enough] / count[enough]
     square = np.bincount(place, deviation**2, _INTERVALS)[enough] / count[enough]
     std = np.sqrt(np.maximum(square - mean**2, 0))
@@ -392,25 +385,11 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def has_profile(cloud: PointCloud) -> bool:
-    """Whether a cloud has enough deviations for `along_stripe`."""
-    return len(_known_deviations(cloud)) > 0 and bool((_intervals(cloud)[1] >= _LEAST_IN_INTERVAL).any())
-
-
-def _known_deviations(cloud: PointCloud) -> np.ndarray:
-    deviation = np.empty(0) if cloud.deviation_mm is None else cloud.deviation_mm.astype(np.float64)
-    return deviation[np.isfinite(deviation)]
-
-
-def _intervals(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Edges of intervals of Y, points in each, and the interval and deviation of every evaluated point."""
-    assert cloud.deviation_mm is not None
-    y = cloud.points_mm[np.isfinite(cloud.deviation_mm), 1]
-    edges = np.linspace(y.min(), y.max(), _INTERVALS + 1)
-    place = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, _INTERVALS - 1)
-    # Points of one Y have no profile.
-    count = np.bincount(place, minlength=_INTERVALS) if np.ptp(y) > 0 else np.zeros(_INTERVALS, int)
-    return edges, count, place, _known_deviations(cloud)
+def _evaluated(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) that have a deviation, and their deviations (N,)."""
+    deviation = np.full(len(cloud), np.nan) if cloud.deviation_mm is None else cloud.deviation_mm.astype(np.float64)
+    known = np.isfinite(deviation)
+    return cloud.points_mm[known], deviation[known]
 
 
 @dataclass(frozen=True)
@@ -426,21 +405,13 @@ class ResidualList:
 def residual_lists(calibration: Calibration) -> list[ResidualList]:
     """All lists of residuals that are long enough to be drawn; matrices are left out."""
     found = []
-    for group, name, values in _lists(calibration.residuals_in_file(), ""):
-        if len(values) > SHORT_LIST and any(is_number(value) for value in values):
+    for group, name, value in entries_of(calibration.residuals_in_file()):
+        values = number_list(value) or ()
+        if len(values) > SHORT_LIST and any(each is not None for each in values):
             images = calibration.figures(group).get("images")
             names = [image for image in images if isinstance(image, str)] if isinstance(images, list) else []
-            numbers = tuple(value if is_number(value) else None for value in values)
-            found.append(ResidualList(group, name, numbers, tuple(names) if len(names) == len(values) else ()))
+            found.append(ResidualList(group, name, tuple(values), tuple(names) if len(names) == len(values) else ()))
     return found
-
-
-def _lists(table: Mapping[str, Any], group: str) -> Iterator[tuple[str, str, list[Any]]]:
-    for name, value in table.items():
-        if isinstance(value, dict):
-            yield from _lists(value, f"{group} {name}".strip())
-        elif isinstance(value, list) and all(item is None or is_number(item) for item in value):
-            yield group, name, value
 
 
 def residuals(calibration: Calibration, ax: Axes | None = None, *, which: ResidualList | None = None) -> Axes:
@@ -448,12 +419,12 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: Residu
 
     Raises
     ------
-    ValueError
+    NothingToDrawError
         The calibration has no list of residuals.
     """
     which = which or next(iter(residual_lists(calibration)), None)
     if which is None:
-        raise ValueError("the calibration stores no list of residuals")
+        raise NothingToDrawError("the calibration stores no list of residuals")
     ax = _axes(ax)
     places = np.arange(1, len(which.values) + 1)
     heights = np.array([np.nan if value is None else value for value in which.values])
@@ -482,29 +453,27 @@ def window_curves(
 
     Raises
     ------
-    ValueError
+    NothingToDrawError
         None of the calibrations stores it.
     """
-    if not has_window_curve(calibrations):
-        raise ValueError("none of the calibrations stores the error over the tried window distances")
+    curves = {name: _window_curve(calibration) for name, calibration in calibrations.items()}
+    if all(curve is None for curve in curves.values()):
+        raise NothingToDrawError("none of the calibrations stores the error over the tried window distances")
     ax = _axes(ax)
-    for number, (name, calibration) in enumerate(calibrations.items()):
-        curve = _window_curve(calibration)
+    for colour, (name, curve) in zip(cycle(COLOURS), curves.items(), strict=False):
         if curve is None:
             continue
-        colour, label, least = COLOURS[number % len(COLOURS)], plain_text(name), None
-        stored = calibration.figures("window").get("errors_mm")
-        errors = [error for error in stored if is_number(error)] if isinstance(stored, list) else []
-        complete = isinstance(stored, list) and 0 < len(errors) == len(stored)
-        if calibration.window is not None and complete:
+        label, window = plain_text(name), calibrations[name].window
+        errors = number_list(calibrations[name].figures("window").get("errors_mm"))
+        rms = float(np.sqrt(np.mean(np.square(np.array(errors or [None], dtype=float)))))
+        if window is not None and np.isfinite(rms):
             # The tried distances are too coarse to meet the bottom of the valley.
-            least = calibration.window.distance_mm, float(np.sqrt(np.mean(np.square(errors))))
-            curve = np.vstack([curve, least])
+            curve = np.vstack([curve, (window.distance_mm, rms)])
             curve = curve[np.argsort(curve[:, 0])]
-            label += f": {least[0]:.3f} mm, error {least[1]:.4f} mm"
-        ax.plot(*curve.T, color=colour, label=label)
-        if least is not None:
-            ax.plot(*least, "D", color=colour, markersize=7)
+            ax.plot(*curve.T, color=colour, label=f"{label}: {window.distance_mm:.3f} mm, error {rms:.4f} mm")
+            ax.plot(window.distance_mm, rms, "D", color=colour, markersize=7)
+        else:
+            ax.plot(*curve.T, color=colour, label=label)
     if true_mm is not None:
         ax.axvline(true_mm, color=RED, linestyle="--", label=f"true {true_mm:.3f} mm")
     ax.set(xlabel="window distance d / mm", ylabel="step height error (rms) / mm")
@@ -512,21 +481,13 @@ def window_curves(
     return ax
 
 
-def has_window_curve(calibrations: Mapping[str, Calibration]) -> bool:
-    """Whether any of the calibrations has what `window_curves` draws."""
-    return any(_window_curve(calibration) is not None for calibration in calibrations.values())
-
-
 def _window_curve(calibration: Calibration) -> np.ndarray | None:
     """Tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not store them."""
     stored = calibration.figures("window").get("curve_mm")
-    rows = stored if isinstance(stored, list) else []
-    curve = [row for row in rows if isinstance(row, list) and len(row) == 2]
-    if not curve or len(curve) < len(rows):
+    rows = [number_list(row) for row in stored] if isinstance(stored, list) else []
+    if not rows or any(row is None or len(row) != 2 for row in rows):
         return None
-    if not all(value is None or is_number(value) for row in curve for value in row):
-        return None
-    return np.array(curve, dtype=float)
+    return np.array(rows, dtype=float)
 
 
 def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -15,14 +14,14 @@ from uwlts.report.tables import true_window_distance
 from uwlts.storage.files import written_aside
 
 KEY_FIGURES = {
-    "sphere_spacing_error_mm": ("spheres", Quantity.SPACING_ERROR),
-    "probing_error_mm": ("spheres", Quantity.PROBING_ERROR),
-    "std_mm": (None, Quantity.STD),
-    "step_height_error_mm": ("step", Quantity.HEIGHT_ERROR),
-    "pipe_diameter_error_mm": ("pipe", Quantity.DIAMETER_ERROR),
-    "plane_range_error_mm": ("plane", Quantity.RANGE_ERROR),
+    "sphere_spacing_error_mm": ("Sphere spacing error", "spheres", Quantity.SPACING_ERROR),
+    "probing_error_mm": ("Probing error", "spheres", Quantity.PROBING_ERROR),
+    "std_mm": ("Standard deviation", None, Quantity.STD),
+    "step_height_error_mm": ("Step height error", "step", Quantity.HEIGHT_ERROR),
+    "pipe_diameter_error_mm": ("Pipe diameter error", "pipe", Quantity.DIAMETER_ERROR),
+    "plane_range_error_mm": ("Plane range error", "plane", Quantity.RANGE_ERROR),
 }
-"""Key figures by name: kind of the artefact (None: any) and quantity; details are left out."""
+"""Key figures by name: heading, kind of the artefact (None: any) and quantity; details are left out."""
 
 
 class _Stored(BaseModel):
@@ -32,33 +31,23 @@ class _Stored(BaseModel):
 
 
 class KeyFigure(_Stored):
-    """An error of every measurement, its largest, and the mean of their absolute values."""
+    """An error of every measurement, its largest or the published ones, and the mean of their absolute values."""
 
     mean_abs: float | None
-    by_measurement: dict[str, float]
+    by_measurement: dict[str, float | tuple[float, ...]]
 
 
-class PublishedFigure(_Stored):
-    """Published errors of every measurement, and the mean of their absolute values."""
-
-    mean_abs: float | None
-    by_measurement: dict[str, tuple[float, ...]]
-
-
-_Figure = TypeVar("_Figure", KeyFigure, PublishedFigure)
-
-
-class _KeyFigures(_Stored, Generic[_Figure]):
+class _KeyFigures(_Stored):
     """The figures of `KEY_FIGURES`."""
 
-    sphere_spacing_error_mm: _Figure
-    probing_error_mm: _Figure
-    std_mm: _Figure
-    step_height_error_mm: _Figure
-    pipe_diameter_error_mm: _Figure
-    plane_range_error_mm: _Figure
+    sphere_spacing_error_mm: KeyFigure
+    probing_error_mm: KeyFigure
+    std_mm: KeyFigure
+    step_height_error_mm: KeyFigure
+    pipe_diameter_error_mm: KeyFigure
+    plane_range_error_mm: KeyFigure
 
-    def figure(self, key: str) -> _Figure:
+    def figure(self, key: str) -> KeyFigure:
         """The figure of a key of `KEY_FIGURES`."""
         return getattr(self, key)
 
@@ -93,7 +82,7 @@ class PointCount(_Stored):
     rejected: int
 
 
-class CalibrationSummary(_KeyFigures[KeyFigure]):
+class CalibrationSummary(_KeyFigures):
     """Key figures of the measurements made with another calibration than the main one."""
 
     truth: TruthSummary
@@ -103,7 +92,7 @@ class _Title(_Stored):
     title: str
 
 
-class PublishedSummary(_KeyFigures[PublishedFigure], _Title):
+class PublishedSummary(_KeyFigures, _Title):
     """Published key figures of the measurements made, by the names that the reference gives them."""
 
     window_distance_mm: tuple[float, ...]
@@ -114,7 +103,7 @@ class _Names(_Stored):
     calibration: str | None
 
 
-class Summary(_KeyFigures[KeyFigure], _Names):
+class Summary(_KeyFigures, _Names):
     """Key figures of a campaign.
 
     The figures at the top are those of the measurements made with the campaign's main ``calibration``; others are
@@ -167,24 +156,19 @@ def write_summary(
 
 
 def _key_figures(measurements: Iterable[Measurement]) -> dict[str, KeyFigure]:
-    figures = {}
-    for name, (kind, quantity) in KEY_FIGURES.items():
-        values = {}
+    found = {}
+    for name, (_, kind, quantity) in KEY_FIGURES.items():
+        largest = {}
         for measurement in measurements:
             record = measurement.judged
-            evaluation = None if record is None else record.evaluation
-            if record is None or evaluation is None or kind not in (None, evaluation.kind):
+            if record is None or record.evaluation is None or kind not in (None, record.evaluation.kind):
                 continue
-            keys = record.figure_keys()
-            found = [
-                value
-                for figure, value in evaluation.figures_mm.items()
-                if figure in keys and keys[figure].quantity is quantity and not keys[figure].is_detail
-            ]
-            if found:
-                values[measurement.name] = max(found, key=abs)
-        figures[name] = KeyFigure(mean_abs=_mean_abs(values.values()), by_measurement=values)
-    return figures
+            keys = record.figure_keys().items()
+            wanted = {figure for figure, key in keys if key.quantity is quantity and not key.is_detail}
+            if errors := [value for figure, value in record.evaluation.figures_mm.items() if figure in wanted]:
+                largest[measurement.name] = max(errors, key=abs)
+        found[name] = KeyFigure(mean_abs=_mean_abs(largest.values()), by_measurement=largest)
+    return found
 
 
 def _mean_abs(values: Iterable[float]) -> float | None:
@@ -222,9 +206,9 @@ def _pooled(compared: Sequence[TruthFigures]) -> PooledTruth:
 
 def _published(measurements: Sequence[Measurement], reference: Reference) -> PublishedSummary:
     figures = {}
-    for key, (_, figure) in KEY_FIGURES.items():
+    for key, (_, _, figure) in KEY_FIGURES.items():
         values = {m.name: found for m in measurements if (found := reference.values(m.known_as, figure))}
         mean = _mean_abs(value for several in values.values() for value in several)
-        figures[key] = PublishedFigure(mean_abs=mean, by_measurement=values)
+        figures[key] = KeyFigure(mean_abs=mean, by_measurement=values)
     window = reference.values((CALIBRATION,), "window_distance_mm")
     return PublishedSummary(title=reference.title, **figures, window_distance_mm=window)

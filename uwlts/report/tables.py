@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from rich import box
@@ -11,11 +11,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from uwlts.metrology.evaluation import FigureKey
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.gather import CALIBRATION, Campaign, GatheredCalibration, Measurement, Reference
-from uwlts.report.numbers import fixed, is_number, plain, unit_of, words_of
+from uwlts.report.numbers import as_fine_as, entries_of, fixed, is_number, plain, unit_of, words_of
 from uwlts.report.page_toolkit import MISSING, Comparison
 from uwlts.report.plot import SHORT_LIST
 
@@ -47,14 +46,10 @@ class Row:
             measured = MISSING if self.measured is None else f"{fixed(100 * self.measured, 2)} %"
         else:
             measured = fixed(self.measured)
-        published = ", ".join(_as_published(value) for value in self.published) or MISSING
+        # Two decimals below a millimetre where more were not printed: 0.10 is not the same claim as 0.1.
+        published = [fixed(v, 2) if abs(v) < 1 and round(v, 2) == v else f"{v:g}" for v in self.published]
         error = fixed(self.error, signed=True)
-        return self.measurement, self.quantity, fixed(self.true), measured, error, published
-
-
-def _as_published(value: float) -> str:
-    """Two decimals below a millimetre where more were not printed: 0.10 is not the same claim as 0.1."""
-    return fixed(value, 2) if abs(value) < 1 and round(value, 2) == value else f"{value:g}"
+        return self.measurement, self.quantity, fixed(self.true), measured, error, ", ".join(published) or MISSING
 
 
 def summary_table(campaign: Campaign, reference: Reference | None = None) -> list[Row]:
@@ -86,15 +81,19 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
     judged = measurement.judged
     if judged is None:
         return []
-    rows = []
-    if judged.evaluation is not None:
-        keys = judged.figure_keys()
-        for figure, value in judged.evaluation.figures_mm.items():
-            key = keys.get(figure)
-            if key is None or not key.is_detail:
-                published = () if reference is None else reference.values(measurement.known_as, figure)
-                rows.append(_figure_row(measurement.name, figure, value, key, published))
-    rows.sort(key=_place)
+    rows, keys = [], judged.figure_keys()
+    for figure, value in ({} if judged.evaluation is None else judged.evaluation.figures_mm).items():
+        key = keys.get(figure)
+        if key is not None and key.is_detail:
+            continue
+        published = () if reference is None else reference.values(measurement.known_as, figure)
+        if key is None or key.calibrated is None:
+            name = _QUANTITIES.get(figure, figure)
+            rows.append(Row(measurement.name, name, measured=value, published=published))
+        else:
+            name, true, std = key.calibrated.name, key.calibrated.value_mm, key.calibrated.uncertainty_mm
+            rows.append(Row(measurement.name, name, true, true + value, value, published, std))
+    rows.sort(key=lambda row: [*map(row.quantity.startswith, _ORDER), True].index(True))
     if judged.truth is not None:
         truth, fitted = judged.truth, judged.truth.after_best_fit
         rows.append(Row(measurement.name, "rms distance to truth", measured=truth.rms_mm))
@@ -104,18 +103,6 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
         within = f"within {best.tolerance_mm:.3f} {name}"
         rows.append(Row(measurement.name, within, measured=best.share_within_tolerance, unit="share"))
     return rows
-
-
-def _place(row: Row) -> int:
-    return next((place for place, start in enumerate(_ORDER) if row.quantity.startswith(start)), len(_ORDER))
-
-
-def _figure_row(name: str, figure: str, value: float, key: FigureKey | None, published: tuple[float, ...]) -> Row:
-    known = None if key is None else key.calibrated
-    if known is None:
-        return Row(name, _QUANTITIES.get(figure, figure), measured=value, published=published)
-    true = known.value_mm
-    return Row(name, known.name, true, true + value, value, published, known.uncertainty_mm)
 
 
 def _window_rows(campaign: Campaign, reference: Reference | None) -> list[Row]:
@@ -140,44 +127,40 @@ def true_window_distance(campaign: Campaign) -> float | None:
     return None if sensor is None else sensor.camera.window.distance_mm
 
 
-_STD_NAMES = {"fx_px": ("fx", "f"), "fy_px": ("fy", "f"), "cx_px": ("cx",), "cy_px": ("cy",)}
-
-
 def parameter_table(campaign: Campaign) -> Comparison:
     """All parameters with their units and, where known, standard deviations; a last column of a twin's true values."""
-    columns = [found.name for found in campaign.calibrations]
-    parameters = [_parameters(found.calibration) for found in campaign.calibrations]
+    columns = [(found.name, _parameters(found.calibration)) for found in campaign.calibrations]
     if campaign.true_sensor is not None:
-        columns.append("true")
-        parameters.append(_parameters(nominal_calibration(campaign.true_sensor)))
-    names = dict.fromkeys(name for table in parameters for name in table)
-    return Comparison(
-        tuple(columns), tuple((*name, tuple(table.get(name, MISSING) for table in parameters)) for name in names)
-    )
+        columns.append(("true", _parameters(nominal_calibration(campaign.true_sensor))))
+    return _side_by_side(columns)
 
 
 def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> Comparison:
     """Every single figure that the residuals of the calibrations hold, by its name."""
-    tables = [dict(_figures(found.calibration.residuals_in_file(), "")) for found in calibrations]
-    names = dict.fromkeys(name for table in tables for name in table)
+    return _side_by_side([(found.name, dict(_figures(found.calibration))) for found in calibrations])
+
+
+def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> Comparison:
+    """Columns by their headings, each of texts by words and unit."""
+    rows = dict.fromkeys(row for _, table in columns for row in table)
     return Comparison(
-        tuple(found.name for found in calibrations),
-        tuple((*name, tuple(table.get(name, MISSING) for table in tables)) for name in names),
+        tuple(heading for heading, _ in columns),
+        tuple((*row, tuple(table.get(row, MISSING) for _, table in columns)) for row in rows),
     )
 
 
 def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
-    std = _camera_std(calibration)
+    stored = calibration.figures("camera").get("std")
+    std = {key: each for key, each in stored.items() if is_number(each)} if isinstance(stored, dict) else {}
     table = {}
-    for key, words in {
-        "fx_px": "focal length, x",
-        "fy_px": "focal length, y",
-        "cx_px": "principal point, x",
-        "cy_px": "principal point, y",
-    }.items():
-        known = next((std[name] for name in _STD_NAMES[key] if name in std), None)
-        table[words, "px"] = _with_std(getattr(camera, key), known, 3)
+    for words, value, names in (
+        ("focal length, x", camera.fx_px, ("fx", "f")),
+        ("focal length, y", camera.fy_px, ("fy", "f")),
+        ("principal point, x", camera.cx_px, ("cx",)),
+        ("principal point, y", camera.cy_px, ("cy",)),
+    ):
+        table[words, "px"] = _with_std(value, next((std[name] for name in names if name in std), None), 3)
     for name in ("k1", "k2", "k3", "p1", "p2"):
         table[f"distortion {name}", ""] = _with_std(getattr(camera.distortion, name), std.get(name), 6)
     pose = calibration.object_transform()
@@ -196,28 +179,24 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     return table
 
 
-def _camera_std(calibration: Calibration) -> dict[str, float]:
-    std = calibration.figures("camera").get("std")
-    return {key: each for key, each in std.items() if is_number(each)} if isinstance(std, dict) else {}
-
-
 def _with_std(value: float, std: float | None, decimals: int) -> str:
     """A value, and its standard deviation with two significant digits; both with the same decimals."""
     if std is None or not std > 0:
         return fixed(value, decimals)
-    decimals = max(0, 1 - math.floor(math.log10(std)))
-    return f"{fixed(value, decimals)} ± {fixed(std, decimals)}"
+    return f"{as_fine_as(value, std, digits=2)} ± {as_fine_as(std, std, digits=2)}"
 
 
-def _figures(table: dict[str, Any], group: str) -> Iterator[tuple[tuple[str, str], str]]:
-    for name, value in table.items():
+def _figures(calibration: Calibration) -> Iterator[tuple[tuple[str, str], str]]:
+    """Name with unit, and text, of every single figure among the residuals."""
+    for group, name, value in entries_of(calibration.residuals_in_file()):
         words = f"{group}: {words_of(name)}" if group else words_of(name)
-        if isinstance(value, dict):
+        if group == "camera std":
             # Standard deviations of the camera stand beside its parameters.
-            if (group, name) != ("camera", "std"):
-                yield from _figures(value, f"{group} {name}".strip())
-        elif isinstance(value, bool) or is_number(value):
-            yield (words, unit_of(name)), plain(value) if is_number(value) else ("yes" if value else "no")
+            continue
+        if is_number(value):
+            yield (words, unit_of(name)), plain(value)
+        elif isinstance(value, bool):
+            yield (words, unit_of(name)), "yes" if value else "no"
         elif isinstance(value, str):
             yield (words, ""), value
         elif isinstance(value, list) and 0 < len(value) <= SHORT_LIST and all(map(is_number, value)):

@@ -32,7 +32,7 @@ from uwlts.optics.design import (
     thesis_factor,
     window_thickness_mm,
 )
-from uwlts.report.inventory import design_table, table_lines
+from uwlts.report.inventory import design, table_lines
 
 ANGLE = math.radians(35)
 AIR = Triangulation(baseline_mm=265, triangulation_angle_rad=ANGLE, focal_length_mm=12.5, pixel_size_mm=0.0053)
@@ -298,7 +298,7 @@ def test_numbers_without_a_meaning_are_refused(refused, message):
 @pytest.mark.parametrize("medium", ["air", "water"])
 def test_the_table_agrees_with_the_view_of_the_sensor(thesis, medium, along):
     sensor = altered(thesis, {"camera": {"stripe_along": along}})
-    table = {row.name: row for row in design_table(sensor, sensor.media[medium])}
+    table = {row.name: row for row in design(sensor, medium=medium)}
     view = view_of_sheet(sensor, sensor.media[medium])
     assert table["stand-off from the window"].value == pytest.approx(view.standoff_mm)
     assert table["line length at the stand-off"].value == pytest.approx(view.line_length_mm)
@@ -312,7 +312,7 @@ def test_the_table_agrees_with_the_view_of_the_sensor(thesis, medium, along):
 
 
 def test_the_table_of_the_thesis_sensor(thesis):
-    table = {row.name: row for row in design_table(thesis, thesis.media["water"])}
+    table = {row.name: row for row in design(thesis, medium="water")}
     expected = {
         "depth per pixel along the laser's axis": (0.2213, "mm/px"),
         "depth per pixel by the thesis's factor n": (0.1722, "mm/px"),
@@ -339,8 +339,7 @@ def test_a_laser_placed_by_its_axis_has_the_same_design(thesis):
     # Anywhere on its axis, it makes the same sheet.
     origin = tuple(np.array([0.0, -265.0, 0.0]) + 40 * np.array(axis))
     placed = altered(thesis, {"laser": PLACED | {"origin_mm": origin, "axis": axis}})
-    water = thesis.media["water"]
-    for mine, theirs in zip(design_table(placed, water), design_table(thesis, water), strict=True):
+    for mine, theirs in zip(design(placed, medium="water"), design(thesis, medium="water"), strict=True):
         assert mine.value == pytest.approx(theirs.value), mine.name
 
 
@@ -361,14 +360,14 @@ def test_z_of_a_laser_beside_the_camera_runs_along_its_own_axis(thesis):
 def test_sensors_without_a_design_are_refused(thesis):
     bare = altered(thesis, {"camera": {"window": {"mounted": False}}})
     with pytest.raises(DesignError, match=r"index is 1\.3312: mount it"):
-        design_table(bare, bare.media["water"])
+        design(bare, medium="water")
     # In air the unmounted window does nothing.
     air = nominal_setup(bare, bare.media["air"])[0]
     assert depth_mm(air, 100.0, 100.0) == pytest.approx(float(depth_mm(AIR, 100.0, 100.0)))
     # A sheet turned by 90 deg about a laser's axis that leans sideways too.
     laser = PLACED | {"origin_mm": (-150.0, 0.0, 0.0), "axis": (150.0, 0.0, 378.5), "roll_deg": 90.0}
     with pytest.raises(DesignError, match="runs across the image's width"):
-        design_table(altered(thesis, {"laser": laser}), thesis.media["water"])
+        design(altered(thesis, {"laser": laser}), medium="water")
 
 
 def test_the_command_prints_the_table(thesis, monkeypatch, capsys):
@@ -380,7 +379,7 @@ def test_the_command_prints_the_table(thesis, monkeypatch, capsys):
 
     code, out, _ = printed("thesis", "--medium", "water")
     assert code == 0
-    assert out.splitlines() == table_lines(design_table(thesis, thesis.media["water"]))
+    assert out.splitlines() == table_lines(design(thesis, medium="water"))
     assert "0.2213 mm/px" in out
     code, _, error = printed("thesis", "--medium", "oil")
     assert code == 2

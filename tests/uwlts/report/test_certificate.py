@@ -141,7 +141,7 @@ def points(calibration, known, values, pixels):
     ).points_mm
 
 
-def test_lengths_are_worth_what_draws_say(calibration, use):
+def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
     """By drawing parameters and reconstructing with them: a standard deviation of 300 draws is right to 4 % (1 sigma).
 
     The largest of 81 places is compared with the largest by draws, which lies a little higher.
@@ -149,14 +149,14 @@ def test_lengths_are_worth_what_draws_say(calibration, use):
     known = use.known
     drawn = np.random.default_rng(1).multivariate_normal(known.values, use.covariance, DRAWS, method="svd")
     compared = 0
-    for worth in length_uncertainties(use):
-        if worth.axis == "X" or worth.length_mm not in (20.0, 100.0):
+    for stated in length_uncertainties(use):
+        if stated.axis == "X" or stated.length_mm not in (20.0, 100.0):
             continue
-        pixels = pixels_at(calibration, known, ends_over(use.region, worth.axis, worth.length_mm).reshape(-1, 2))
+        pixels = pixels_at(calibration, known, ends_over(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
         found = np.array([points(calibration, known, values, pixels) for values in drawn])
         lengths = np.linalg.norm(found[:, 1::2] - found[:, ::2], axis=2)
-        assert worth.calibration_mm == pytest.approx(2 * np.std(lengths, axis=0).max(), rel=0.2)
-        assert worth.point_mm > worth.calibration_mm
+        assert stated.calibration_mm == pytest.approx(2 * np.std(lengths, axis=0).max(), rel=0.2)
+        assert stated.point_mm > stated.calibration_mm
         compared += 1
     assert compared == 4
 
@@ -164,8 +164,8 @@ def test_lengths_are_worth_what_draws_say(calibration, use):
 def test_along_x_the_stage_counts(use, thesis):
     """Two positions and the scale of 100 mm, twice: k = 2."""
     known = thesis.uncertainty
-    worth = next(w for w in length_uncertainties(use) if w.axis == "X" and w.length_mm == 100.0)
-    assert worth.calibration_mm == pytest.approx(
+    stated = next(w for w in length_uncertainties(use) if w.axis == "X" and w.length_mm == 100.0)
+    assert stated.calibration_mm == pytest.approx(
         2 * np.sqrt(2 * known.stage_position_mm**2 + (100 * known.stage_scale) ** 2)
     )
 
@@ -236,8 +236,8 @@ def test_against_another_calibration(calibration, thesis):
 def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, content, thesis):
     page = certificate_page(content, calibration, before=("drawings", nominal_calibration(thesis)))
     for words in (
-        "What lengths are worth",
-        "cannot tell",
+        "Uncertainty of lengths",
+        "Weakly determined parameters",
         "Correlation of the parameters",
         "Against drawings",
         content.sha256,
@@ -263,10 +263,10 @@ def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path
     assert not isinstance(content, JointCertificate) and "lengths" not in content.in_file()
     page = certificate_page(content, known)
     assert NOT_JOINT[1:] in page
-    assert "What lengths are worth" not in page
+    assert "Uncertainty of lengths" not in page
 
 
-def test_a_damaged_volume_is_told(calibration):
+def test_a_damaged_volume_is_reported(calibration):
     damaged = calibration.joint.model_copy(
         update={"covered": (calibration.joint.covered[0].model_copy(update={"medium": 7}),)}
     )

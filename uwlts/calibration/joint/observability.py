@@ -11,7 +11,7 @@ from uwlts.calibration.joint.stored_estimate import StoredEstimate, found_estima
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.joint_estimate import CoveredRegion
-from uwlts.model.parameter_keys import ParameterKey
+from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project_through_window
 
@@ -203,7 +203,7 @@ class Weakness:
     depth_mm : largest depth Z of its ends, OCS
     """
 
-    parameters: tuple[ParameterKey, ...]
+    parameters: tuple[ParameterInFile, ...]
     confused: bool
     cost_mm: float
     length_mm: float
