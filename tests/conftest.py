@@ -1,7 +1,9 @@
 """Chooses Mitsuba's variant before any test module imports the renderer, and loads the sensor most tests start from."""
 
 import fcntl
+import os
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +14,31 @@ from twin.options import use_variant
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 
+ROOT = Path(__file__).resolve().parent.parent
+
 use_variant()
+
+# Processes that tests start in other folders find the packages as this one does.
+os.environ["PYTHONPATH"] = str(ROOT)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--noise", type=int, default=0, help="draw all noise anew: another number, other noise (0: the usual)"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    number = config.getoption("--noise")
+    if number:
+        folder = str(ROOT / "tests" / "other_noise")
+        os.environ |= {"TEST_NOISE": str(number), "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+        sys.path.insert(0, folder)
+        sys.modules.pop("sitecustomize", None)
+        import sitecustomize
+
+        sitecustomize.change_mitsuba()
+
 
 # A shell starts what runs in its background with SIGINT ignored, and children inherit that: here Ctrl-C is tested.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,6 +1,5 @@
 """Guided calibration by the command, through the real drivers: the twin as stage and camera, and a hand-held target."""
 
-import os
 import re
 import signal
 import subprocess
@@ -30,7 +29,6 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.targets import CircleTarget
 
 ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 COUNT = 5
 SENSOR = """
 base = "thesis"
@@ -107,19 +105,12 @@ def command(*words: object) -> list[str]:
 
 
 def run(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        command(*words), env=ENVIRONMENT, capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL
-    )
+    return subprocess.run(command(*words), capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL)
 
 
 def started(*words: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        command(*words),
-        env=ENVIRONMENT,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        command(*words), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 

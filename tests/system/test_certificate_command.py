@@ -1,7 +1,6 @@
 """The command that writes and checks certificates, on a calibration of views made by Fermat's principle."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -25,7 +24,6 @@ def run(*arguments, folder: Path) -> subprocess.CompletedProcess:
         cwd=folder,
         capture_output=True,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         check=False,
         timeout=60,
     )

@@ -4,7 +4,6 @@ Most cases run inside this process, as the commands' own entry points; some as p
 """
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -27,7 +26,6 @@ from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, 
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 WIDTH, HEIGHT = 160, 128
 # The thesis's sensor with pixels 8 times as large: the same view in few pixels.
 SENSOR = f"""
@@ -264,12 +262,7 @@ def test_wrong_command_line(fails, folder: Path, monkeypatch, line: str, says: s
 def test_as_a_process_of_its_own(tmp_path: Path, line: str):
     program, *arguments = line.split()
     ended = subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=ENVIRONMENT,
+        [sys.executable, "-m", f"{program}.cli", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 2
     assert ended.stdout == ""
@@ -280,9 +273,7 @@ def test_as_a_process_of_its_own(tmp_path: Path, line: str):
 
 def test_reader_that_leaves_early_is_no_error(tmp_path: Path):
     code = f"{sys.executable} -m uwlts.cli info thesis"
-    process = subprocess.Popen(
-        code.split(), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=ENVIRONMENT
-    )
+    process = subprocess.Popen(code.split(), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
     assert process.stderr.read() == b""
     process.stderr.close()
@@ -688,7 +679,6 @@ def test_interrupted_simulation_is_kept_and_resumed(command, folder: Path, tmp_p
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=ENVIRONMENT,
     )
     part, frames = part_path(path), 0
     while frames < 3 and process.poll() is None:

@@ -1,7 +1,6 @@
 """The commands from a target rendered in water alone to spheres measured in water: nothing else is known."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -32,7 +31,6 @@ def run(package: str, *arguments, folder: Path) -> str:
         cwd=folder,
         capture_output=True,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         check=False,
     )
     assert done.returncode == 0, done.stderr

@@ -1,6 +1,5 @@
 """The page of a growing recording: what is seen of each image, and the command that serves it."""
 
-import os
 import signal
 import socket
 import subprocess
@@ -93,7 +92,6 @@ def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path)
         port = free.getsockname()[1]
     watching = subprocess.Popen(
         [sys.executable, "-m", "uwlts.cli", "watch", str(tmp_path / "live.h5"), "--port", str(port)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

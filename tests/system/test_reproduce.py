@@ -27,7 +27,6 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.truth import read_truth, truth_path
 
 ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 SENSOR = """
 base = "thesis"
 name = "small"
@@ -336,7 +335,6 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     options = ["--out", tmp_path / "runs", "--campaigns", 1, "--spp", 1, "--workers", 2]
     command = subprocess.Popen(
         [sys.executable, "-m", "twin.cli", "reproduce", described / "many.toml", *map(str, options)],
-        env=ENVIRONMENT,
         start_new_session=True,
         cwd=tmp_path,
         stdout=subprocess.PIPE,

@@ -1,6 +1,5 @@
 """Scans by the command with the twin as the hardware, through the real drivers: the same cloud as a simulated one."""
 
-import os
 import re
 import signal
 import subprocess
@@ -22,7 +21,6 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import extract_stripe
 
 ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 COUNT = 6
 SENSOR = """
 base = "thesis"
@@ -97,7 +95,7 @@ def command(plan: Path, out: Path, *more: str) -> list[str]:
 
 
 def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(plan, out, *more), env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command(plan, out, *more), capture_output=True, text=True, timeout=120)
 
 
 def dark(served: ServedTwin) -> bool:
@@ -139,9 +137,7 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
             f"reconstruct {tmp_path / name}.h5 --calibration {tmp_path / name}.json --out {tmp_path / name}.ply",
             f"evaluate {tmp_path / name}.ply --out {tmp_path / name}.evaluation.json",
         ):
-            judged = subprocess.run(
-                [sys.executable, "-m", "uwlts.cli", *line.split()], env=ENVIRONMENT, capture_output=True, text=True
-            )
+            judged = subprocess.run([sys.executable, "-m", "uwlts.cli", *line.split()], capture_output=True, text=True)
             assert judged.returncode == 0, judged.stderr
         clouds.append((tmp_path / f"{name}.evaluation.json").read_text())
     # The served images' noise is of another draw than the simulated ones', so that the spreads differ by chance.
@@ -175,9 +171,7 @@ def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_p
 def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder, tmp_path):
     out = tmp_path / "scan.h5"
     plan = written(folder, served, top="laser_ms = 0.3", settle_s=0.4)
-    scanning = subprocess.Popen(
-        command(plan, out), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    scanning = subprocess.Popen(command(plan, out), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
     while True:
         assert time.monotonic() < deadline
@@ -219,7 +213,7 @@ def test_plans_that_cannot_be_done_are_refused_before_anything_moves(served, fol
     before = served.controller.state().position_mm
     plan = written(folder, served, name="wrong", top=top, **stage)
     arguments = [word for word in command(plan, tmp_path / "scan.h5") if word != "--home"] + ["--unlock"]
-    done = subprocess.run(arguments, env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert says in done.stderr and "Traceback" not in done.stderr
     assert served.controller.state().position_mm == before and not (tmp_path / "scan.h5").exists()

@@ -1,6 +1,5 @@
 """Automatic exposure of real runs of ``uwlts scan`` at a served twin, against the exposures that the twin chooses."""
 
-import os
 import subprocess
 import sys
 import time
@@ -17,7 +16,6 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 
 ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 SENSOR = """
 base = "thesis"
 name = "coarse"
@@ -77,7 +75,6 @@ def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:
     )
     done = subprocess.run(
         [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home"],
-        env=ENVIRONMENT,
         capture_output=True,
         text=True,
         timeout=120,
@@ -144,7 +141,6 @@ def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subpr
     )
     return subprocess.Popen(
         [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home", "--watch"],
-        env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         text=True,
     )

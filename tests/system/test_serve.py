@@ -1,6 +1,5 @@
 """The served twin through the real drivers: what stage, laser and exposure do to the picture, and its faults."""
 
-import os
 import re
 import signal
 import subprocess
@@ -326,12 +325,7 @@ def test_the_command_serves_until_it_is_interrupted(described: Path, served):
     arguments = ["serve", described / "board.toml", "--sensor", described / "sensor.toml", "--ideal", "--spp", 1]
     program = [sys.executable, "-m", "twin.cli", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
     command = subprocess.Popen(
-        program,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
+        program, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
         lines = []

@@ -4,7 +4,6 @@ Only formulas are asked here; what rendering says of designs is tested with the 
 """
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from uwlts.model.library import load_sensor
 from uwlts.runtime.workers import open_workers
 
 ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 SWEEP = [sys.executable, "-m", "twin.cli", "sweep"]
 STUDY = """
 title = "Small"
@@ -66,18 +64,13 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
 
 def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more],
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more], capture_output=True, text=True, timeout=300
     )
 
 
 def begun(study: Path, out: Path, *more: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more],
-        env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -160,7 +153,6 @@ def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, 
             "--spp",
             "1",
         ],
-        env=ENVIRONMENT,
         capture_output=True,
         text=True,
         timeout=300,
@@ -238,7 +230,7 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
     """A Dask scheduler and workers, processes of their own on loopback: its address, and the workers."""
     found = folder / "scheduler.json"
     module = [sys.executable, "-m"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": ENVIRONMENT, "cwd": folder}
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
     scheduler = subprocess.Popen(
         [
             *module,

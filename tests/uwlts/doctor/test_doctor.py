@@ -28,14 +28,7 @@ NOBODY = 65534
 
 def doctor(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "uwlts.cli", "doctor", *arguments]
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    return subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, timeout=60)
 
 
 def as_nobody(program: str) -> str:
