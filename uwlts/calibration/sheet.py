@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from uwlts.metrology.flat_fits import fit_plane
+from uwlts.metrology.fits import fit_plane
 from uwlts.metrology.least_squares import fit_robustly
 from uwlts.model.calibration import CameraModel, SheetModel
 from uwlts.model.errors import CalibrationError, EvaluationError

@@ -7,7 +7,7 @@ import numpy as np
 
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.metrology.evaluation import ArtefactEvaluation, FigureUncertainty, spread_mm
-from uwlts.metrology.round_fits import fit_sphere
+from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import SphereEvaluation
 from uwlts.model.artefacts import Artefact
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty

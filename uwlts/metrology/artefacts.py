@@ -3,14 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal, assert_never
+from typing import Any, ClassVar, assert_never
 
 import numpy as np
 
 from uwlts.metrology.evaluation import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
-from uwlts.metrology.flat_fits import PlaneFit, fit_plane
+from uwlts.metrology.fits import CylinderFit, FlatFit, fit_cylinder, fit_plane
 from uwlts.metrology.least_squares import RobustFit, fit_robustly
-from uwlts.metrology.round_fits import CylinderFit, fit_cylinder
 from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
 from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
@@ -23,6 +22,8 @@ _MOST_REJECTED, _DIAMETER_TOLERANCE = 0.1, 0.2
 _LEAST_ARC, _SECTORS = np.pi, 72
 # Points on each face for the height of one profile; a line through fewer is uncertain by its own noise.
 _LEAST_OF_PROFILE = 5
+
+_fit_facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
 
 def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
@@ -94,10 +95,10 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
 
     EvaluationError for too few points, or a tenth of them away from the plane.
     """
-    robust = _fitted(partial(fit_plane, towards=TOWARDS_SENSOR), points, artefact.kind)
+    robust, counts = _fitted(_fit_facing_plane, points, artefact.kind)
     return PlaneEvaluation(
         artefact=artefact,
-        **_point_counts(robust),
+        **counts,
         re_mm=spread_mm(robust.fit.residuals_mm),
         std_mm=robust.fit.std_mm,
         point_mm=tuple(robust.fit.point_mm.tolist()),
@@ -111,7 +112,7 @@ def evaluate_pipe(points: np.ndarray, artefact: Pipe) -> PipeEvaluation:
     EvaluationError for too few points, a tenth of them away from the cylinder, a patch that leaves the cylinder open,
     or a diameter that is not the artefact's within a fifth.
     """
-    robust = _fitted(fit_cylinder, points, artefact.kind)
+    robust, counts = _fitted(fit_cylinder, points, artefact.kind)
     fit = robust.fit
     error = 2 * fit.radius_mm - artefact.diameter_mm
     if abs(error) > _DIAMETER_TOLERANCE * artefact.diameter_mm:
@@ -121,7 +122,7 @@ def evaluate_pipe(points: np.ndarray, artefact: Pipe) -> PipeEvaluation:
         )
     return PipeEvaluation(
         artefact=artefact,
-        **_point_counts(robust),
+        **counts,
         diameter_mm=2 * fit.radius_mm,
         diameter_error_mm=error,
         diameter_std_mm=2 * float(np.sqrt(fit.covariance[4, 4])),
@@ -133,22 +134,17 @@ def evaluate_pipe(points: np.ndarray, artefact: Pipe) -> PipeEvaluation:
     )
 
 
-def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> RobustFit[Any]:
+def _fitted(fit: Callable[[np.ndarray], Any], points: np.ndarray, kind: str) -> tuple[RobustFit[Any], dict[str, Any]]:
+    """A shape fitted to nearly all points, and the fields of its evaluation that concern the points."""
     robust = fit_robustly(fit, points)
     if robust.rejected_share > _MOST_REJECTED:
         raise EvaluationError(
             f"{robust.rejected} of {len(points)} points lie more than {robust.limit_mm:.3g} mm off the best {kind}; "
             f"the cloud holds other surfaces, cut them off"
         )
-    return robust
-
-
-def _point_counts(robust: RobustFit[Any]) -> dict[str, Any]:
-    return {
-        "points_used": int(np.count_nonzero(robust.inliers)),
-        "points_rejected": robust.rejected,
-        "deviation_mm": np.where(robust.inliers, robust.distances_mm, np.nan),
-    }
+    deviation = np.where(robust.inliers, robust.distances_mm, np.nan)
+    used = len(points) - robust.rejected
+    return robust, {"points_used": used, "points_rejected": robust.rejected, "deviation_mm": deviation}
 
 
 def _ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
@@ -167,20 +163,11 @@ def _ovality(points: np.ndarray, fit: CylinderFit) -> float | None:
 class StepEvaluation(ArtefactEvaluation):
     """A step, mm. Deviations are from the reference face's plane, and from that plane at the calibrated height.
 
-    Attributes
-    ----------
-    height_mm, height_error_mm, height_std_mm : float
-        Mean distance of one face's points to the plane through the other's; its standard uncertainty from the
-        scatter of the points alone.
-    profile_height_mm, profile_height_error_mm, profile_height_std_mm : float or None
-        Mean and standard deviation of the heights of the single profiles, measured within the sheet and turned to
-        the faces' normal; None where no profile shows both faces.
-    profiles : int
-        Profiles that show both faces.
-    lower_std_mm, upper_std_mm : float
-        Standard deviations about each face's own plane.
-    parallelism_deg : float
-        Angle between the two planes.
+    The height is the mean distance of one face's points to the plane through the other's, its standard uncertainty that
+    by the scatter of the points alone. The height by profiles is the mean of the heights of the ``profiles`` that show
+    both faces, measured within the sheet and turned to the faces' normal, with their standard deviation; None where
+    there is no such profile. Standard deviations of the faces are about their own planes, between which the
+    parallelism is the angle.
     """
 
     kind: ClassVar[str] = "step"
@@ -210,52 +197,41 @@ def evaluate_step(points: np.ndarray, frame: np.ndarray, artefact: StepStandard,
     EvaluationError where there are no two faces at this height.
     """
     labels = label_step_faces(points, height_mm=artefact.height_mm, edge_mm=artefact.edge_mm, seed=seed)
-    lower, upper = (_step_face(points, labels, face) for face in (StepFace.LOWER, StepFace.UPPER))
+    planes: dict[StepFace, FlatFit] = {}
+    rejected = 0
+    for face in (StepFace.LOWER, StepFace.UPPER):
+        members = np.flatnonzero(labels == face)
+        robust = fit_robustly(_fit_facing_plane, points[members])
+        labels[members[~robust.inliers]] = StepFace.NEITHER
+        planes[face] = robust.fit
+        rejected += robust.rejected
     height = step_height(points, labels, reference=artefact.reference)
-    base, direction = (lower, 1.0) if artefact.reference == "lower" else (upper, -1.0)
-    other = StepFace.UPPER if artefact.reference == "lower" else StepFace.LOWER
-    # The sheet cuts the step at an angle to its normal, where it is longer by one over the cosine.
-    cosine_of_sheet = float(np.linalg.norm(base.fit.normal[1:]))
-    by_profile = cosine_of_sheet * _heights_by_profile(points, frame, labels, artefact.reference)
-    deviation = base.fit.distances_mm(points)
-    deviation[labels == other] -= direction * artefact.height_mm
+    base = StepFace[artefact.reference.upper()]
+    deviation = planes[base].distances_mm(points)
+    deviation[labels == base.other] += artefact.height_mm * (-1 if base == StepFace.LOWER else 1)
     deviation[labels == StepFace.NEITHER] = np.nan
-    cosine = min(1.0, float(abs(lower.fit.normal @ upper.fit.normal)))
-    mean = float(by_profile.mean()) if len(by_profile) else None
+    heights = []
+    for number in np.unique(frame[frame >= 0]):
+        own = frame == number
+        if min(np.count_nonzero(labels[own] == face) for face in planes) >= _LEAST_OF_PROFILE:
+            heights.append(step_height(points[own, 1:], labels[own], reference=artefact.reference).height_mm)
+    # The sheet cuts the step at an angle to its normal, where it is longer by one over the cosine.
+    by_profile = float(np.linalg.norm(planes[base].normal[1:])) * np.array(heights)
+    mean = float(by_profile.mean()) if heights else None
+    lower, upper = planes.values()
     return StepEvaluation(
         artefact=artefact,
         points_used=int(np.count_nonzero(labels)),
-        points_rejected=lower.rejected + upper.rejected,
+        points_rejected=rejected,
         deviation_mm=deviation,
         height_mm=height.height_mm,
         height_error_mm=height.height_mm - artefact.height_mm,
         height_std_mm=height.std_mm,
         profile_height_mm=mean,
         profile_height_error_mm=None if mean is None else mean - artefact.height_mm,
-        profile_height_std_mm=float(by_profile.std(ddof=1)) if len(by_profile) > 1 else None,
-        profiles=len(by_profile),
-        lower_std_mm=lower.fit.std_mm,
-        upper_std_mm=upper.fit.std_mm,
-        parallelism_deg=float(np.degrees(np.arccos(cosine))),
+        profile_height_std_mm=float(by_profile.std(ddof=1)) if len(heights) > 1 else None,
+        profiles=len(heights),
+        lower_std_mm=lower.std_mm,
+        upper_std_mm=upper.std_mm,
+        parallelism_deg=float(np.degrees(np.arccos(min(1.0, abs(lower.normal @ upper.normal))))),
     )
-
-
-def _step_face(points: np.ndarray, labels: np.ndarray, face: StepFace) -> RobustFit[PlaneFit]:
-    """The plane of one face; its outliers lose their label."""
-    members = np.flatnonzero(labels == face)
-    robust = fit_robustly(partial(fit_plane, towards=TOWARDS_SENSOR), points[members])
-    labels[members[~robust.inliers]] = StepFace.NEITHER
-    return robust
-
-
-def _heights_by_profile(
-    points: np.ndarray, frame: np.ndarray, labels: np.ndarray, reference: Literal["lower", "upper"]
-) -> np.ndarray:
-    heights = []
-    for number in np.unique(frame[frame >= 0]):
-        profile = frame == number
-        counts = [np.count_nonzero(labels[profile] == face) for face in (StepFace.LOWER, StepFace.UPPER)]
-        if min(counts) >= _LEAST_OF_PROFILE:
-            height = step_height(points[profile, 1:], labels[profile], reference=reference)
-            heights.append(height.height_mm)
-    return np.array(heights)

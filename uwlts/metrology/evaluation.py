@@ -109,47 +109,35 @@ class Figure:
 
 def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
     """Keys of all figures that the evaluation of an artefact may have, in their order."""
+    errors, plain = [], ()
     match artefact:
         case SphereStandard():
             return _sphere_keys(artefact)
         case PlaneStandard():
-            return _plain_keys(Quantity.RANGE_ERROR, Quantity.STD)
+            plain = Quantity.RANGE_ERROR, Quantity.STD
         case StepStandard():
             height = CalibratedQuantity("step height", artefact.height_mm, artefact.height_uncertainty_mm)
-            return (
-                FigureKey(Quantity.HEIGHT_ERROR, "height error", calibrated=height),
-                *_plain_keys(Quantity.STD, Quantity.PROFILE_HEIGHT_ERROR),
-            )
+            errors, plain = [(Quantity.HEIGHT_ERROR, height)], (Quantity.STD, Quantity.PROFILE_HEIGHT_ERROR)
         case Pipe():
             diameter = CalibratedQuantity("pipe diameter", artefact.diameter_mm, artefact.diameter_uncertainty_mm)
-            return (
-                FigureKey(Quantity.DIAMETER_ERROR, "diameter error", calibrated=diameter),
-                *_plain_keys(Quantity.RANGE, Quantity.STD, Quantity.OVALITY),
-            )
+            errors, plain = [(Quantity.DIAMETER_ERROR, diameter)], (Quantity.RANGE, Quantity.STD, Quantity.OVALITY)
         case _:
             assert_never(artefact)
-
-
-def _plain_keys(*quantities: Quantity) -> tuple[FigureKey, ...]:
-    return tuple(FigureKey(quantity, str(quantity)) for quantity in quantities)
+    with_errors = [*errors, *((quantity, None) for quantity in plain)]
+    return tuple(FigureKey(quantity, str(quantity), calibrated=known) for quantity, known in with_errors)
 
 
 def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
-    keys = [*_plain_keys(Quantity.PROBING_ERROR, Quantity.STD)]
+    keys = [FigureKey(quantity, str(quantity)) for quantity in (Quantity.PROBING_ERROR, Quantity.STD)]
     for number, diameter in enumerate(artefact.diameters_mm, start=1):
         known = CalibratedQuantity(f"diameter, sphere {number}", diameter, artefact.diameter_uncertainty_mm)
-        keys += [
-            FigureKey(Quantity.PROBING_ERROR, f"PE sphere {number}", (number,)),
-            FigureKey(Quantity.STD, f"STD sphere {number}", (number,)),
-            FigureKey(Quantity.DIAMETER_ERROR, f"diameter error sphere {number}", (number,), known),
-        ]
+        of_sphere = (Quantity.PROBING_ERROR, None), (Quantity.STD, None), (Quantity.DIAMETER_ERROR, known)
+        keys += [FigureKey(quantity, f"{quantity} sphere {number}", (number,), size) for quantity, size in of_sphere]
     for number, spacing in enumerate(artefact.spacings_mm, start=1):
-        between = number, number + 1
         pair = "" if len(artefact.spacings_mm) == 1 else f" {number}-{number + 1}"
         for quantity, suffix in ((Quantity.SPACING_ERROR, ""), (Quantity.SPACING_ERROR_KNOWN_RADIUS, " known radius")):
-            name = f"sphere spacing{pair}{suffix}"
-            known = CalibratedQuantity(name, spacing, artefact.spacing_uncertainty_mm)
-            keys.append(FigureKey(quantity, f"SSE{pair}{suffix}", between, known))
+            known = CalibratedQuantity(f"sphere spacing{pair}{suffix}", spacing, artefact.spacing_uncertainty_mm)
+            keys.append(FigureKey(quantity, f"SSE{pair}{suffix}", (number, number + 1), known))
     return tuple(keys)
 
 

@@ -35,19 +35,9 @@ FitT = TypeVar("FitT", bound=Fit)
 
 @dataclass(frozen=True, eq=False)
 class RobustFit(Generic[FitT]):
-    """A fit to the inliers, and what was left out.
+    """A fit to the ``inliers`` (N,) only, the distances (N,) of all points from it, and the number of fits.
 
-    Attributes
-    ----------
-    fit
-        The shape, fitted to the inliers only.
-    inliers : (N,) bool
-    distances_mm : (N,)
-        Distances of all points, inliers or not, from the fitted shape.
-    limit_mm : float
-        Points whose distance differs by more from the median distance (nearly zero) were left out.
-    rounds : int
-        Number of fits.
+    Points whose distance differs by more than ``limit_mm`` from the median distance (nearly zero) were left out.
     """
 
     fit: FitT
@@ -73,20 +63,8 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
     A point is off by the difference of its distance from the median distance of all points; the robust standard
     deviation is 1.4826 times the median size of these differences (the median absolute deviation). A point that was
     left out comes back when a later fit passes within the limit; after 20 rounds points only leave, so that the rounds
-    end. The rule is for a few outliers on one surface, not for telling surfaces apart.
-
-    Parameters
-    ----------
-    fit : callable
-        `fit_sphere`, `fit_plane`, ... or a partial of them: points (M, D) to a shape.
-    points : (N, D), mm
-    k : float
-        Limit in robust standard deviations.
-
-    Raises
-    ------
-    EvaluationError
-        The fit refuses the points or what is left of them.
+    end. The rule is for a few outliers on one surface, not for separating surfaces. ``fit`` makes a shape of points
+    (M, D), mm, as `fit_sphere` and `fit_plane` do; EvaluationError where it refuses the points or what is left of them.
     """
     points = accepted_points(points, least=1, what="a robust fit", dimensions=(2, 3))
     # Rounding alone must not make outliers of exact points.
@@ -117,15 +95,6 @@ LARGEST_RELATIVE_STD = 0.2
 """A radius that is uncertain by more than this share of itself may as well be infinite: the shape may be a plane."""
 
 
-@dataclass(frozen=True)
-class Normalised:
-    """Points moved to their centroid and scaled to a root mean square distance of one from it."""
-
-    points: np.ndarray
-    centroid_mm: np.ndarray
-    scale_mm: float
-
-
 def accepted_points(points: Any, *, least: int, what: str, dimensions: tuple[int, ...] = (3,)) -> np.ndarray:
     """Points (N, D) for a fit; EvaluationError for fewer than `least` or not finite, ValueError for another shape."""
     points = np.asarray(points, dtype=np.float64)
@@ -139,31 +108,35 @@ def accepted_points(points: Any, *, least: int, what: str, dimensions: tuple[int
     return points
 
 
-def normalise(points: np.ndarray, *, what: str) -> Normalised:
-    """Centre and scale (N, D) points; all points in one place are refused."""
+@dataclass(frozen=True, eq=False)
+class Normalised:
+    """Points (N, D) for a fit, and the same moved to their centroid and scaled to a mean square distance of one.
+
+    ``extents`` (D,) are the root sums of squares of the scaled points along their principal ``axes`` (D, D), in rows,
+    the longest first.
+    """
+
+    given_mm: np.ndarray
+    points: np.ndarray
+    centroid_mm: np.ndarray
+    scale_mm: float
+    extents: np.ndarray
+    axes: np.ndarray
+
+    def is_flat(self, dimension: int) -> bool:
+        """Whether the points span no more than `dimension` directions."""
+        return bool(self.extents[dimension] <= _SINGULAR * self.extents[0])
+
+
+def normalised(points: Any, *, least: int, what: str, dimensions: tuple[int, ...] = (3,)) -> Normalised:
+    """Accepted points, centred and scaled; EvaluationError as `accepted_points`, and for points all in one place."""
+    points = accepted_points(points, least=least, what=what, dimensions=dimensions)
     centroid = points.mean(axis=0)
     centred = points - centroid
     scale = float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
     if scale <= 1e-12 * float(np.abs(centroid).max()):
         raise EvaluationError(f"{what}: all {len(points)} points lie in one place")
-    return Normalised(centred / scale, centroid, scale)
-
-
-def prepared_round(
-    points: Any, radius_mm: float | None, *, least: int, what: str
-) -> tuple[np.ndarray, Normalised, float | None]:
-    """Points (N, 3) for a fit of a round surface, the same normalised, and the known radius in their unit, if any.
-
-    A known radius saves one of the ``least`` points. EvaluationError as `accepted_points`, and for points in one plane.
-    """
-    points = accepted_points(points, least=least if radius_mm is None else least - 1, what=what)
-    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0):
-        raise ValueError(f"a radius is positive, not {radius_mm}")
-    unit = normalise(points, what=what)
-    extents, _ = principal_axes(unit.points)
-    if is_flat(extents, 2):
-        raise EvaluationError(f"{what}: all {len(points)} points lie in one plane")
-    return points, unit, None if radius_mm is None else radius_mm / unit.scale_mm
+    return Normalised(points, centred / scale, centroid, scale, *principal_axes(centred / scale))
 
 
 def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,14 +144,8 @@ def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     By the singular values of the points themselves: their scatter matrix would lose half of the digits.
     """
-    triangle = np.linalg.qr(points, mode="r")
-    _, extents, axes = np.linalg.svd(triangle)
+    _, extents, axes = np.linalg.svd(np.linalg.qr(points, mode="r"))
     return extents, axes
-
-
-def is_flat(extents: np.ndarray, dimension: int) -> bool:
-    """Whether points with these principal extents span no more than `dimension` directions."""
-    return bool(extents[dimension] <= _SINGULAR * extents[0])
 
 
 def evenly_thinned(points: np.ndarray, at_most: int) -> np.ndarray:
@@ -199,22 +166,15 @@ def minimised(
     return solution.x, 2.0 * float(solution.cost) if converged else np.inf
 
 
-def require_convergence(sum_of_squares: float, *, what: str) -> None:
-    """Raise EvaluationError for the infinite sum of a search that did not converge."""
-    if not np.isfinite(sum_of_squares):
-        raise EvaluationError(f"{what} does not converge; the points do not have this shape")
-
-
 def covariance_of(jacobian: np.ndarray, sum_of_squares: float, *, what: str) -> tuple[np.ndarray, float]:
-    """Covariance (P, P) of the parameters and standard deviation of one residual.
+    """Covariance (P, P) of the parameters of a shape and standard deviation of one residual.
 
-    s2 (J^T J)^-1 with s2 = sum of squares / (N - P): equal, independent noise on every residual.
-
-    Raises
-    ------
-    EvaluationError
-        The Jacobian (N, P) is singular: some parameter could have any value.
+    s2 (J^T J)^-1 with s2 = sum of squares / (N - P): equal, independent noise on every residual. EvaluationError for
+    the infinite sum of a search that did not converge, or a singular Jacobian (N, P): some parameter could have any
+    value.
     """
+    if not np.isfinite(sum_of_squares):
+        raise EvaluationError(f"{what} fit does not converge; the points do not have this shape")
     count, parameters = jacobian.shape
     _, strengths, directions = np.linalg.svd(np.linalg.qr(jacobian, mode="r"))
     if not strengths[-1] > _SINGULAR * strengths[0]:

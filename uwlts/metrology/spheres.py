@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from uwlts.metrology.evaluation import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
+from uwlts.metrology.fits import SphereFit, fit_sphere
 from uwlts.metrology.least_squares import DEFAULT_K, MAD_TO_STD, RobustFit, fit_robustly
-from uwlts.metrology.round_fits import SphereFit, fit_sphere
 from uwlts.model.artefacts import SphereStandard
 from uwlts.model.errors import EvaluationError
 
@@ -30,18 +30,10 @@ _OUTER_SHARE, _OUTER_COUNT = 0.1, 2
 
 @dataclass(frozen=True, eq=False)
 class FoundSphere:
-    """A sphere in a cloud and which points belong to it.
+    """A sphere in a cloud: the free-radius fit to its points, and their numbers (M,) in the cloud, in that order.
 
-    Attributes
-    ----------
-    robust : RobustFit of SphereFit
-        Free-radius fit to the points that belong to the sphere, `members` in their order.
-    members : (M,) int
-        Indices of those points in the cloud.
-    near : (N,) bool
-        All points of the cloud within three limits of the sphere, mixed ones included.
-    points_mixed : int
-        Points on the sphere where another surface crosses it, which do not belong.
+    ``near`` (N,) are all points of the cloud within three limits of the sphere, including the ``points_mixed`` on it
+    where another surface crosses it, which do not belong.
     """
 
     robust: RobustFit[SphereFit]
@@ -49,16 +41,11 @@ class FoundSphere:
     near: np.ndarray
     points_mixed: int
 
-    @property
-    def used(self) -> np.ndarray:
-        """Indices (K,) in the cloud of the points that the fit rests on."""
-        return self.members[self.robust.inliers]
-
 
 def find_sphere(
     points: np.ndarray, radius_mm: float, *, usable: np.ndarray, rng: np.random.Generator
 ) -> FoundSphere | None:
-    """The best supported sphere of this radius among the usable points, or None.
+    """The best supported sphere of this radius among the ``usable`` (N,) of the points (N, 3), mm, or None.
 
     Centres are proposed by triples of neighbouring points (two spheres of known radius pass through three points),
     judged by the number of points near the surface of the thinned cloud (RANSAC), refined, and accepted when the
@@ -67,18 +54,15 @@ def find_sphere(
     Points belong to the sphere when they lie within three limits of it (a limit is five robust standard deviations,
     at most a tenth of the radius), except where two points and more than 10 % of those within a patch of about 0.12
     radius lie beyond one limit: there another surface, a wall or a stem, crosses the sphere.
-
-    Parameters
-    ----------
-    points : (N, 3), mm
-    usable : (N,) bool
     """
     usable = usable.copy()
     for _ in range(_ATTEMPTS):
         if np.count_nonzero(usable) < LEAST_POINTS:
             return None
-        thinned = _thinned(points[usable], radius_mm * _THINNING, rng)
-        centre = _best_centre(thinned, radius_mm, rng)
+        # One point of each cell, so that density does not count.
+        left = points[usable]
+        _, first = np.unique(_cells(left - left.min(axis=0), radius_mm * _THINNING), return_index=True)
+        centre = _best_centre(left[rng.permutation(first)[:_THINNED]], radius_mm, rng)
         if centre is None:
             return None
         found = _accepted(points, usable, centre, radius_mm)
@@ -88,30 +72,25 @@ def find_sphere(
     return None
 
 
-def _thinned(points: np.ndarray, cell_mm: float, rng: np.random.Generator) -> np.ndarray:
-    """One point of each cell of a cubic grid, so that density does not count, and at most 4000 of them."""
-    cells = np.floor((points - points.min(axis=0)) / cell_mm).astype(np.int64)
-    _, first = np.unique(cells @ _key_factors(cells), return_index=True)
-    return points[rng.permutation(first)[:_THINNED]]
-
-
-def _key_factors(cells: np.ndarray) -> np.ndarray:
-    size = cells.max(axis=0) + 1
-    return np.array([size[1] * size[2], size[2], 1])
+def _cells(points: np.ndarray, size: float) -> np.ndarray:
+    """Numbers (N,) of the cells of a cubic grid in which points (N, 3) lie, none of whose coordinates is negative."""
+    cells = np.floor(points / size).astype(np.int64)
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 
 
 def _best_centre(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray | None:
     """The proposed and refined centre with most points near its sphere."""
     centres = _proposed_centres(points, radius, rng)
     limit = _SEARCH_LIMIT * radius
-    for sample, kept in zip((points[:_SCREENED], points), _KEPT, strict=True):
-        if not len(centres):
-            return None
+
+    def best(centres: np.ndarray, sample: np.ndarray, count: int) -> np.ndarray:
         support = np.count_nonzero(np.abs(cdist(centres, sample) - radius) < limit, axis=1)
-        centres = centres[np.argsort(-support, kind="stable")[:kept]]
-    refined = np.array([_refined_centre(points, centre, radius) for centre in centres])
-    support = np.count_nonzero(np.abs(cdist(refined, points) - radius) < limit, axis=1)
-    return refined[np.argmax(support)]
+        return centres[np.argsort(-support, kind="stable")[:count]]
+
+    if not len(centres):
+        return None
+    centres = best(best(centres, points[:_SCREENED], _KEPT[0]), points, _KEPT[1])
+    return best(np.array([_refined_centre(points, centre, radius) for centre in centres]), points, 1)[0]
 
 
 def _proposed_centres(points: np.ndarray, radius: float, rng: np.random.Generator) -> np.ndarray:
@@ -174,8 +153,7 @@ def _accepted(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius
     points_mixed = int(np.count_nonzero(usable & mixed & (np.abs(distances) <= limit)))
     if points_mixed > len(members):
         return None
-    robust = fit_robustly(fit_sphere, points[members])
-    return FoundSphere(robust, members, near, points_mixed)
+    return FoundSphere(fit_robustly(fit_sphere, points[members]), members, near, points_mixed)
 
 
 def _crossed_by_others(away: np.ndarray, distances: np.ndarray, limit: float, usable: np.ndarray) -> np.ndarray:
@@ -189,8 +167,7 @@ def _crossed_by_others(away: np.ndarray, distances: np.ndarray, limit: float, us
     if not len(near):
         return crossed
     direction = away[near] / np.linalg.norm(away[near], axis=1, keepdims=True)
-    cells = np.floor((direction + 1.0) / _CELL).astype(np.int64)
-    _, cell = np.unique(cells @ _key_factors(cells), return_inverse=True)
+    _, cell = np.unique(_cells(direction + 1.0, _CELL), return_inverse=True)
     outer = np.bincount(cell, weights=np.abs(distances[near]) > limit)
     total = np.bincount(cell)
     crossed[near] = ((outer >= _OUTER_COUNT) & (outer > _OUTER_SHARE * total))[cell]
@@ -204,18 +181,11 @@ _SAME_SIZE = 0.005
 
 @dataclass(frozen=True)
 class SphereResult:
-    """One sphere, mm. `std` names are standard uncertainties from the scatter of the points alone.
+    """One sphere by its free-radius fit, mm, OCS.
 
-    Attributes
-    ----------
-    centre_mm : tuple of float
-        Of the free-radius fit, OCS.
-    pe_mm : float
-        Probing error: range of the radial residuals of the free-radius fit.
-    std_mm : float
-        Standard deviation of those residuals.
-    points_mixed : int
-        Points left aside where another surface crosses the sphere.
+    The probing error ``pe_mm`` is the range of the radial residuals, ``std_mm`` their standard deviation;
+    ``diameter_std_mm`` is a standard uncertainty by the scatter of the points alone. ``points_mixed`` were left aside,
+    as another surface crosses the sphere there.
     """
 
     centre_mm: tuple[float, float, float]
@@ -265,63 +235,65 @@ class SphereEvaluation(ArtefactEvaluation):
         return max((spacing.sse_mm for spacing in self.spacings), key=abs, default=None)
 
     def values_mm(self) -> dict[FigureId, float | None]:
-        values: dict[FigureId, float | None] = {
-            (Quantity.PROBING_ERROR, ()): self.pe_mm,
-            (Quantity.STD, ()): self.std_mm,
-        }
+        kind = Quantity
+        values: dict[FigureId, float | None] = {(kind.PROBING_ERROR, ()): self.pe_mm, (kind.STD, ()): self.std_mm}
         for number, sphere in enumerate(self.spheres, start=1):
-            values[Quantity.PROBING_ERROR, (number,)] = sphere.pe_mm
-            values[Quantity.STD, (number,)] = sphere.std_mm
-            values[Quantity.DIAMETER_ERROR, (number,)] = sphere.diameter_error_mm
+            values[kind.PROBING_ERROR, (number,)] = sphere.pe_mm
+            values[kind.STD, (number,)] = sphere.std_mm
+            values[kind.DIAMETER_ERROR, (number,)] = sphere.diameter_error_mm
         for number, spacing in enumerate(self.spacings, start=1):
-            values[Quantity.SPACING_ERROR, (number, number + 1)] = spacing.sse_mm
-            values[Quantity.SPACING_ERROR_KNOWN_RADIUS, (number, number + 1)] = spacing.sse_known_radius_mm
+            values[kind.SPACING_ERROR, (number, number + 1)] = spacing.sse_mm
+            values[kind.SPACING_ERROR_KNOWN_RADIUS, (number, number + 1)] = spacing.sse_known_radius_mm
         return values
 
 
 def evaluate_spheres(points: np.ndarray, artefact: SphereStandard, *, seed: int = 0) -> SphereEvaluation:
     """Find the spheres in points (N, 3), mm, OCS, and evaluate them.
 
-    Raises
-    ------
-    EvaluationError
-        Fewer spheres than the artefact has; the message says which were found and where. Or they are hollow, as
-        turned images make them.
+    EvaluationError for fewer spheres than the artefact has, with those that were found and where; or if they are
+    hollow, as turned images make them.
     """
     found = _in_order(_found_spheres(points, artefact, np.random.default_rng(seed)), artefact)
     deviation = np.full(len(points), np.nan)
     spheres, fits = [], []
     for sphere, diameter in zip(found, artefact.diameters_mm, strict=True):
         members, robust = _within_cap(points, sphere, artefact.cap_angle_deg)
-        used = members[robust.inliers]
-        if np.mean((points[used] - robust.fit.centre_mm) @ TOWARDS_SENSOR) < 0:
+        used, fit = members[robust.inliers], robust.fit
+        if np.mean((points[used] - fit.centre_mm) @ TOWARDS_SENSOR) < 0:
             raise EvaluationError(
                 "the spheres are hollow: their points lie behind their centres, where the sensor cannot see them. Are "
                 "the images turned by 180 deg or mirrored against those of the calibration?"
             )
-        deviation[used] = robust.fit.residuals_mm
-        fits.append((robust.fit, fit_sphere(points[used], diameter / 2)))
+        deviation[used] = fit.residuals_mm
+        fits.append((fit, fit_sphere(points[used], diameter / 2)))
         spheres.append(
             SphereResult(
-                centre_mm=tuple(robust.fit.centre_mm.tolist()),
-                diameter_mm=2 * robust.fit.radius_mm,
-                diameter_error_mm=2 * robust.fit.radius_mm - diameter,
-                diameter_std_mm=2 * float(np.sqrt(robust.fit.covariance[3, 3])),
-                pe_mm=spread_mm(robust.fit.residuals_mm),
-                std_mm=robust.fit.std_mm,
+                centre_mm=tuple(fit.centre_mm.tolist()),
+                diameter_mm=2 * fit.radius_mm,
+                diameter_error_mm=2 * fit.radius_mm - diameter,
+                diameter_std_mm=2 * float(np.sqrt(fit.covariance[3, 3])),
+                pe_mm=spread_mm(fit.residuals_mm),
+                std_mm=fit.std_mm,
                 points_used=len(used),
                 points_rejected=robust.rejected,
                 points_mixed=sphere.points_mixed,
             )
         )
-    pairs = zip(pairwise(fits), artefact.spacings_mm, strict=True)
+    spacings = []
+    for ((free_1, known_1), (free_2, known_2)), calibrated in zip(pairwise(fits), artefact.spacings_mm, strict=True):
+        between = free_2.centre_mm - free_1.centre_mm
+        spacing = float(np.linalg.norm(between))
+        direction = between / spacing
+        variance = direction @ (free_1.covariance + free_2.covariance)[:3, :3] @ direction
+        by_known = float(np.linalg.norm(known_2.centre_mm - known_1.centre_mm)) - calibrated
+        spacings.append(SpacingResult(spacing, spacing - calibrated, by_known, float(np.sqrt(variance))))
     return SphereEvaluation(
         artefact=artefact,
         points_used=sum(sphere.points_used for sphere in spheres),
         points_rejected=sum(sphere.points_rejected for sphere in spheres),
         deviation_mm=deviation,
         spheres=tuple(spheres),
-        spacings=tuple(_spacing(first, second, calibrated) for (first, second), calibrated in pairs),
+        spacings=tuple(spacings),
     )
 
 
@@ -332,7 +304,7 @@ def _found_spheres(points: np.ndarray, artefact: SphereStandard, rng: np.random.
         sphere = find_sphere(points, diameter / 2, usable=usable, rng=rng)
         if sphere is None:
             place = "{:.2f} mm at ({:.1f}, {:.1f}, {:.1f}) with {} points".format
-            fits = [(other.robust.fit, len(other.used)) for other in found]
+            fits = [(robust.fit, len(robust.inliers) - robust.rejected) for robust in (other.robust for other in found)]
             places = ", ".join(place(2 * fit.radius_mm, *fit.centre_mm, count) for fit, count in fits)
             raise EvaluationError(
                 f"{len(found)} of {len(artefact.diameters_mm)} spheres found among {len(points)} points"
@@ -372,19 +344,3 @@ def _within_cap(
             f"that faces the sensor (-Z); {LEAST_POINTS} are needed. Widen cap_angle_deg"
         )
     return members, fit_robustly(fit_sphere, points[members])
-
-
-def _spacing(
-    first: tuple[SphereFit, SphereFit], second: tuple[SphereFit, SphereFit], calibrated: float
-) -> SpacingResult:
-    (free_1, known_1), (free_2, known_2) = first, second
-    between = free_2.centre_mm - free_1.centre_mm
-    spacing = float(np.linalg.norm(between))
-    direction = between / spacing
-    variance = direction @ (free_1.covariance + free_2.covariance)[:3, :3] @ direction
-    return SpacingResult(
-        spacing_mm=spacing,
-        sse_mm=spacing - calibrated,
-        sse_known_radius_mm=float(np.linalg.norm(known_2.centre_mm - known_1.centre_mm)) - calibrated,
-        spacing_std_mm=float(np.sqrt(variance)),
-    )

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.metrology.flat_fits import LineFit, PlaneFit, fit_line, fit_plane
+from uwlts.metrology.fits import fit_line, fit_plane
 from uwlts.metrology.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
 from uwlts.model.errors import EvaluationError
 
@@ -28,6 +28,11 @@ class StepFace(IntEnum):
     LOWER = 1
     UPPER = 2
 
+    @property
+    def other(self) -> "StepFace":
+        """The upper face of the lower one and the other way round."""
+        return StepFace(3 - self)
+
 
 @dataclass(frozen=True)
 class StepHeight:
@@ -44,22 +49,8 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     pairs (triples) of points; the faces may be in several pieces (base - block - base) and lie at any angle. A point
     belongs to a face when it is nearer to it than five robust standard deviations (within 1 to 30 % of the height)
     and, along the face, farther than `edge_mm` from all points that are not on it: so the rounded, mixed points at
-    edges and the riser stay out.
-
-    Parameters
-    ----------
-    points : (N, 2) or (N, 3), mm
-    height_mm : float
-        Approximate height.
-    edge_mm : float
-        Width of the strip left out beside edges.
-    seed : int
-        Of the random choice.
-
-    Raises
-    ------
-    EvaluationError
-        Too few points, or no two such faces; the message says what was found.
+    edges and the riser stay out. ``height_mm`` is approximate. EvaluationError, which says what was found, for too few
+    points or no two such faces.
     """
     points = accepted_points(points, least=20, what="a step", dimensions=(2, 3))
     least = 10 if points.shape[1] == 2 else 40
@@ -73,13 +64,20 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
     on_anchor = on_other = np.zeros(len(points), dtype=bool)
     for _ in range(_ROUNDS):
         on_anchor, on_other = _levels(points @ normal, anchor, offset)
-        normal = _common_normal(points[on_anchor], points[on_other], normal)
+        # Common to two parallel lines or planes, each through the middle of its points.
+        faces = [face - face.mean(axis=0) for face in (points[on_anchor], points[on_other]) if len(face)]
+        axis = principal_axes(np.vstack(faces))[1][-1]
+        normal = axis if axis @ normal > 0 else -axis
         anchor = float(np.median(points[on_anchor] @ normal))
     lower, upper = (on_anchor, on_other) if offset > 0 else (on_other, on_anchor)
     labels = np.zeros(len(points), dtype=np.int8)
     along = points @ np.linalg.svd(normal[None])[2][1:].T
     for face, on_it in ((StepFace.LOWER, lower), (StepFace.UPPER, upper)):
-        labels[_away_from_edges(along, on_it, edge_mm)] = face
+        members = np.flatnonzero(on_it)
+        if len(members) and edge_mm > 0 and not on_it.all():
+            distance, _ = KDTree(along[~on_it]).query(along[members], distance_upper_bound=edge_mm)
+            members = members[distance > edge_mm]
+        labels[members] = face
     _require_faces(heights=points @ normal, labels=labels, height=height_mm, least=least)
     return labels
 
@@ -90,29 +88,16 @@ def step_height(
     """Mean distance of one face's points to the line (profile) or plane (scan) through the other's.
 
     Thesis, section 3.2.2. In a profile whose sheet does not cut the step along its normal this is the height over the
-    cosine of the angle between.
-
-    Parameters
-    ----------
-    points : (N, 2) or (N, 3), mm
-    labels : (N,)
-        From `label_step_faces`. While points move a little, as in a calibration, the labels can stay.
-    reference : str
-        The face to which the line or plane is fitted.
-
-    Raises
-    ------
-    EvaluationError
-        Too few points on a face.
+    cosine of the angle between. ``points`` are (N, 2) or (N, 3), mm, ``labels`` (N,) from `label_step_faces`; while
+    points move a little, as in a calibration, the labels can stay. The line or plane is fitted to the ``reference``
+    face. EvaluationError for too few points on a face.
     """
-    base, other = (StepFace.LOWER, StepFace.UPPER) if reference == "lower" else (StepFace.UPPER, StepFace.LOWER)
+    base = StepFace[reference.upper()]
     points = np.asarray(points, dtype=np.float64)
-    fit = fit_line if points.shape[1] == 2 else fit_plane
-    surface: LineFit | PlaneFit = fit(points[labels == base])
-    across = accepted_points(points[labels == other], least=2, what="a step face", dimensions=(2, 3))
+    surface = (fit_line if points.shape[1] == 2 else fit_plane)(points[labels == base])
+    across = accepted_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
     distances = surface.distances_mm(across)
-    axes = surface.axes if isinstance(surface, PlaneFit) else surface.direction[None]
-    lever = np.array([1.0, *(axes @ (across.mean(axis=0) - surface.point_mm))])
+    lever = np.array([1.0, *(surface.axes @ (across.mean(axis=0) - surface.point_mm))])
     variance = lever @ surface.covariance @ lever + distances.var(ddof=1) / len(distances)
     return StepHeight(abs(float(distances.mean())), float(np.sqrt(variance)))
 
@@ -120,16 +105,17 @@ def step_height(
 def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
     """Two levels at the right distance, each with enough points and narrow: a slope or curve fills its whole band."""
     lower, upper = heights[labels == StepFace.LOWER], heights[labels == StepFace.UPPER]
-    found, advice = f"no two step faces about {height:g} mm apart", "show both faces, or correct the height"
+    found = ""
     if min(len(lower), len(upper)) < least:
-        counts = (
+        found = (
             f"{len(lower)} points on the lower level, {len(upper)} on the upper one, at least {least} needed on each"
         )
-        raise EvaluationError(f"{found}: {counts}; {advice}")
-    widest = max(float(lower.std()), float(upper.std()))
-    if widest > _LARGEST_STD * height:
-        scatter = f"what lies at these levels scatters by {widest:.2g} mm (standard deviation)"
-        raise EvaluationError(f"{found}: {scatter} and is sloping or curved; {advice}")
+    elif (widest := max(float(lower.std()), float(upper.std()))) > _LARGEST_STD * height:
+        found = f"what lies at these levels scatters by {widest:.2g} mm (standard deviation) and is sloping or curved"
+    if found:
+        raise EvaluationError(
+            f"no two step faces about {height:g} mm apart: {found}; show both faces, or correct the height"
+        )
     distance = float(upper.mean() - lower.mean())
     if abs(distance - height) > _HEIGHT_TOLERANCE * height:
         raise EvaluationError(f"the step faces are {distance:.2f} mm apart; the step is described with {height:g} mm")
@@ -164,9 +150,10 @@ def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     dimension = points.shape[1]
     corners = points[rng.integers(len(points), size=(_PROPOSALS, dimension))]
     side = corners[:, 1] - corners[:, 0]
-    normals = (
-        np.column_stack([-side[:, 1], side[:, 0]]) if dimension == 2 else np.cross(side, corners[:, 2] - corners[:, 0])
-    )
+    if dimension == 2:
+        normals = np.column_stack([-side[:, 1], side[:, 0]])
+    else:
+        normals = np.cross(side, corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     proper = length > 1e-6 * length.max()
     normals = normals[proper] / length[proper, None]
@@ -193,19 +180,3 @@ def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
         spread = MAD_TO_STD * float(np.median(np.abs(near - level)))
         limit = float(np.clip(DEFAULT_K * spread, _LIMITS[0] * height, _LIMITS[1] * height))
     return np.abs(heights - level) <= limit
-
-
-def _common_normal(lower: np.ndarray, upper: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Normal (D,) of two parallel lines or planes, each through the middle of its points."""
-    faces = [face - face.mean(axis=0) for face in (lower, upper) if len(face)]
-    _, axes = principal_axes(np.vstack(faces))
-    return axes[-1] if axes[-1] @ towards > 0 else -axes[-1]
-
-
-def _away_from_edges(along: np.ndarray, on_it: np.ndarray, edge: float) -> np.ndarray:
-    """Indices of the points of a face that no other point comes near along the face."""
-    face, others = np.flatnonzero(on_it), along[~on_it]
-    if not len(others) or not len(face) or edge == 0:
-        return face
-    distance, _ = KDTree(others).query(along[face], distance_upper_bound=edge)
-    return face[distance > edge]

@@ -22,15 +22,11 @@ class TruthComparison:
     distance_mm : (N,)
         Component of the error along the true surface's normal; NaN where not matched.
     mean_mm, std_mm, rms_mm : float
-        Of the distances of the matched points.
-    p95_mm, p99_mm, largest_mm : float
-        Of the absolute distances.
+        Of the distances of the matched points; percentiles and the largest are of their absolute values.
     share_within_tolerance : float
         Share of the matched points with an absolute distance of at most `tolerance_mm`.
-    false_points : int
-        Points without a true stripe.
-    missed : int
-        True stripes (a line of a frame) without a point.
+    false_points, missed : int
+        Points without a true stripe, and true stripes (a line of a frame) without a point.
     """
 
     matched: np.ndarray
@@ -66,17 +62,9 @@ def compare_with_truth(
 ) -> TruthComparison:
     """Signed distances (p - p_true) . n of points (N, 3), mm, to the true surface, and their statistics.
 
-    Parameters
-    ----------
-    points : (N, 3)
-    frame, line : (N,) int
-        Image and row (or column) of each point.
-    point_mm, normal : (F, L, 3)
-        True point and unit surface normal of each line of each frame, in the frame of the points.
-    status : (F, L)
-        0 where the stripe is visible; the other two arrays are not read elsewhere.
-    tolerance_mm : float
-        For `share_within_tolerance`.
+    ``frame`` and ``line`` (N,) are the image and row (or column) of each point. ``point_mm`` and ``normal`` (F, L, 3)
+    are the true point and unit surface normal of each line of each frame, in the frame of the points, where its
+    ``status`` (F, L) is 0, a visible stripe.
 
     Raises
     ------
@@ -92,19 +80,31 @@ def compare_with_truth(
     shapes = point_mm.shape, normal.shape, visible.shape
     if visible.ndim != 2 or shapes[:2] != ((*visible.shape, 3),) * 2:
         raise ValueError(f"truth of the shapes (F, L, 3), (F, L, 3), (F, L) expected: {shapes}")
-    _require_proper(points, frame, line, point_mm, normal, visible)
+    outside = (frame < 0) | (frame >= visible.shape[0]) | (line < 0) | (line >= visible.shape[1])
+    if not np.isfinite(points).all():
+        raise EvaluationError("points to be compared must be finite; leave the others out")
+    if outside.any():
+        first = int(np.argmax(outside))
+        raise EvaluationError(
+            f"{np.count_nonzero(outside)} of {len(points)} points have no place in the truth of {visible.shape[0]} "
+            f"frames and {visible.shape[1]} lines (the first: frame {frame[first]}, line {line[first]}); "
+            f"cloud and truth belong to different captures"
+        )
+    if not np.isfinite(point_mm[visible]).all():
+        raise EvaluationError("the truth is not finite on lines whose stripe it calls visible")
+    # Normals may come in single precision (1e-7); a wrong length would scale every distance.
+    if not np.allclose(np.sum(np.square(normal[visible]), axis=1), 1.0, rtol=0, atol=1e-5):
+        raise EvaluationError("the truth has normals that are not of unit length on lines it calls visible")
     matched = visible[frame, line]
     if not matched.any():
         raise EvaluationError(f"none of the {len(points)} points lies on a frame and line with a visible true stripe")
-    error = np.full(points.shape, np.nan)
-    distance = np.full(len(points), np.nan)
+    error, distance = np.full(points.shape, np.nan), np.full(len(points), np.nan)
     at = frame[matched], line[matched]
     error[matched] = points[matched] - point_mm[at]
-    distance[matched] = np.sum(error[matched] * normal[at], axis=1)
+    signed = distance[matched] = np.sum(error[matched] * normal[at], axis=1)
+    size = np.abs(signed)
     found = np.zeros_like(visible)
     found[at] = True
-
-    signed, size = distance[matched], np.abs(distance[matched])
     p95, p99 = np.percentile(size, [95, 99])
     return TruthComparison(
         matched=matched,
@@ -137,23 +137,3 @@ def best_fit_motion(comparison: TruthComparison, points: np.ndarray) -> np.ndarr
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, middle_true - rotation @ middle_measured
     return motion
-
-
-def _require_proper(
-    points: np.ndarray, frame: np.ndarray, line: np.ndarray, truth: np.ndarray, normal: np.ndarray, visible: np.ndarray
-) -> None:
-    if not np.isfinite(points).all():
-        raise EvaluationError("points to be compared must be finite; leave the others out")
-    outside = (frame < 0) | (frame >= visible.shape[0]) | (line < 0) | (line >= visible.shape[1])
-    if outside.any():
-        first = int(np.argmax(outside))
-        raise EvaluationError(
-            f"{np.count_nonzero(outside)} of {len(points)} points have no place in the truth of {visible.shape[0]} "
-            f"frames and {visible.shape[1]} lines (the first: frame {frame[first]}, line {line[first]}); "
-            f"cloud and truth belong to different captures"
-        )
-    if not np.isfinite(truth[visible]).all():
-        raise EvaluationError("the truth is not finite on lines whose stripe it calls visible")
-    # Normals may come in single precision (1e-7); a wrong length would scale every distance.
-    if not np.allclose(np.sum(np.square(normal[visible]), axis=1), 1.0, rtol=0, atol=1e-5):
-        raise EvaluationError("the truth has normals that are not of unit length on lines it calls visible")

@@ -47,22 +47,22 @@ class Source:
     coverage_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.distribution not in _DIVISORS:
-            raise RangeError(
-                f"{self.name}: unknown distribution '{self.distribution}'; known are {', '.join(_DIVISORS)}"
-            )
-        if not (math.isfinite(self.sensitivity) and math.isfinite(self.correction)):
-            numbers = f"sensitivity {self.sensitivity:g} and correction {self.correction:g}"
-            raise RangeError(f"{self.name}: {numbers}; both must be finite")
-        if not 0 <= self.half_width < math.inf:
-            raise RangeError(f"{self.name}: half_width is {self.half_width:g}; expected a finite number, at least 0")
-        if not self.degrees_of_freedom >= 1:
-            raise RangeError(f"{self.name}: {self.degrees_of_freedom:g} degrees of freedom; expected at least 1")
-        if not 0 < self.coverage_factor < math.inf:
-            raise RangeError(f"{self.name}: coverage_factor is {self.coverage_factor:g}; expected a positive number")
-        if self.distribution != "normal" and self.coverage_factor != 1:
-            found = f"found {self.coverage_factor:g}"
-            raise RangeError(f"{self.name}: a {self.distribution} distribution has no coverage factor, {found}")
+        factor, kind = self.coverage_factor, self.distribution
+        numbers = f"sensitivity {self.sensitivity:g} and correction {self.correction:g}"
+        refusals = [
+            (kind not in _DIVISORS, f"unknown distribution '{kind}'; known are {', '.join(_DIVISORS)}"),
+            (not all(map(math.isfinite, (self.sensitivity, self.correction))), f"{numbers}; both must be finite"),
+            (
+                not 0 <= self.half_width < math.inf,
+                f"half_width is {self.half_width:g}; expected a finite number, at least 0",
+            ),
+            (not self.degrees_of_freedom >= 1, f"{self.degrees_of_freedom:g} degrees of freedom; expected at least 1"),
+            (not 0 < factor < math.inf, f"coverage_factor is {factor:g}; expected a positive number"),
+            (kind != "normal" and factor != 1, f"a {kind} distribution has no coverage factor, found {factor:g}"),
+        ]
+        for refused, message in refusals:
+            if refused:
+                raise RangeError(f"{self.name}: {message}")
 
     @property
     def standard_uncertainty(self) -> float:
@@ -72,25 +72,13 @@ class Source:
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Combined uncertainty of all sources, in the unit of the result.
+    """Combined uncertainty u_c of all sources (GUM Eq. 10), in the unit of the result.
 
-    Attributes
-    ----------
-    sources : tuple of Source
-    standard_uncertainty : float
-        Combined, u_c (GUM Eq. 10).
-    shares_percent : tuple of float
-        Each source's part of u_c squared.
-    degrees_of_freedom : float
-        Effective, by Welch and Satterthwaite (GUM G.4.1, Eq. G.2b); not rounded.
-    coverage_probability, coverage_factor : float
-        The factor k is Student's t for the degrees of freedom cut to an integer (GUM G.4.1, note 1).
-    expanded_uncertainty : float
-        U = k u_c.
-    correction : float
-        Sum of the sources' corrections, each times its sensitivity.
-    largest_error : float
-        Of a result that is left uncorrected: \\|correction\\| + U (thesis section 4.8.5; the GUM would correct).
+    ``shares_percent`` are each source's part of u_c squared. ``degrees_of_freedom`` are effective, by Welch and
+    Satterthwaite (GUM G.4.1, Eq. G.2b), not rounded. ``coverage_factor`` k is Student's t for them cut to an integer
+    (GUM G.4.1, note 1), ``expanded_uncertainty`` k u_c. ``correction`` is the sum of the sources' corrections, each
+    times its sensitivity, ``largest_error`` that of a result that is left uncorrected: its size and U together (thesis
+    section 4.8.5; the GUM would correct).
     """
 
     sources: tuple[Source, ...]

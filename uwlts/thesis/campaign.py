@@ -62,17 +62,13 @@ class CampaignFolder:
 
 def campaign_folders(folder: Path) -> list[CampaignFolder]:
     """The folders campaign-0, campaign-1, ... of a reproduction; CaptureError where there is none."""
-    found = sorted(
-        (path for path in folder.glob("campaign-*") if path.is_dir()), key=lambda path: (len(path.name), path.name)
-    )
+    found = [path for path in folder.glob("campaign-*") if path.is_dir()]
     if not found:
         raise CaptureError(f"{folder} holds no campaign: a folder called campaign-0, campaign-1, ... is expected")
-    return [CampaignFolder(path) for path in found]
+    return [CampaignFolder(path) for path in sorted(found, key=lambda path: (len(path.name), path.name))]
 
 
 def up_to_date(path: Path) -> bool:
     """Whether there are results and no recording of the campaign is newer."""
-    if not path.is_file():
-        return False
-    finished = path.stat().st_mtime_ns
-    return all(recording.stat().st_mtime_ns <= finished for recording in path.parent.glob("*.h5"))
+    recordings = path.parent.glob("*.h5")
+    return path.is_file() and all(each.stat().st_mtime_ns <= path.stat().st_mtime_ns for each in recordings)

@@ -1,29 +1,48 @@
-"""Report of a reproduction: summary.json, tables.csv, summary.md and report.html."""
+"""Report of a reproduction: summary.json, tables.csv, summary.md and report.html with the thesis's figures redrawn."""
 
 import csv
 import io
 import json
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
 import uwlts
 from uwlts.model.errors import DescriptionError
 from uwlts.report import plot
-from uwlts.report.page_toolkit import png_data_uri, render_page, svg_of
+from uwlts.report.page_toolkit import (
+    BLUE,
+    COLOURS,
+    INK,
+    RED,
+    legend_below,
+    new_figure,
+    plain_text,
+    png_data_uri,
+    render_page,
+    svg_of,
+)
 from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import read_cloud
 from uwlts.storage.files import refuse_unsuitable, written_aside
 from uwlts.thesis.campaign import campaign_folders
 from uwlts.thesis.evaluation import TRIALS, evaluate_campaign
-from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
 from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_comparison
-from uwlts.thesis.measurements import FORGOTTEN
+from uwlts.thesis.measurements import FORGOTTEN, POLYNOMIALS, PROPOSED
 from uwlts.thesis.monte_carlo import LEAST_TRIALS
-from uwlts.thesis.results import CampaignResults
+from uwlts.thesis.results import CampaignResults, Points
 from uwlts.thesis.tables import LARGEST_RATIO, MEAN, Published, TableRow, all_rows, headline_rows, load_published
+
+_TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text(encoding="utf-8"))
+# A table with more quantities has one value to a line.
+_MOST_COLUMNS = 3
 
 
 @dataclass(frozen=True)
@@ -106,74 +125,9 @@ def evaluate_thesis(
 
 def differences(rows: Sequence[TableRow]) -> list[str]:
     """Sentences with the measured numbers; those whose rows were not measured are left out."""
-    found = {(row.table, row.row, row.quantity): row for row in rows}
-
-    def value(table: str, row: str, quantity: str) -> float | None:
-        known = found.get((table, row, quantity))
-        return None if known is None else known.mean
-
-    def mean(table: str, medium: str, quantity: str, thing: str = "spheres") -> float | None:
-        return value(table, f"{thing}, {MEAN}, {medium}", quantity)
-
-    sentences = [
-        _said(
-            "Standard deviation and range come from speckle and from how the peak is found. With LabVIEW's low-pass "
-            "filter, which leaves pixels within 40 % of their neighbours as they are, and a quadratic over 5 pixels, "
-            "the spheres in water spread by {} mm (published 0.115); with a plain 5x5 mean it would be {} mm, with a "
-            "quadratic over three pixels {} mm, over seven {} mm. Our own profile fit leaves {} mm.",
-            mean("Table 6", "water", "STD"),
-            mean("Experiment: thesis, mean of 5x5", "water", "STD"),
-            mean("Experiment: thesis, fit over 3 px", "water", "STD"),
-            mean("Experiment: thesis, fit over 7 px", "water", "STD"),
-            mean("Our stripe centre, proposed", "water", "STD"),
-        ),
-        _said(
-            "The published ranges are 4 to 6 standard deviations, which thousands of points with nearly normal errors "
-            "cannot have; PE and RE here leave out the 0.3 % that VDI/VDE 2634 allows. Over all points PE in water is "
-            "{} mm instead of {} mm, RE {} mm instead of {} mm.",
-            mean("Experiment: no point left out", "water", "PE of all points"),
-            mean("Table 6", "water", "PE"),
-            mean("Experiment: no point left out", "water", "RE of all points", "plane"),
-            mean("Table 7", "water", "RE", "plane"),
-        ),
-        _said(
-            "In air the thesis's spheres stand 0.28 and 0.37 mm too far apart or too close, by either method, and ours "
-            "{} and {} mm. No imperfection of the list does that. A window that one of the two, calibration or scan, "
-            "did not look through does: scans through the window by a calibration made without it err by {} mm. The "
-            "thesis suspects its step calibration, which its results in air do not use.",
-            mean("Table 2", "air", "SSE"),
-            mean("Table 6", "air", "SSE"),
-            mean("Experiment: window forgotten in air", "air", "SSE"),
-        ),
-        _said(
-            "In water the sphere spacing of the proposed method errs by {} mm with one refraction and {} mm with two "
-            "(published 0.09 and 0.14). It follows the step standard's height, at 48 mm of window distance per mm, and "
-            "differs from campaign to campaign more than from position to position: the published standard deviation "
-            "over six positions of one campaign does not show it.",
-            value("Table 5", f"one refraction, {MEAN}", "SSE"),
-            value("Table 5", f"two refractions, {MEAN}", "SSE"),
-        ),
-        _said(
-            "The polynomials in water err by {} mm (published 0.115). All profile lines are fitted together here: each "
-            "has its own polynomials, but their coefficients change smoothly from line to line, which takes out the "
-            "noise of single lines.",
-            mean("Table 2", "water", "SSE"),
-        ),
-        _said(
-            "A single viewpoint in water, refraction taken for distortion, errs by {} mm in the sphere spacing with "
-            "our stripe centre; two refractions err by {} mm.",
-            mean("Our stripe centre, single viewpoint", "water", "SSE"),
-            mean("Our stripe centre, two refractions", "water", "SSE"),
-        ),
-        _said(
-            "The stripe on the pipe is {} mm long along the image's longer side and {} mm along the shorter one; the "
-            "thesis says 185.27 mm. A 12.5 mm lens on 1280 pixels of 5.3 um sees that much in water only farther away "
-            "than the described stand-off, or 204 mm in air.",
-            value("Figure 67", "300 mm pipe at the stand-off, stripe along the width", "line length"),
-            value("Figure 67", "300 mm pipe at the stand-off, stripe along the height", "line length"),
-        ),
-    ]
-    return [sentence for sentence in sentences if sentence]
+    means = {(row.table, row.row, row.quantity): row.mean for row in rows}
+    found = [(each["text"], [means.get(tuple(key)) for key in each["values"]]) for each in _TEXTS["differences"]]
+    return [text.format(*(f"{mean:.3f}" for mean in values)) for text, values in found if None not in values]
 
 
 def far_off(rows: Sequence[TableRow]) -> list[TableRow]:
@@ -181,28 +135,21 @@ def far_off(rows: Sequence[TableRow]) -> list[TableRow]:
     return [row for row in rows if row.ratio is not None and not 1 / LARGEST_RATIO <= row.ratio <= LARGEST_RATIO]
 
 
-def _said(text: str, *values: float | None) -> str:
-    """The text with its numbers, nothing if one is missing."""
-    return "" if None in values else text.format(*(f"{value:.3f}" for value in values))
-
-
-_COLUMNS = ("table", "row", "quantity", "published", "ours_mean", "ours_min", "ours_max")
-
-
 def write_comparison(
     folder: Path, results: Sequence[CampaignResults], published: Published, *, overwrite: bool = False
 ) -> list[TableRow]:
     """Write all four files into a folder, each whole or not at all; returns the rows of the tables.
 
-    Raises
-    ------
-    OutputError
-        A file exists and ``overwrite`` is not given, or cannot be written.
+    OutputError where a file exists and ``overwrite`` is not given, or cannot be written.
     """
     rows = all_rows(results, published)
+    plain, lines = [row.as_dict() for row in rows], io.StringIO()
+    table = csv.DictWriter(lines, plain[0], lineterminator="\n")
+    table.writeheader()
+    table.writerows(plain)
     found = {
-        "summary.json": json.dumps([row.as_dict() for row in rows], indent=1, allow_nan=False) + "\n",
-        "tables.csv": _csv(rows),
+        "summary.json": json.dumps(plain, indent=1, allow_nan=False) + "\n",
+        "tables.csv": lines.getvalue(),
         "summary.md": markdown(rows, results),
         "report.html": report_page(folder, results, rows, published),
     }
@@ -214,65 +161,41 @@ def write_comparison(
 
 def markdown(rows: Sequence[TableRow], results: Sequence[CampaignResults]) -> str:
     """The headline as a Markdown table."""
-    campaigns = len(results)
+    campaigns = f"{len(results)} campaign{'s' if len(results) != 1 else ''}"
     lines = [
-        "| mean over the positions | | published, mm | ours, mm | range of "
-        f"{campaigns} campaign{'s' if campaigns != 1 else ''} | ours / published |",
+        f"| mean over the positions | | published, mm | ours, mm | range of {campaigns} | ours / published |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for row in headline_rows(rows):
-        if row.ours:
-            lines.append(
-                f"| {row.table}: {row.row.replace(f', {MEAN},', ',')} | {row.quantity} | {row.published:.2f} | "
-                f"{row.mean:.3f} | {min(row.ours):.3f} to {max(row.ours):.3f} | {row.ratio:.2f} |"
-            )
+    lines += [
+        f"| {row.table}: {row.row.replace(f', {MEAN},', ',')} | {row.quantity} | {row.published:.2f} | "
+        f"{row.mean:.3f} | {min(row.ours):.3f} to {max(row.ours):.3f} | {row.ratio:.2f} |"
+        for row in headline_rows(rows)
+        if row.ours
+    ]
     return "\n".join(lines) + "\n"
-
-
-def _csv(rows: Sequence[TableRow]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    writer.writerows(row.as_dict().values() for row in rows)
-    return text.getvalue()
-
-
-_MOST_COLUMNS = 3
-_TITLES = {
-    "Table 2": "spheres by the polynomials",
-    "Table 3": "planes by the polynomials",
-    "Table 4": "window distance by the step images used",
-    "Table 5": "one and two refractions",
-    "Table 6": "spheres by the proposed method",
-    "Table 7": "planes by the proposed method",
-    "Table 8": "largest sphere spacing error as a share of the volume's depth",
-    "Table 9": "uncertainty budget of the sphere spacing in water",
-    "Figure 58": "residual of the polynomials Z(v)",
-    "Figure 66": "objects without calibrated values: spread about the true surface after a best fit",
-    "Figure 67": "line length on the pipe",
-    "Experiment: window forgotten in air": "scans through the window by a calibration made without it",
-    "Experiment: thesis, mean of 5x5": "a plain mean for LabVIEW's low-pass filter",
-    "Experiment: thesis, fit over 3 px": "a narrower quadratic",
-    "Experiment: thesis, fit over 7 px": "a wider quadratic",
-    "Experiment: no point left out": "ranges over all points",
-}
 
 
 def report_page(
     folder: Path, results: Sequence[CampaignResults], rows: Sequence[TableRow], published: Published
 ) -> str:
     """The page as text, with pictures from the first campaign in the folder."""
-    first = results[0]
+    first, headline = results[0], headline_rows(rows)
     z_of_v, y_of_z = polynomials_figures(first)
-    headline = headline_rows(rows)
-    shown = [
-        row
-        for row in rows
-        if row.table == "Figure 66"
-        and row.quantity == "STD"
-        and row.row.endswith("thesis image processing")
-        and FORGOTTEN not in row.row
+    free = [row for row in rows if (row.table, row.quantity) == ("Figure 66", "STD") and FORGOTTEN not in row.row]
+    shown = [*headline, *(row for row in free if row.row.endswith("thesis image processing"))]
+    means = (
+        "Means over the positions: bars are ours (blue in water, red in air), the line spans the campaigns, "
+        "diamonds are the thesis's."
+    )
+    figures = [
+        ("Figure 66", means, comparison_figure(shown)),
+        ("Figure 45", "Points on a step for several window distances.", window_distance_figure(first)),
+        ("Figure 58", "Polynomials Z(v).", z_of_v),
+        ("Figure 59", "Polynomials Y(Z).", y_of_z),
     ]
+    if first.line_profiles:
+        figures.append(("Figure 67", "Stripe on a 300 mm pipe.", line_figure(first)))
+    intervals = [(number, each) for number, result in enumerate(results) for each in result.monte_carlo]
     return render_page(
         "uwlts.thesis",
         "template.html.j2",
@@ -282,27 +205,13 @@ def report_page(
         far_off=far_off(headline),
         far=LARGEST_RATIO,
         tables=[
-            (name, _TITLES.get(name, ""), *_folded(list(group))) for name, group in groupby(rows, lambda row: row.table)
+            (name, _TEXTS["titles"].get(name, ""), *_folded(list(group)))
+            for name, group in groupby(rows, lambda row: row.table)
         ],
         differences=differences(rows),
-        figures=[
-            (
-                "Figure 66",
-                "Means over the positions: bars are ours (blue in water, red in air), the line spans the "
-                "campaigns, diamonds are the thesis's.",
-                svg_of(comparison_figure([*headline, *shown])),
-            ),
-            ("Figure 45", "Points on a step for several window distances.", svg_of(window_distance_figure(first))),
-            ("Figure 58", "Polynomials Z(v).", svg_of(z_of_v)),
-            ("Figure 59", "Polynomials Y(Z).", svg_of(y_of_z)),
-        ]
-        + ([("Figure 67", "Stripe on a 300 mm pipe.", svg_of(line_figure(first)))] if first.line_profiles else []),
-        intervals=[(number, each) for number, result in enumerate(results) for each in result.monte_carlo],
-        held_by_budget=sum(
-            abs(each.observed_mm) <= result.budget.get("expanded", -1.0)
-            for result in results
-            for each in result.monte_carlo
-        ),
+        figures=[(name, caption, svg_of(figure)) for name, caption, figure in figures],
+        intervals=intervals,
+        held_by_budget=sum(abs(each.observed_mm) <= results[n].budget.get("expanded", -1.0) for n, each in intervals),
         failures=[(number, m) for number, result in enumerate(results) for m in result.measurements if m.failure],
         pictures=_pictures(folder),
         version=uwlts.__version__,
@@ -330,3 +239,73 @@ def _pictures(folder: Path) -> list[tuple[str, str, str]]:
         stripe = "" if view is None else png_data_uri(stripe_picture(view))
         found.append((name, stripe, png_data_uri(plot.cloud(read_cloud(cloud)).figure)))
     return found
+
+
+def window_distance_figure(results: CampaignResults) -> Figure:
+    """Figure 45: a step's profile for several window distances."""
+    profiles = {f"d = {each.distance_mm:.1f} mm": each.points_mm for each in results.window_profiles}
+    figure, (whole, upper) = new_figure(9.0, 3.2, columns=2)
+    _draw_profiles(whole, "One step image for different window distances", profiles)
+    _draw_profiles(upper, "Its upper face", profiles)
+    depths = [z for points in profiles.values() for _, z in points if np.isfinite(z)]
+    if depths:
+        # The face is flat within a few tenths of a millimetre for every window distance that is drawn.
+        upper.set_ylim(min(depths) - 0.2, min(depths) + 1.2)
+    legend_below(figure)
+    return figure
+
+
+def polynomials_figures(results: CampaignResults) -> tuple[Figure, Figure]:
+    """Figures 58 and 59: Z(v) and Y(Z) of three profile lines in air and in water."""
+    (by_row, rows), (by_depth, depths) = (new_figure(9.0, 3.2, columns=2) for _ in range(2))
+    for z_axes, y_axes, (medium, found) in zip(rows, depths, results.polynomials.items(), strict=True):
+        for name, line in found.lines.items():
+            z_axes.plot(line.centre_px, line.z_mm, label=f"profile line, {name}")
+            y_axes.plot(line.z_mm, line.y_mm, label=f"profile line, {name}")
+        z_axes.set(title=f"Z(v) in {medium}", xlabel="stripe position v / px", ylabel="Z / mm")
+        y_axes.set(title=f"Y(Z) in {medium}", xlabel="Z / mm", ylabel="Y / mm")
+    legend_below(by_row)
+    legend_below(by_depth)
+    return by_row, by_depth
+
+
+def line_figure(results: CampaignResults) -> Figure:
+    """Figure 67: the stripe on a 300 mm pipe at the stand-off, for either orientation of the camera."""
+    figure, (axes,) = new_figure(4.8, 3.2)
+    profiles = {
+        f"along the image's {side}: {profile.length_mm:.1f} mm": profile.points_mm
+        for side, profile in results.line_profiles.items()
+    }
+    _draw_profiles(axes, "Stripe on a 300 mm pipe in water", profiles)
+    legend_below(figure, columns=1)
+    return figure
+
+
+def comparison_figure(rows: Sequence[TableRow]) -> Figure:
+    """Figure 66: means over the positions, ours as bars with the campaigns' range, the published ones as diamonds."""
+    shown = [row for row in rows if row.ours]
+    figure, (axes,) = new_figure(9.0, 0.8 + 0.25 * len(shown))
+    places = np.arange(len(shown))
+    colours = [BLUE if "water" in row.row else RED for row in shown]
+    axes.barh(places, [np.mean(row.ours) for row in shown], height=0.55, color=colours, alpha=0.75)
+    axes.hlines(places, [min(row.ours) for row in shown], [max(row.ours) for row in shown], color=INK)
+    published = [(row.published, place) for place, row in enumerate(shown) if row.published is not None]
+    axes.plot(*np.array(published).reshape(-1, 2).T, "D", color=COLOURS[1], markeredgecolor=INK)
+    methods = {"Table 2": POLYNOMIALS, "Table 3": POLYNOMIALS, "Table 6": PROPOSED, "Table 7": PROPOSED}
+    names = [row.row.replace(f", {MEAN}", "").removesuffix(", thesis image processing") for row in shown]
+    labels = [
+        ", ".join(filter(None, (f"{row.quantity}: {name}", methods.get(row.table))))
+        for row, name in zip(shown, names, strict=True)
+    ]
+    axes.set_yticks(places, [plain_text(label) for label in labels])
+    axes.invert_yaxis()
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("mean of the campaigns / mm")
+    return figure
+
+
+def _draw_profiles(axes: Axes, title: str, profiles: Mapping[str, Points]) -> None:
+    """Draw points (Y, Z) in mm of profiles by name."""
+    for name, points in profiles.items():
+        axes.plot(*np.array(points, float).reshape(-1, 2).T, ".", markersize=3, label=name)
+    axes.set(title=title, xlabel="Y / mm", ylabel="Z / mm")

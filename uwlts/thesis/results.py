@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
-from uwlts.model.errors import CaptureError
+from uwlts.model.errors import CaptureError, problems_of
 from uwlts.storage.files import json_text, written_aside
 
 Points = list[tuple[float, float]]
@@ -29,11 +29,8 @@ class _Kept(BaseModel):
         except OSError as error:
             raise CaptureError(f"cannot read {path}: {error.strerror}") from error
         except ValidationError as error:
-            problem = error.errors()[0]
-            reason = f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}".removeprefix(": ")
-            raise CaptureError(
-                f"{path} holds no results that this program reads ({reason}); remove it to evaluate the campaign again"
-            ) from error
+            reason = f"holds no results that this program reads ({problems_of(error).removeprefix(': ')})"
+            raise CaptureError(f"{path} {reason}; remove it to evaluate the campaign again") from error
 
     def keep(self, path: Path) -> Self:
         """Write the file, whole or not at all; ValueError where a number is not finite."""
@@ -144,12 +141,7 @@ class SphereErrors(BaseModel):
 
     def by_method(self) -> dict[Method, dict[str, float]]:
         """Errors by the calibrations that there are of the scan's medium."""
-        found: dict[Method, dict[str, float] | None] = {
-            "one_refraction": self.one_refraction,
-            "two_refractions": self.two_refractions,
-            "joint": self.joint,
-        }
-        return {method: errors for method, errors in found.items() if errors is not None}
+        return {method: errors for method in get_args(Method) if (errors := getattr(self, method)) is not None}
 
     @model_serializer(mode="wrap")
     def _without_none(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from uwlts.calibration.evidence import step_evidence
 from uwlts.calibration.sequential import step_image
 from uwlts.calibration.window import StepImage, solve_window, step_profile
 from uwlts.measurement.reconstruction import reconstruct_stripes
-from uwlts.metrology.round_fits import fit_sphere
+from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
 from uwlts.model.any_calibration import AnyCalibration

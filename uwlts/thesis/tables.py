@@ -1,6 +1,6 @@
 """The thesis's published tables, and ours beside them: one row for every value, over all campaigns."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from operator import attrgetter
@@ -13,7 +13,7 @@ from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, read_table
 from uwlts.thesis.campaign import MEDIA, STEP_PLACES
 from uwlts.thesis.measurements import FORGOTTEN, OURS, POLYNOMIALS, PROPOSED, SINGLE, THESIS, TWO, VARIANTS
-from uwlts.thesis.results import CampaignResults, Measurement
+from uwlts.thesis.results import CampaignResults
 
 
 @dataclass(frozen=True)
@@ -88,27 +88,27 @@ class TableRow:
 def all_rows(results: Sequence[CampaignResults], published: Published) -> list[TableRow]:
     """Rows of all tables from the results of campaigns."""
     spheres, planes = ("spheres", ("PE", "STD", "SSE")), ("plane", ("RE", "STD"))
-    seen = _Seen(results, published)
+    tables = _Tables(results, published)
     rows = [
-        *seen.objects("Table 2", *spheres, POLYNOMIALS, THESIS),
-        *seen.objects("Table 3", *planes, POLYNOMIALS, THESIS),
-        *_window(results, published),
-        *_refractions(seen),
-        *seen.objects("Table 6", *spheres, PROPOSED, THESIS),
-        *seen.objects("Table 7", *planes, PROPOSED, THESIS),
-        *_shares(seen),
-        *_budget(results, published),
-        *_line(results, published),
+        *tables.objects("Table 2", *spheres, POLYNOMIALS, THESIS),
+        *tables.objects("Table 3", *planes, POLYNOMIALS, THESIS),
+        *tables.window(),
+        *tables.refractions(),
+        *tables.objects("Table 6", *spheres, PROPOSED, THESIS),
+        *tables.objects("Table 7", *planes, PROPOSED, THESIS),
+        *tables.shares(),
+        *tables.budget(),
+        *tables.lines(),
     ]
     for method in (PROPOSED, POLYNOMIALS, TWO, SINGLE):
         table = f"Our stripe centre, {method}"
-        rows += [*seen.objects(table, *spheres, method, OURS), *seen.objects(table, *planes, method, OURS)]
-    rows += seen.objects("Experiment: window forgotten in air", "spheres", ("SSE",), FORGOTTEN, THESIS)
+        rows += [*tables.objects(table, *spheres, method, OURS), *tables.objects(table, *planes, method, OURS)]
+    rows += tables.objects("Experiment: window forgotten in air", "spheres", ("SSE",), FORGOTTEN, THESIS)
     for processing in VARIANTS:
-        rows += seen.objects(f"Experiment: {processing}", "spheres", ("PE", "STD"), PROPOSED, processing)
+        rows += tables.objects(f"Experiment: {processing}", "spheres", ("PE", "STD"), PROPOSED, processing)
     for thing, name in (("spheres", "PE of all points"), ("plane", "RE of all points")):
-        rows += seen.objects("Experiment: no point left out", thing, (name,), PROPOSED, THESIS)
-    return [*rows, *_free_forms(seen)]
+        rows += tables.objects("Experiment: no point left out", thing, (name,), PROPOSED, THESIS)
+    return [*rows, *tables.free_forms()]
 
 
 def headline_rows(rows: Sequence[TableRow]) -> list[TableRow]:
@@ -118,53 +118,37 @@ def headline_rows(rows: Sequence[TableRow]) -> list[TableRow]:
     ]
 
 
-def _collected(
-    results: Sequence[CampaignResults], value: Callable[[CampaignResults], float | None]
-) -> tuple[float, ...]:
-    """A value of every campaign that has it, without its sign."""
-    found = (value(result) for result in results)
-    return tuple(abs(number) for number in found if number is not None)
+_KEY = attrgetter("thing", "placement", "medium", "method", "processing")
+
+
+def _sizes(values: Iterable[float | None]) -> tuple[float, ...]:
+    """The values that there are, without their sign."""
+    return tuple(abs(value) for value in values if value is not None)
 
 
 def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
     """Rows of one quantity and their mean over the positions that were measured, campaign by campaign."""
     yield from rows
-    theirs = [row.published for row in rows if row.ours]
-    published = [value for value in theirs if value is not None]
-    complete = [row.ours for row in rows if row.ours]
-    counts = {len(values) for values in complete}
-    if complete and len(counts) == 1:
-        yield TableRow(
-            rows[0].table,
-            name,
-            rows[0].quantity,
-            float(np.mean(published)) if len(published) == len(theirs) else None,
-            tuple(np.mean(complete, axis=0).tolist()),
-        )
-
-
-def _key(found: Measurement) -> tuple[str, str, str, str, str]:
-    return found.thing, found.placement, found.medium, found.method, found.processing
+    measured = [row for row in rows if row.ours]
+    if len({len(row.ours) for row in measured}) != 1:
+        return
+    published = [row.published for row in measured if row.published is not None]
+    mean = float(np.mean(published)) if len(published) == len(measured) else None
+    ours = np.mean([row.ours for row in measured], axis=0)
+    yield TableRow(rows[0].table, name, rows[0].quantity, mean, tuple(ours.tolist()))
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """All campaigns' measurements, looked up by what was measured and how."""
+class _Tables:
+    """Rows of the tables from all campaigns' results."""
 
     results: Sequence[CampaignResults]
     published: Published
 
-    def figures(
-        self, thing: str, place: str, medium: str, method: str, processing: str, name: str
-    ) -> tuple[float, ...]:
-        """A figure of every campaign that has it, without its sign."""
-        wanted = thing, place, medium, method, processing
-        return tuple(
-            abs(found.figures_mm[name])
-            for result in self.results
-            for found in result.measurements
-            if _key(found) == wanted and name in found.figures_mm
-        )
+    def figures(self, *key: str, name: str) -> tuple[float, ...]:
+        """A figure of every campaign that has it: by thing, place, medium, method and image processing."""
+        found = (measured for result in self.results for measured in result.measurements if _KEY(measured) == key)
+        return _sizes(measured.figures_mm.get(name) for measured in found)
 
     def objects(self, table: str, thing: str, names: Sequence[str], method: str, processing: str) -> Iterator[TableRow]:
         """Rows of a thing's positions in both media and their means; published values are those of the same method."""
@@ -173,89 +157,66 @@ class _Seen:
             rows = []
             for number, place in enumerate(self.published.positions(thing)):
                 theirs = self.published.value(thing, source, medium, name.removesuffix(" of all points"), number)
-                ours = self.figures(thing, place, medium, method, processing, name)
+                ours = self.figures(thing, place, medium, method, processing, name=name)
                 rows.append(TableRow(table, f"{thing}, {place}, {medium}", name, theirs, ours))
             if any(row.ours for row in rows):
                 yield from _with_mean(rows, f"{thing}, {MEAN}, {medium}")
 
+    def window(self) -> Iterator[TableRow]:
+        sets = {f"{place} {n}": (place, n - 1) for place in STEP_PLACES for n in (1, 2, 3)}
+        sets |= {place: (place, 3) for place in STEP_PLACES} | {"all": ("all",)}
+        columns = ("window distance", "distance_mm", "window"), ("mean SSE", "mean_sse_mm", "window_sse")
+        for (quantity, attribute, source), (name, path) in product(columns, sets.items()):
+            ours = _sizes(getattr(result.window.get(name), attribute, None) for result in self.results)
+            yield TableRow("Table 4", f"step images: {name}", quantity, self.published.value(source, *path), ours)
+        ours = _sizes(result.two_refractions_distance_mm for result in self.results)
+        theirs = self.published.value("window", "two_refractions")
+        yield TableRow("Table 4", "two refractions, all", "window distance", theirs, ours)
 
-def _window(results: Sequence[CampaignResults], published: Published) -> Iterator[TableRow]:
-    sets = [(f"{place} {n}", (place, n - 1)) for place in STEP_PLACES for n in (1, 2, 3)]
-    sets += [(place, (place, 3)) for place in STEP_PLACES] + [("all", ("all",))]
-    for quantity, key, source in (
-        ("window distance", attrgetter("distance_mm"), "window"),
-        ("mean SSE", attrgetter("mean_sse_mm"), "window_sse"),
-    ):
-        for name, path in sets:
-            ours = _collected(results, lambda r, n=name, k=key: k(r.window[n]) if n in r.window else None)
-            yield TableRow("Table 4", f"step images: {name}", quantity, published.value(source, *path), ours)
-    ours = _collected(results, lambda r: r.two_refractions_distance_mm)
-    yield TableRow(
-        "Table 4", "two refractions, all", "window distance", published.value("window", "two_refractions"), ours
-    )
+    def refractions(self) -> Iterator[TableRow]:
+        cases = ("one", "one refraction", PROPOSED), ("two", "two refractions", TWO)
+        for (key, title, method), name in product(cases, ("STD", "SSE")):
+            rows = []
+            for number, place in enumerate(self.published.positions("spheres")):
+                theirs = self.published.value("refractions", key, name, number)
+                ours = self.figures("spheres", place, "water", method, THESIS, name=name)
+                rows.append(TableRow("Table 5", f"{title}, {place}", name, theirs, ours))
+            yield from _with_mean(rows, f"{title}, {MEAN}")
 
+    def shares(self) -> Iterator[TableRow]:
+        """The thesis's percentages are those of the largest error, though it calls them the division of the error."""
+        places = self.published.positions("spheres")
+        for medium, method in product(MEDIA, (POLYNOMIALS, PROPOSED)):
+            found = [self.figures("spheres", place, medium, method, THESIS, name="SSE") for place in places]
+            depth = self.published.value("depth_mm", medium)
+            complete = [errors for errors in found if len(errors) == len(self.results)]
+            shares = tuple((100 / depth * np.max(complete, axis=0)).tolist()) if depth and complete else ()
+            theirs = self.published.value("share_percent", medium, method)
+            yield TableRow("Table 8", f"{method}, {medium}", "largest SSE over depth, %", theirs, shares)
 
-def _refractions(seen: _Seen) -> Iterator[TableRow]:
-    for (key, method), name in product((("one", PROPOSED), ("two", TWO)), ("STD", "SSE")):
-        rows = [
-            TableRow(
-                "Table 5",
-                f"{key} refraction{'s' if key == 'two' else ''}, {place}",
-                name,
-                seen.published.value("refractions", key, name, number),
-                seen.figures("spheres", place, "water", method, THESIS, name),
-            )
-            for number, place in enumerate(seen.published.positions("spheres"))
-        ]
-        yield from _with_mean(rows, f"{key} refraction{'s' if key == 'two' else ''}, {MEAN}")
+    def budget(self) -> Iterator[TableRow]:
+        known = {"degrees_of_freedom": "effective", "expanded": "U, 95 %", "correction": "C", "largest_error": "C + U"}
+        for name in self.published.content.get("budget", {}):
+            ours = _sizes(result.budget.get(name) for result in self.results)
+            theirs = self.published.value("budget", name)
+            yield TableRow("Table 9", name.replace("_", " "), known.get(name, "u"), theirs, ours)
 
+    def lines(self) -> Iterator[TableRow]:
+        for side, theirs in (("width", self.published.value("line", "length_mm")), ("height", None)):
+            ours = _sizes(getattr(result.line_profiles.get(side), "length_mm", None) for result in self.results)
+            row = f"300 mm pipe at the stand-off, stripe along the {side}"
+            yield TableRow("Figure 67", row, "line length", theirs, ours)
+        theirs = self.published.value("line", "polynomial_residual_mm")
+        for medium in MEDIA:
+            ours = _sizes(result.polynomials[medium].residual_mm for result in self.results)
+            yield TableRow("Figure 58", f"Z(v) in {medium}", "residual", theirs, ours)
 
-def _shares(seen: _Seen) -> Iterator[TableRow]:
-    """The thesis's percentages are those of the largest error, though it calls them the division of the error."""
-    for medium, method in product(MEDIA, (POLYNOMIALS, PROPOSED)):
-        places = seen.published.positions("spheres")
-        found = [seen.figures("spheres", place, medium, method, THESIS, "SSE") for place in places]
-        depth = seen.published.value("depth_mm", medium)
-        complete = [errors for errors in found if len(errors) == len(seen.results)]
-        shares = tuple((100 / depth * np.max(complete, axis=0)).tolist()) if depth and complete else ()
-        theirs = seen.published.value("share_percent", medium, method)
-        yield TableRow("Table 8", f"{method}, {medium}", "largest SSE over depth, %", theirs, shares)
-
-
-def _budget(results: Sequence[CampaignResults], published: Published) -> Iterator[TableRow]:
-    names = list(published.content.get("budget", {}))
-    for name in names:
-        ours = _collected(results, lambda r, n=name: r.budget.get(n))
-        yield TableRow("Table 9", name.replace("_", " "), _unit_of(name), published.value("budget", name), ours)
-
-
-def _unit_of(name: str) -> str:
-    known = {"degrees_of_freedom": "effective", "expanded": "U, 95 %", "correction": "C", "largest_error": "C + U"}
-    return known.get(name, "u")
-
-
-def _line(results: Sequence[CampaignResults], published: Published) -> Iterator[TableRow]:
-    theirs = {"width": published.value("line", "length_mm"), "height": None}
-    for side, length in theirs.items():
-        ours = _collected(results, lambda r, s=side: r.line_profiles[s].length_mm if s in r.line_profiles else None)
-        yield TableRow(
-            "Figure 67", f"300 mm pipe at the stand-off, stripe along the {side}", "line length", length, ours
-        )
-    for medium in MEDIA:
-        ours = _collected(results, lambda r, m=medium: r.polynomials[m].residual_mm)
-        theirs_mm = published.value("line", "polynomial_residual_mm")
-        yield TableRow("Figure 58", f"Z(v) in {medium}", "residual", theirs_mm, ours)
-
-
-def _free_forms(seen: _Seen) -> Iterator[TableRow]:
-    """STD of the objects of Figure 66 whose values the thesis draws and does not print."""
-    keys = {
-        _key(found)
-        for result in seen.results
-        for found in result.measurements
-        if found.thing in ("pipe", "head", "weld")
-    }
-    for thing, place, medium, method, processing in sorted(keys):
-        for name in ("STD", "diameter error") if thing == "pipe" else ("STD",):
-            row = f"{thing}, {medium}, {method}, {processing} image processing"
-            yield TableRow("Figure 66", row, name, None, seen.figures(thing, place, medium, method, processing, name))
+    def free_forms(self) -> Iterator[TableRow]:
+        """STD of the objects of Figure 66 whose values the thesis draws and does not print."""
+        keys = {_KEY(measured) for result in self.results for measured in result.measurements}
+        for key in sorted(keys):
+            thing, _, medium, method, processing = key
+            names = {"pipe": ("STD", "diameter error"), "head": ("STD",), "weld": ("STD",)}.get(thing, ())
+            for name in names:
+                row = f"{thing}, {medium}, {method}, {processing} image processing"
+                yield TableRow("Figure 66", row, name, None, self.figures(*key, name=name))

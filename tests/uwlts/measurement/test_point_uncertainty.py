@@ -15,7 +15,7 @@ from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.measurement.figure_uncertainty import MovedSpheres, figure_uncertainties, noise_mm
 from uwlts.measurement.point_uncertainty import point_uncertainty, stage_root, stripe_noise_px
 from uwlts.metrology.artefacts import evaluate_cloud
-from uwlts.metrology.round_fits import fit_sphere
+from uwlts.metrology.fits import fit_sphere
 from uwlts.model.artefacts import PlaneStandard, SphereStandard
 from uwlts.model.calibration import KnownMedium, KnownStage
 from uwlts.model.errors import CalibrationError

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from uwlts.metrology.flat_fits import fit_line, fit_plane
+from uwlts.metrology.fits import fit_cylinder, fit_line, fit_plane, fit_sphere
 from uwlts.metrology.least_squares import fit_robustly
-from uwlts.metrology.round_fits import fit_cylinder, fit_sphere
 from uwlts.model.errors import EvaluationError
 
 poses = st.tuples(

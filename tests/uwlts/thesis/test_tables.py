@@ -18,8 +18,16 @@ from uwlts.report.page_toolkit import svg_of
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.storage.cloud import PointCloud, write_cloud
 from uwlts.thesis.campaign import CampaignFolder, campaign_folders
-from uwlts.thesis.figures import comparison_figure, line_figure, polynomials_figures, window_distance_figure
-from uwlts.thesis.report import differences, far_off, markdown, write_comparison
+from uwlts.thesis.report import (
+    comparison_figure,
+    differences,
+    far_off,
+    line_figure,
+    markdown,
+    polynomials_figures,
+    window_distance_figure,
+    write_comparison,
+)
 from uwlts.thesis.results import CampaignResults, Measurement, WindowProfile
 from uwlts.thesis.tables import TableRow, all_rows, headline_rows, load_published
 
