@@ -1,7 +1,8 @@
 """Camera parameters and target poses from images of a flat target, by the stage's displacements or by free poses."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -9,9 +10,11 @@ import numpy as np
 
 from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
 from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
-from uwlts.calibration.target_images import Placement, TargetImage, observe, placements, single_images
+from uwlts.calibration.target_images import Placement, TargetImage, observe, placements, pose_values
 from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
+from uwlts.optics.camera import project
+from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 # Coordinates of size one: a direction in which points extend less than this share of the widest one, or a null vector
 # of the equations that is not alone by this share, cannot be separated from rounding and lens distortion.
@@ -19,24 +22,12 @@ _FLAT = 1e-4
 _AMBIGUOUS = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class LinearCamera:
-    """Camera matrix K (3, 3), rotation (3, 3) and translation (3,) in mm from the points' frame to the camera's."""
-
-    matrix: np.ndarray
-    rotation: np.ndarray
-    translation_mm: np.ndarray
-
-
-def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> LinearCamera:
+def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pinhole camera from at least six points in space, by the normalised linear method without lens distortion.
 
-    Hartley and Zisserman, Multiple View Geometry, 2nd ed., algorithm 7.1 (linear part) and section 6.2.4 (RQ).
-
-    Parameters
-    ----------
-    points_mm : (N, 3), mm, any frame
-    pixels : (N, 2), px
+    Hartley and Zisserman, Multiple View Geometry, 2nd ed., algorithm 7.1 (linear part) and section 6.2.4 (RQ). From
+    points (N, 3) in mm, in any frame, and pixels (N, 2): camera matrix K (3, 3), rotation (3, 3) and translation (3,)
+    in mm from the points' frame to the camera's.
 
     Raises CalibrationError: the points lie in one plane or are too few, or the image is mirrored against them.
     """
@@ -58,7 +49,19 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> LinearCamera:
     if singular[10] < _AMBIGUOUS * singular[0]:
         raise CalibrationError("the target points do not determine the camera: use more points, spread over the image")
     projection = np.linalg.solve(pixel_to_unit, rows[11].reshape(3, 4)) @ to_unit
-    return _taken_apart(projection, points_mm)
+    if np.median(points_mm @ projection[2, :3] + projection[2, 3]) < 0:
+        projection = -projection
+    if np.linalg.det(projection[:, :3]) < 0:
+        raise CalibrationError(
+            "the target images are mirrored against the stage positions: the stage moved the other way than "
+            "stage_direction says, or the target's columns or rows are numbered the wrong way round"
+        )
+    # RQ from QR of the rows in reverse order; the signs make the camera matrix's diagonal positive.
+    orthogonal, triangular = np.linalg.qr(projection[::-1, :3].T)
+    matrix, rotation = triangular.T[::-1, ::-1], orthogonal.T[::-1]
+    signs = np.sign(np.diag(matrix))
+    matrix, rotation = matrix * signs, signs[:, None] * rotation
+    return matrix / matrix[2, 2], rotation, np.linalg.solve(matrix, projection[:, 3])
 
 
 def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,46 +77,26 @@ def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return similarity, np.column_stack([coordinates, np.ones(len(coordinates))]) @ similarity.T
 
 
-def _taken_apart(projection: np.ndarray, points_mm: np.ndarray) -> LinearCamera:
-    depths = points_mm @ projection[2, :3] + projection[2, 3]
-    if np.median(depths) < 0:
-        projection = -projection
-    if np.linalg.det(projection[:, :3]) < 0:
-        raise CalibrationError(
-            "the target images are mirrored against the stage positions: the stage moved the other way than "
-            "stage_direction says, or the target's columns or rows are numbered the wrong way round"
-        )
-    # RQ from QR of the rows in reverse order; the signs make the camera matrix's diagonal positive.
-    orthogonal, triangular = np.linalg.qr(projection[::-1, :3].T)
-    matrix, rotation = triangular.T[::-1, ::-1], orthogonal.T[::-1]
-    signs = np.sign(np.diag(matrix))
-    matrix, rotation = matrix * signs, signs[:, None] * rotation
-    translation = np.linalg.solve(matrix, projection[:, 3])
-    return LinearCamera(matrix / matrix[2, 2], rotation, translation)
-
-
-def linear_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
+def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
     """Camera parameters (P,) and poses (6,) of a target that the stage displaces along its normal.
 
     The placement that reaches farthest gives both by the linear method, the others then have their poses found.
     """
-    farthest = int(np.argmax([np.ptp(placement.shifts_mm) for placement in placements]))
-    points = placements[farthest].displaced(placements[farthest].direction(np.empty(0)))
-    start = direct_linear(points, placements[farthest].pixels)
-    global_values = intrinsics.from_matrix(start.matrix)
-    poses = [placement_pose(placement, intrinsics.matrix(global_values)) for placement in placements]
-    poses[farthest] = np.r_[cv2.Rodrigues(start.rotation)[0].ravel(), start.translation_mm]
+    farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
+    matrix, rotation, translation = direct_linear(views[farthest].displaced(), views[farthest].pixels)
+    global_values = intrinsics.from_matrix(matrix)
+    poses = [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
+    poses[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
     return global_values, poses
 
 
-def planar_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
+def _planar_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
     """Camera parameters (P,) and poses (6,) of single images: f from homographies, the principal point in the middle.
 
     `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera calibration, PAMI 2000.
     """
     size = (intrinsics.width_px, intrinsics.height_px)
-    points = [placement.points_mm.astype(np.float32) for placement in placements]
-    pixels = [placement.pixels.astype(np.float32) for placement in placements]
+    points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
     matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
     if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
         raise CalibrationError(
@@ -121,13 +104,12 @@ def planar_start(placements: list[Placement], intrinsics: Intrinsics) -> tuple[n
             "from image to image"
         )
     global_values = intrinsics.from_matrix(matrix)
-    return global_values, [placement_pose(placement, intrinsics.matrix(global_values)) for placement in placements]
+    return global_values, [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
 
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
     """Rotation vector and shift (6,) of a placement seen by a camera without distortion."""
-    points = placement.displaced(placement.direction(np.empty(0)))
-    found, rotation, translation = cv2.solvePnP(points, placement.pixels, matrix, None)
+    found, rotation, translation = cv2.solvePnP(placement.displaced(), placement.pixels, matrix, None)
     if not found:
         raise CalibrationError("no pose of the target explains one of its images: is it the right target?")
     return np.r_[rotation.ravel(), translation.ravel()]
@@ -135,10 +117,14 @@ def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
 
 Poses = Literal["stage-normal", "stage", "free"]
 
-
 # Beyond these shares of f and of the image's side a camera counts as not determined: lengths would be wrong as much.
 _LARGEST_FOCAL_STD = 0.02
 _LARGEST_CENTRE_STD = 0.05
+# Offsets of circles' images are calculated again until they change by less; a few rounds settle, unless the diameter
+# is wrong.
+_SETTLED_PX = 1e-4
+_BIAS_ROUNDS = 10
+_X, _Y = np.eye(3)[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +143,7 @@ class CameraSolution:
     stage_tilt_rad, stage_tilt_std_rad : angle between that direction and the target's normal and its standard
         deviation, for poses "stage"; the largest of all placements
     stopped : why the iteration ended
+    bias_px : list of (N, 2) or None; offsets taken out of the centres of the circles' images
     """
 
     model: CameraModel
@@ -170,6 +157,7 @@ class CameraSolution:
     stage_tilt_std_rad: float | None
     rounds: int
     stopped: str
+    bias_px: list[np.ndarray] | None = None
 
     def std(self) -> dict[str, float]:
         """Standard deviation of every estimated parameter."""
@@ -183,6 +171,10 @@ class CameraSolution:
         """Root mean square distance between found and calculated pixels over all images."""
         return float(np.sqrt(np.mean(np.sum(np.vstack(self.residuals_px) ** 2, axis=1))))
 
+    def largest_bias_px(self) -> float | None:
+        """Longest offset taken out, over all circles."""
+        return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
+
 
 def solve_camera(
     images: Sequence[TargetImage],
@@ -193,6 +185,7 @@ def solve_camera(
     approaching: bool = True,
     options: CameraOptions | None = None,
     start: CameraSolution | None = None,
+    circle_diameter_mm: float | None = None,
 ) -> CameraSolution:
     """Calibrate the camera by least squares of the pixel distances.
 
@@ -207,25 +200,70 @@ def solve_camera(
         image, stage positions unused
     approaching : whether growing stage positions bring the sensor nearer to the target; unused by "free"
     start : a solution for nearly the same pixels, with the same options and poses
+    circle_diameter_mm : the pixels are centres of the images of circles of this diameter; their offsets from the images
+        of the circles' centres are calculated, taken out, and calculated again until they stay
 
-    Raises CalibrationError: too few images, a stage that did not move, a target mirrored against the stage, parameters
-    not determined.
+    Raises
+    ------
+    CalibrationError
+        There are too few images, the stage did not move, the target is mirrored against the stage, the parameters are
+        not determined, or the offsets do not settle.
+    RangeError
+        A circle's image is no ellipse.
     """
     options = CameraOptions() if options is None else options
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
-    views = _accepted(images, poses, approaching, options)
-    if start is None:
-        global_values, local = planar_start(views, intrinsics) if poses == "free" else linear_start(views, intrinsics)
-        local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
-    else:
-        global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
 
-    def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
-        return observe(views[group], intrinsics, global_values, local)
+    def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
+        views = _accepted(images, poses, approaching, options)
+        if start is not None:
+            global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
+        else:
+            found = _planar_start if poses == "free" else _linear_start
+            global_values, local = found(views, intrinsics)
+            local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
 
-    fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
-    _refuse_undetermined(fit, intrinsics)
-    return _solution(images, views, fit, intrinsics, poses)
+        def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
+            return observe(views[group], intrinsics, global_values, local)
+
+        fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
+        _refuse_undetermined(fit, intrinsics)
+        return _solution(images, views, fit, intrinsics, poses)
+
+    if circle_diameter_mm is None:
+        return solved(images, start)
+    bias = [np.zeros_like(image.pixels) for image in images]
+    for _ in range(_BIAS_ROUNDS):
+        centred = [replace(i, pixels=i.pixels - offset) for i, offset in zip(images, bias, strict=True)]
+        start, before = solved(centred, start), bias
+        seen_by = partial(project, start.model)
+        bias = [
+            centre_offsets(seen_by, pose, image.points_mm, diameter_mm=circle_diameter_mm)
+            for image, pose in zip(images, start.target_poses, strict=True)
+        ]
+        if max(np.max(np.abs(b - a)) for a, b in zip(before, bias, strict=True)) <= _SETTLED_PX:
+            return replace(start, bias_px=before)
+    raise CalibrationError(
+        f"the offsets of the circles' images did not settle in {_BIAS_ROUNDS} rounds: is the circles' diameter "
+        f"{circle_diameter_mm:g} mm?"
+    )
+
+
+def centre_offsets(
+    project: Callable[[np.ndarray], np.ndarray], pose: np.ndarray, points_mm: np.ndarray, *, diameter_mm: float
+) -> np.ndarray:
+    """Offsets (N, 2) in px of the centres of circles' images from the images of the circles' centres.
+
+    The circles lie in the plane of a target at ``T_camera_target`` (4, 4); ``project`` maps points (M, 3) of the camera
+    frame to pixels (M, 2).
+
+    Raises RangeError: a circle's image is no ellipse.
+    """
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return project(points @ pose[:3, :3].T + pose[:3, 3])
+
+    return circle_centre_bias(seen, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
 
 
 def _accepted(
@@ -234,7 +272,7 @@ def _accepted(
     if poses == "free":
         if len(images) < 3:
             raise CalibrationError(f"free poses need at least 3 target images; there are {len(images)}")
-        return single_images(images)
+        return placements(images, approaching=None)
     if poses == "stage" and not options.square_pixels:
         raise CalibrationError(
             "a free stage direction and pixels that are not square cannot be separated: give square pixels, or "
@@ -251,11 +289,10 @@ def _accepted(
 
 def _restart(view: Placement, start: CameraSolution, poses: Poses) -> np.ndarray:
     pose = start.target_poses[view.image[0]]
-    local = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
     if poses != "stage":
-        return local
+        return pose_values(pose)
     direction = pose[:3, :3].T @ start.stage_direction
-    return np.r_[local, direction[:2] / abs(direction[2])]
+    return np.r_[pose_values(pose), direction[:2] / abs(direction[2])]
 
 
 def _refuse_undetermined(fit: SchurFit, intrinsics: Intrinsics) -> None:

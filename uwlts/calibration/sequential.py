@@ -1,7 +1,7 @@
 """Sequential calibration: camera and sheet from captures in air, then the window's distance from a step."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal
 
@@ -9,12 +9,11 @@ import numpy as np
 from pydantic import JsonValue
 
 import uwlts
-from uwlts.calibration.camera import CameraSolution, Poses
-from uwlts.calibration.circle_bias import UnbiasedSolution, solve_target
+from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
-from uwlts.calibration.window import StepImage, WindowSolution, label_step, solve_window
+from uwlts.calibration.window import WindowSolution, label_step, solve_window
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -24,106 +23,59 @@ from uwlts.storage.capture_sources import source_of
 from uwlts.stripe import StripeOptions
 
 
-@dataclass(frozen=True)
-class CameraFigures:
+def _camera_figures(solution: CameraSolution) -> dict[str, JsonValue]:
     """Residuals, standard deviations and covariance of the camera, as files hold them; None for what is missing."""
-
-    images: int
-    points: int
-    rms_px: float
-    sigma_px: float
-    image_rms_px: list[float]
-    std: dict[str, float]
-    parameters: list[str]
-    covariance: list[list[float]]
-    stage_direction: list[float] | None
-    stage_tilt_deg: float | None
-    stage_tilt_std_deg: float | None
-    largest_circle_bias_px: float | None
-    rounds: int
-    stopped: str
-
-    @classmethod
-    def of(cls, solution: CameraSolution, unbiased: UnbiasedSolution | None) -> "CameraFigures":
-        direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
-        return cls(
-            images=len(solution.residuals_px),
-            points=sum(map(len, solution.residuals_px)),
-            rms_px=solution.rms_px(),
-            sigma_px=solution.sigma_px,
-            image_rms_px=solution.image_rms_px().tolist(),
-            std=solution.std(),
-            parameters=list(solution.parameters),
-            covariance=solution.covariance.tolist(),
-            stage_direction=None if direction is None else direction.tolist(),
-            stage_tilt_deg=None if tilt is None else float(np.degrees(tilt)),
-            stage_tilt_std_deg=None if tilt_std is None else float(np.degrees(tilt_std)),
-            largest_circle_bias_px=None if unbiased is None else unbiased.largest_bias_px(),
-            rounds=solution.rounds,
-            stopped=solution.stopped,
-        )
+    direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
+    return {
+        "images": len(solution.residuals_px),
+        "points": sum(map(len, solution.residuals_px)),
+        "rms_px": solution.rms_px(),
+        "sigma_px": solution.sigma_px,
+        "image_rms_px": solution.image_rms_px().tolist(),
+        "std": solution.std(),
+        "parameters": list(solution.parameters),
+        "covariance": solution.covariance.tolist(),
+        "stage_direction": None if direction is None else direction.tolist(),
+        "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
+        "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
+        "largest_circle_bias_px": solution.largest_bias_px(),
+        "rounds": solution.rounds,
+        "stopped": solution.stopped,
+    }
 
 
-@dataclass(frozen=True)
-class SheetFigures:
+def _sheet_figures(solution: SheetSolution, points: StripePoints) -> dict[str, JsonValue]:
     """Distances of the stripe points from the sheet, as files hold them."""
-
-    images: int
-    points: int
-    rms_mm: float
-    max_mm: float
-    rejected_share: float
-    normal_std_deg: float
-    turn_from_nominal_deg: float
-
-    @classmethod
-    def of(cls, solution: SheetSolution, points: StripePoints) -> "SheetFigures":
-        return cls(
-            images=len(np.unique(points.image)),
-            points=len(points.points_mm),
-            rms_mm=solution.rms_mm,
-            max_mm=solution.max_mm,
-            rejected_share=solution.rejected_share,
-            normal_std_deg=float(np.degrees(solution.normal_std_rad)),
-            turn_from_nominal_deg=float(np.degrees(solution.turn_rad)),
-        )
+    return {
+        "images": len(np.unique(points.image)),
+        "points": len(points.points_mm),
+        "rms_mm": solution.rms_mm,
+        "max_mm": solution.max_mm,
+        "rejected_share": solution.rejected_share,
+        "normal_std_deg": float(np.degrees(solution.normal_std_rad)),
+        "turn_from_nominal_deg": float(np.degrees(solution.turn_rad)),
+    }
 
 
-@dataclass(frozen=True)
-class WindowFigures:
+def _window_figures(solution: WindowSolution, steps: Sequence[StepEvidence]) -> dict[str, JsonValue]:
     """Step heights and their errors, the distance's standard deviations, the curve, as files hold them."""
-
-    images: list[str]
-    distance_mm: float
-    std_mm: float | None
-    scatter_std_mm: float
-    per_height: float
-    heights_mm: list[float]
-    errors_mm: list[float]
-    height_std_mm: list[float]
-    image_distances_mm: list[float | None]
-    curve_mm: list[list[float | None]]
-    bounds_mm: list[float]
-
-    @classmethod
-    def of(cls, solution: WindowSolution, sources: list[str]) -> "WindowFigures":
-        return cls(
-            images=sources,
-            distance_mm=solution.model.distance_mm,
-            std_mm=solution.std_mm,
-            scatter_std_mm=solution.scatter_std_mm,
-            per_height=solution.per_height,
-            heights_mm=solution.heights_mm.tolist(),
-            errors_mm=solution.errors_mm.tolist(),
-            height_std_mm=solution.height_std_mm.tolist(),
-            image_distances_mm=_none_for_nan(solution.image_distances_mm),
-            curve_mm=[_none_for_nan(row) for row in solution.curve_mm],
-            bounds_mm=list(solution.bounds_mm),
-        )
+    return {
+        "images": [step.source for step in steps],
+        "distance_mm": solution.model.distance_mm,
+        "std_mm": solution.std_mm,
+        "scatter_std_mm": solution.scatter_std_mm,
+        "per_height": solution.per_height,
+        "heights_mm": solution.heights_mm.tolist(),
+        "errors_mm": solution.errors_mm.tolist(),
+        "height_std_mm": solution.height_std_mm.tolist(),
+        "image_distances_mm": _none_for_nan(solution.image_distances_mm),
+        "curve_mm": [_none_for_nan(row) for row in solution.curve_mm],
+        "bounds_mm": list(solution.bounds_mm),
+    }
 
 
-def _none_for_nan(values: np.ndarray) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
+def _none_for_nan(values: np.ndarray) -> list[JsonValue]:
+    return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
 _LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger deviations are reported
@@ -165,14 +117,12 @@ class CalibrationResult:
 
     Attributes
     ----------
-    bias_px : list of (N, 2) or None; offsets taken out of the circles' centres
     steps : those used for the window, in the order of its figures
     """
 
     calibration: Calibration
     air: AirEvidence
     camera: CameraSolution
-    bias_px: list[np.ndarray] | None
     stripe_points: StripePoints
     sheet: SheetSolution
     steps: list[StepEvidence]
@@ -270,14 +220,15 @@ def gather(
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
     """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
     sensor, found = evidence.sensor, evidence.air
-    camera, unbiased = solve_target(
+    camera = solve_camera(
         found.images,
-        sensor.camera,
-        circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
+        width_px=sensor.camera.width_px,
+        height_px=sensor.camera.height_px,
         poses=options.poses,
         approaching=evidence.approaching is not False,
         options=options.camera,
         start=start,
+        circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
     )
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
@@ -288,6 +239,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     pose = laser_pose(sensor)
     sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
     warnings = [*evidence.warnings, *_turn_warnings(camera, sheet, evidence)]
+    figures = {"camera": _camera_figures(camera), "sheet": _sheet_figures(sheet, stripe_points)}
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -298,23 +250,29 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         sheet=sheet.model,
         camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
     )
-    used, window = [], None
+    used, left_out, window = [], [], None
     if evidence.window is not None:
-        used, window, left_out = _window(calibration, evidence, evidence.window, options)
-        warnings += left_out
-    figures = {"camera": CameraFigures.of(camera, unbiased), "sheet": SheetFigures.of(sheet, stripe_points)}
-    if window is not None:
-        figures["window"] = WindowFigures.of(window, [step.source for step in used])
+        described = WindowModel.described(evidence.window, sensor.laser.wavelength_nm, refractions=options.refractions)
+        for step in evidence.steps:
+            try:
+                used.append(label_step(calibration, described, step))
+            except EvaluationError as error:
+                left_out.append(f"{step.source}: left out, {error}")
+        if not used:
+            why = "; ".join([*evidence.warnings, *left_out][:3])
+            raise CalibrationError(f"no step image can be used for the window's distance; {why}")
+        window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm)
+        figures["window"] = _window_figures(window, used)
+    warnings += left_out
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
         update={
             "window": None if window is None else window.model,
-            "residuals": {name: asdict(each) for name, each in figures.items()},
+            "residuals": figures,
             "provenance": evidence.sources | how | {"warnings": warnings},
         }
     )
-    bias = None if unbiased is None else unbiased.bias_px
-    return CalibrationResult(calibration, found, camera, bias, stripe_points, sheet, used, window, warnings)
+    return CalibrationResult(calibration, found, camera, stripe_points, sheet, used, window, warnings)
 
 
 def common_sensor(captures: Sequence[Capture]) -> Sensor:
@@ -356,39 +314,6 @@ def _approaching(air: Sequence[Capture]) -> bool:
             "poses='free' with a tilted target"
         )
     return bool(min(along) > 0)
-
-
-def _window(
-    calibration: Calibration, evidence: Evidence, described: Window, options: CalibrationOptions
-) -> tuple[list[StepEvidence], WindowSolution, list[str]]:
-    wavelength = evidence.sensor.laser.wavelength_nm
-    window = WindowModel.described(described, wavelength, refractions=options.refractions)
-    used, images, warnings = [], [], []
-    for step in evidence.steps:
-        try:
-            images.append(step_image(calibration, window, step))
-            used.append(step)
-        except EvaluationError as error:
-            warnings.append(f"{step.source}: left out, {error}")
-    if not images:
-        raise CalibrationError(
-            "no step image can be used for the window's distance; " + "; ".join([*evidence.warnings, *warnings][:3])
-        )
-    return used, solve_window(calibration, window, images, bounds_mm=options.bounds_mm), warnings
-
-
-def step_image(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
-    """A stripe on the step standard with its treads labelled; EvaluationError where it does not show two."""
-    standard = step.standard
-    return label_step(
-        calibration,
-        window,
-        step.pixels,
-        height_mm=standard.height_mm,
-        medium_index=step.medium_index,
-        edge_mm=standard.edge_mm,
-        reference=standard.reference,
-    )
 
 
 def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:

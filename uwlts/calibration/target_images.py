@@ -80,36 +80,41 @@ class Placement:
         raw = np.array([*(tilt if len(tilt) else (0.0, 0.0)), self.along_z])
         return raw / np.linalg.norm(raw)
 
-    def displaced(self, direction: np.ndarray) -> np.ndarray:
+    def displaced(self, direction: np.ndarray | None = None) -> np.ndarray:
         """Points (N, 3) in the target's frame at s0, as if the sensor had not moved: the stage moves them back."""
-        return self.points_mm - self.shifts_mm[:, None] * direction
+        along = self.direction(np.empty(0)) if direction is None else direction
+        return self.points_mm - self.shifts_mm[:, None] * along
 
 
-def placements(images: Sequence[TargetImage], *, approaching: bool) -> list[Placement]:
-    """Group images by their placement number; refuse targets that appear mirrored in some images."""
-    numbers = sorted({image.placement for image in images})
-    groups = [[i for i, image in enumerate(images) if image.placement == number] for number in numbers]
-    return [_joined(images, group, approaching=approaching) for group in groups]
+def pose_values(pose: np.ndarray) -> np.ndarray:
+    """Rotation vector and translation in mm (6,) of a transform (4, 4)."""
+    return np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
 
 
-def single_images(images: Sequence[TargetImage]) -> list[Placement]:
-    """Every image as a placement of its own."""
-    return [_joined(images, [index], approaching=True) for index in range(len(images))]
+def placements(images: Sequence[TargetImage], *, approaching: bool | None) -> list[Placement]:
+    """Images joined by their placement number, or one by one if the stage's sense is None.
 
-
-def _joined(images: Sequence[TargetImage], group: list[int], *, approaching: bool) -> Placement:
-    members = [images[index] for index in group]
-    counts = [len(member.points_mm) for member in members]
-    facing = {z_away(member) for member in members}
-    if len(facing) > 1:
-        raise CalibrationError("the target is mirrored in some of its images: its columns or rows run backwards")
-    return Placement(
-        points_mm=np.vstack([member.points_mm for member in members]),
-        shifts_mm=np.repeat([member.stage_mm - members[0].stage_mm for member in members], counts),
-        pixels=np.vstack([member.pixels for member in members]),
-        image=np.repeat(group, counts),
-        along_z=1.0 if facing.pop() == approaching else -1.0,
-    )
+    Raises CalibrationError: the target appears mirrored in some images of a placement.
+    """
+    numbers = [index if approaching is None else image.placement for index, image in enumerate(images)]
+    joined = []
+    for number in sorted(set(numbers)):
+        group = [index for index, own in enumerate(numbers) if own == number]
+        members = [images[index] for index in group]
+        counts = [len(member.points_mm) for member in members]
+        facing = {z_away(member) for member in members}
+        if len(facing) > 1:
+            raise CalibrationError("the target is mirrored in some of its images: its columns or rows run backwards")
+        joined.append(
+            Placement(
+                points_mm=np.vstack([member.points_mm for member in members]),
+                shifts_mm=np.repeat([member.stage_mm - members[0].stage_mm for member in members], counts),
+                pixels=np.vstack([member.pixels for member in members]),
+                image=np.repeat(group, counts),
+                along_z=1.0 if facing.pop() == (approaching is not False) else -1.0,
+            )
+        )
+    return joined
 
 
 def observe(

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares, root_scalar
 
+from uwlts.calibration.evidence import StepEvidence
 from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
@@ -21,23 +21,10 @@ _AT_BOUND = 1e-3  # share of the range; least squares within bounds stop as clos
 
 
 @dataclass(frozen=True, eq=False)
-class StepImage:
-    """One image of a step standard.
+class StepImage(StepEvidence):
+    """A stripe on a step standard with the `StepFace` (N,) of every pixel, from `label_step`."""
 
-    Attributes
-    ----------
-    pixels : (N, 2); stripe pixels (u, v)
-    height_mm : calibrated height of the step
-    medium_index : refractive index of the medium relative to air
-    labels : (N,); `StepFace` of every pixel, from `label_step`
-    reference : the tread to which the line is fitted
-    """
-
-    pixels: np.ndarray
-    height_mm: float
-    medium_index: float
     labels: np.ndarray
-    reference: Literal["lower", "upper"] = "lower"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,25 +67,16 @@ def step_profile(
     return seen.points_camera_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
 
 
-def label_step(
-    calibration: Calibration,
-    window: WindowModel | None,
-    pixels: np.ndarray,
-    *,
-    height_mm: float,
-    medium_index: float,
-    edge_mm: float = 1.0,
-    reference: Literal["lower", "upper"] = "lower",
-) -> StepImage:
-    """Tell the treads apart at the window's nominal distance, where the profile is true to a few percent.
+def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
+    """Separate the treads at the window's nominal distance, where the profile is true to a few percent.
 
     Raises EvaluationError: the profile does not show two treads.
     """
-    points = step_profile(calibration, window, pixels, medium_index=medium_index)
+    points = step_profile(calibration, window, step.pixels, medium_index=step.medium_index)
     found = np.isfinite(points).all(axis=1)
     labels = np.full(len(points), int(StepFace.NEITHER), dtype=np.int8)
-    labels[found] = label_step_faces(points[found], height_mm=height_mm, edge_mm=edge_mm)
-    return StepImage(pixels, height_mm, medium_index, labels, reference)
+    labels[found] = label_step_faces(points[found], height_mm=step.standard.height_mm, edge_mm=step.standard.edge_mm)
+    return StepImage(**vars(step), labels=labels)
 
 
 def solve_window(
@@ -131,7 +109,7 @@ def solve_window(
     low, high = bounds_mm or tuple(share * window.distance_mm for share in _SEARCHED)
     if not 0 < low < high < np.inf:
         raise CalibrationError(f"the window's distance is searched from {low:g} to {high:g} mm; give 0 < low < high")
-    true = np.array([step.height_mm for step in steps])
+    true = np.array([step.standard.height_mm for step in steps])
     if not (np.isfinite(true) & (true > 0)).all():
         raise CalibrationError(f"the heights of the steps must be positive lengths in mm, not {true.tolist()}")
 
@@ -148,10 +126,11 @@ def solve_window(
             f"behind the step"
         )
     # The points that can be reconstructed form one range: a window before the nearest point.
-    low, high = tried[usable][0], tried[usable][-1]
+    low, high = float(tried[usable][0]), float(tried[usable][-1])
+    margin = _AT_BOUND * (high - low)
     best = least_squares(
         lambda d: heights(d[0]) - true,
-        [np.clip(tried[np.nanargmin(mean_error)], *_inside(low, high))],
+        [np.clip(tried[np.nanargmin(mean_error)], low + margin, high - margin)],
         bounds=(low, high),
         xtol=1e-12,
         ftol=1e-12,
@@ -161,9 +140,20 @@ def solve_window(
     distance, slopes = float(best.x[0]), best.jac[:, 0]
     measured, height_std = _heights(calibration, window, steps, distance).T
     errors = measured - true
-    _refuse(distance, low, high, np.ptp(scanned[usable], axis=0), height_std)
-    squares = float(slopes @ slopes)
-    freedom = len(steps) - 1
+    change, scatter = (np.sqrt(np.mean(v**2)) for v in (np.ptp(scanned[usable], axis=0), height_std))
+    if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
+        raise CalibrationError(
+            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} "
+            f"to {high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
+        )
+    if not low + margin < distance < high - margin:
+        raise CalibrationError(
+            f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
+            "check the medium's index and the step's height, and that the images are not turned or mirrored, or widen "
+            "the bounds"
+        )
+    own = zip(steps, scanned[usable].T - true[:, None], strict=True)
+    squares, freedom = float(slopes @ slopes), len(steps) - 1
     return WindowSolution(
         model=window.model_copy(update={"distance_mm": distance}),
         heights_mm=measured,
@@ -174,19 +164,11 @@ def solve_window(
         scatter_std_mm=float(np.linalg.norm(slopes * height_std)) / squares,
         per_height=float(slopes.sum()) / squares,
         image_distances_mm=np.array(
-            [
-                _own_distance(calibration, window, step, tried[usable], scanned[usable, index], distance)
-                for index, step in enumerate(steps)
-            ]
+            [_own_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
         ),
         curve_mm=np.column_stack([tried, mean_error]),
-        bounds_mm=(float(low), float(high)),
+        bounds_mm=(low, high),
     )
-
-
-def _inside(low: float, high: float) -> tuple[float, float]:
-    margin = _AT_BOUND * (high - low)
-    return low + margin, high - margin
 
 
 def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float) -> np.ndarray:
@@ -199,45 +181,30 @@ def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[Step
     for index in {step.medium_index for step in steps}:
         here = [number for number, step in enumerate(steps) if step.medium_index == index]
         treads = [steps[number].labels != StepFace.NEITHER for number in here]
-        pixels = np.vstack([steps[number].pixels[on_it] for number, on_it in zip(here, treads, strict=True)])
-        points = step_profile(calibration, at_distance, pixels, medium_index=index)
-        ends = np.cumsum([np.count_nonzero(on_it) for on_it in treads])
-        for number, on_it, profile in zip(here, treads, np.split(points, ends[:-1]), strict=True):
+        pixels = [steps[number].pixels[on_it] for number, on_it in zip(here, treads, strict=True)]
+        points = step_profile(calibration, at_distance, np.vstack(pixels), medium_index=index)
+        profiles = np.split(points, np.cumsum([len(part) for part in pixels])[:-1])
+        for number, on_it, profile in zip(here, treads, profiles, strict=True):
             if np.isfinite(profile).all():
                 step = steps[number]
-                height = step_height(profile, step.labels[on_it], reference=step.reference)
+                height = step_height(profile, step.labels[on_it], reference=step.standard.reference)
                 heights[number] = height.height_mm, height.std_mm
     return heights
 
 
-def _refuse(distance: float, low: float, high: float, changes: np.ndarray, height_std: np.ndarray) -> None:
-    change = float(np.sqrt(np.mean(changes**2)))
-    scatter = float(np.sqrt(np.mean(height_std**2)))
-    if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
-        raise CalibrationError(
-            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} "
-            f"to {high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
-        )
-    inner = _inside(low, high)
-    if not inner[0] < distance < inner[1]:
-        raise CalibrationError(
-            f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
-            "check the medium's index and the step's height, and that the images are not turned or mirrored, or widen "
-            "the bounds"
-        )
-
-
 def _own_distance(
-    calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, scanned: np.ndarray, near: float
+    calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, errors: np.ndarray, near: float
 ) -> float:
-    """Distance at which one image shows the true height, the one next to ``near``; NaN where there is none."""
-    errors = scanned - step.height_mm
+    """Distance at which one image shows the true height, the one next to ``near``; NaN where there is none.
+
+    ``errors`` are those of the height at the distances tried.
+    """
     changes = np.flatnonzero(errors[:-1] * errors[1:] <= 0)
     if not len(changes):
         return float("nan")
     left = changes[np.argmin(np.abs(tried[changes] - near))]
 
     def error(distance: float) -> float:
-        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.height_mm
+        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.standard.height_mm
 
     return float(root_scalar(error, bracket=(tried[left], tried[left + 1]), method="brentq", xtol=1e-7).root)

@@ -93,10 +93,10 @@ def propagate(
         raise RangeError(f"{trials} trials give no 95 % interval: make at least {LEAST_TRIALS}")
     start = solve(evidence, options=options)
     # Offsets of circle centres hardly change from trial to trial; they are taken out once.
-    if start.bias_px is not None:
+    if start.camera.bias_px is not None:
         images = [
             replace(image, pixels=image.pixels - bias)
-            for image, bias in zip(evidence.air.images, start.bias_px, strict=True)
+            for image, bias in zip(evidence.air.images, start.camera.bias_px, strict=True)
         ]
         evidence = replace(evidence, air=replace(evidence.air, images=images))
         options = replace(options, correct_circles=False)

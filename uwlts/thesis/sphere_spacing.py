@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.evidence import step_evidence
-from uwlts.calibration.sequential import step_image
-from uwlts.calibration.window import StepImage, solve_window, step_profile
+from uwlts.calibration.window import StepImage, label_step, solve_window, step_profile
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import evaluate_spheres
@@ -156,7 +155,7 @@ def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, 
             evidence, _ = step_evidence([capture])
             sensor, refractions = capture.header.sensor, window_of(calibration).refractions
             described = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
-        found[place] = [step_image(calibration, described, step) for step in evidence]
+        found[place] = [label_step(calibration, described, step) for step in evidence]
     return found
 
 

@@ -133,10 +133,10 @@ def test_the_sensor_is_found(result):
 
 
 def test_circle_offsets_are_taken_out(result, files):
-    assert 0.005 < max(np.abs(bias).max() for bias in result.bias_px) < 0.5
+    assert 0.005 < max(np.abs(bias).max() for bias in result.camera.bias_px) < 0.5
     with Capture(files[0]) as air:
         plain = calibrate_sequentially([air], options=CalibrationOptions(correct_circles=False))
-    assert plain.bias_px is None
+    assert plain.camera.bias_px is None
     assert plain.calibration.window is None
     assert plain.window is None
     assert "window" not in plain.calibration.residuals

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
+from uwlts.calibration.evidence import StepEvidence
 from uwlts.calibration.window import label_step, solve_window
 from uwlts.calibration.window import step_profile as reconstructed
 from uwlts.metrology.step_faces import StepFace
+from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.optics.nominal import nominal_calibration
@@ -33,7 +35,15 @@ def steps(window, profiles=None, *, noise_px=0.0, rng=None, index=WATER, height_
         through_window(SENSOR, p, refractions=window.refractions, index=index, noise_px=noise_px, rng=rng)
         for p in profiles
     )
-    return [label_step(AIR, window, pixels, height_mm=height_mm, medium_index=index) for pixels in views]
+    return [labelled(window, pixels, height_mm, index) for pixels in views]
+
+
+def labelled(window, pixels, height_mm=STEP_MM, index=WATER):
+    return label_step(AIR, window, StepEvidence(pixels, StepStandard(height_mm=height_mm), index, "a step"))
+
+
+def with_height(step, height_mm):
+    return replace(step, standard=step.standard.model_copy(update={"height_mm": height_mm}))
 
 
 @pytest.mark.parametrize("window", [PLATE, INTERFACE])
@@ -80,7 +90,7 @@ def test_nine_noisy_steps_scatter_as_reported():
 
 def test_a_wrong_height_shifts_the_distance_as_told():
     solution = solve_window(AIR, PLATE, clean_steps(PLATE))
-    wrong = solve_window(AIR, PLATE, [replace(step, height_mm=STEP_MM + 0.02) for step in clean_steps(PLATE)])
+    wrong = solve_window(AIR, PLATE, [with_height(step, STEP_MM + 0.02) for step in clean_steps(PLATE)])
     # The thesis's height uncertainty of 0.02 mm: nearly 1 mm of window distance, all but linear.
     shift = wrong.model.distance_mm - solution.model.distance_mm
     assert shift == pytest.approx(0.02 * solution.per_height, rel=0.02)
@@ -136,7 +146,7 @@ def test_a_window_behind_the_step_is_not_tried():
 
 def test_an_image_that_fits_no_distance_has_none():
     images = clean_steps(PLATE)
-    odd = label_step(AIR, PLATE, images[4].pixels, height_mm=STEP_MM + 4, medium_index=WATER)
+    odd = labelled(PLATE, images[4].pixels, STEP_MM + 4)
     solution = solve_window(AIR, PLATE, [*images, *images, odd])
     assert np.isnan(solution.image_distances_mm[-1])
     assert np.isfinite(solution.image_distances_mm[:-1]).all()
@@ -149,6 +159,6 @@ def test_unusable_steps_are_refused():
         steps(PLATE, [np.column_stack([np.zeros(400), np.linspace(-60, 60, 400), np.full(400, 10.0)])])
     good = steps(PLATE, nine_steps()[3:4])[0]
     with pytest.raises(RangeError, match="finite"):
-        label_step(AIR, PLATE, good.pixels * np.nan, height_mm=STEP_MM, medium_index=WATER)
+        labelled(PLATE, good.pixels * np.nan)
     with pytest.raises(CalibrationError, match="positive lengths"):
-        solve_window(AIR, PLATE, [replace(good, height_mm=np.nan)])
+        solve_window(AIR, PLATE, [with_height(good, np.nan)])

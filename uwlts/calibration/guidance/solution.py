@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera import CameraSolution, Poses
-from uwlts.calibration.circle_bias import solve_target
+from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sheet import SheetSolution, fit_sheet, points_on_target
 from uwlts.calibration.target_images import TargetImage
@@ -28,10 +27,6 @@ class RecordedPose:
     view: TargetView
     stripe: np.ndarray
     stage_mm: float
-
-    def image(self) -> TargetImage:
-        """What it contributes to the camera; CalibrationError where its points are too few or on one line."""
-        return TargetImage(self.view.points_mm, self.view.pixels, self.stage_mm)
 
 
 @dataclass(frozen=True)
@@ -68,15 +63,17 @@ def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
 
 def solve_recorded(recorded: Sequence[RecordedPose], setting: Setting) -> CameraSolution:
     """Camera and poses from what is recorded; CalibrationError where that does not determine them yet."""
+    camera = setting.sensor.camera
     try:
-        return solve_target(
-            [pose.image() for pose in recorded],
-            setting.sensor.camera,
-            circle_diameter_mm=setting.target.circle_diameter_mm,
+        return solve_camera(
+            [TargetImage(pose.view.points_mm, pose.view.pixels, pose.stage_mm) for pose in recorded],
+            width_px=camera.width_px,
+            height_px=camera.height_px,
             poses=setting.poses,
             approaching=setting.approaching,
             options=setting.camera,
-        )[0]
+            circle_diameter_mm=setting.target.circle_diameter_mm,
+        )
     except RangeError as error:
         raise CalibrationError(str(error)) from error
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from uwlts.calibration.evidence import StepEvidence
 from uwlts.calibration.image_quality import LaserFault
-from uwlts.calibration.sequential import step_image
+from uwlts.calibration.window import label_step
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import EvaluationError, ImageError
@@ -94,7 +94,7 @@ def judge_step(
         reasons.append(LaserFault(f"stripe saturated on {100 * saturated:.0f} % of its lines; shorten laser_ms"))
     evidence = StepEvidence(pixels, standard, medium_index, "this image")
     try:
-        step_image(calibration, window, evidence)
+        label_step(calibration, window, evidence)
     except EvaluationError as error:
         reasons.append(f"no step: {error}")
     placed = calibration.model_copy(update={"window": window})

@@ -12,7 +12,7 @@ from uwlts.calibration.joint.initial_scans import ScanStripes, scan_stripes
 from uwlts.calibration.joint.parameters import Prior, View
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sources_of
-from uwlts.calibration.target_images import Placement, placements, single_images
+from uwlts.calibration.target_images import Placement, placements
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import (
@@ -46,9 +46,7 @@ class Series:
 
     def placements(self, *, free: bool) -> list[Placement]:
         """The images joined by the stage's motion, or one by one."""
-        if free or self.approaching is None:
-            return single_images(self.found.images)
-        return placements(self.found.images, approaching=self.approaching)
+        return placements(self.found.images, approaching=None if free else self.approaching)
 
 
 @dataclass(frozen=True, eq=False)

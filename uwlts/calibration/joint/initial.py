@@ -13,9 +13,9 @@ from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.gathering import Gathered, Series
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
-from uwlts.calibration.sequential import step_image
 from uwlts.calibration.sheet import fit_sheet, object_frame
 from uwlts.calibration.target_images import Placement
+from uwlts.calibration.window import label_step
 from uwlts.metrology.step_faces import StepFace
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError
@@ -226,7 +226,7 @@ def step_profiles(
     found, warnings = [], []
     for number, (step, view) in enumerate(gathered.steps):
         try:
-            image = step_image(start, window, step)
+            image = label_step(start, window, step)
         except EvaluationError as error:
             warnings.append(f"{step.source}: left out, {error}")
             continue

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from uwlts.calibration.joint.estimate import Evidence
@@ -21,7 +20,7 @@ from uwlts.calibration.joint.observability import (
 from uwlts.calibration.joint.parameters import Prior, View
 from uwlts.calibration.joint.scanned_surfaces import Spheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
-from uwlts.calibration.target_images import Placement
+from uwlts.calibration.target_images import Placement, pose_values
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
@@ -72,7 +71,7 @@ def target_shot(calibration: Calibration, known: StoredEstimate, target: Target,
         radius_mm=float(np.linalg.norm(extent - middle, axis=1).max()),
         middle_mm=middle,
     )
-    local = np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])
+    local = pose_values(pose)
     return _shot(known, evidence, local, Uncertainty())
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.circle_bias import centre_offsets
+from uwlts.calibration.camera import centre_offsets
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.joint.consistency import findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
