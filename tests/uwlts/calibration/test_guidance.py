@@ -8,7 +8,7 @@ import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lens_of, step_profile, through_window
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
-from uwlts.calibration.guidance.coverage import candidates, coverage_of, place_words, tilts_rad, working_range_mm
+from uwlts.calibration.guidance.coverage import candidates, coverage_of, place_words, tilts_rad
 from uwlts.calibration.guidance.pose_advice import (
     State,
     Wanted,
@@ -237,7 +237,7 @@ def test_wished_poses_beat_as_many_random_ones(setting):
     wanted = Wanted(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
-    options = candidates(BOARD, nominal_camera(setting), setting.camera, range_mm=working_range_mm(setting.sensor))
+    options = candidates(setting, nominal_camera(setting))
     assert len(options) > 20
     stds = []
     for draw in range(12):
@@ -252,7 +252,7 @@ def test_wished_poses_beat_as_many_random_ones(setting):
 def test_what_is_expected_of_an_image_comes_true(setting):
     """The standard deviations expected from the information are those of the solution; the description adds little."""
     state = led(setting, Wanted(focal_std_px=1e-6, centre_std_px=1e-6), np.random.default_rng(5), most=6)
-    expected = state.expected_std(state.information)
+    expected = state.expected_std()
     for key, std in state.std().items():
         # The solution's scatter has some 1000 degrees of freedom, the start of the lens matters at the percent level.
         assert expected[key] == pytest.approx(std, rel=0.1), key

@@ -7,12 +7,10 @@ from itertools import product
 import cv2
 import numpy as np
 
-from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
-from uwlts.calibration.target_images import Placement, observe
+from uwlts.calibration.guidance.solution import Setting
+from uwlts.calibration.target_images import Placement, observe, pose_values
 from uwlts.model.calibration import CameraModel
-from uwlts.model.sensor import Sensor
 from uwlts.optics.camera import directions
-from uwlts.targets import Target
 
 TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles stay detectable
 _PLACES, _DEPTHS = (0.2, 0.5, 0.8), (0.1, 0.5, 0.9)  # shares of the image and of the working range, inside both
@@ -32,29 +30,16 @@ class Candidate:
     information: np.ndarray
 
 
-def target_middle(target: Target) -> np.ndarray:
-    """Middle (3,) of a target's points in its frame, mm."""
-    return target.points_mm.mean(axis=0)
-
-
-def working_range_mm(sensor: Sensor) -> tuple[float, float]:
-    """Nearest and farthest distance from the pupil at which the sensor is meant to see something."""
-    window = sensor.camera.window
-    outer = window.distance_mm + window.thickness_mm
-    return outer + sensor.volume.near_mm, outer + sensor.volume.far_mm
-
-
 def information_of(
-    points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, options: CameraOptions
+    points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, setting: Setting
 ) -> np.ndarray:
-    """What the points of one image, each found to 1 px, say of the camera's parameters (P, P), its pose being unknown.
+    """Information (P, P) on the camera's parameters in points of one image, each found to 1 px, the pose being unknown.
 
     The pose's part is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
     """
-    intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
-    placement = Placement(points_mm, np.zeros(len(points_mm)), pixels, np.zeros(len(points_mm), dtype=int), 1.0)
-    local = np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
-    seen = observe(placement, intrinsics, intrinsics.from_model(camera), local)
+    intrinsics, count = setting.intrinsics(), len(points_mm)
+    placement = Placement(points_mm, np.zeros(count), pixels, np.zeros(count, dtype=int), 1.0)
+    seen = observe(placement, intrinsics, intrinsics.from_model(camera), pose_values(pose))
     if seen is None:
         return np.zeros((len(intrinsics.names),) * 2)
     by_global, basis = seen.by_global, np.linalg.qr(seen.by_local / np.linalg.norm(seen.by_local, axis=0))[0]
@@ -62,50 +47,37 @@ def information_of(
     return left.T @ left
 
 
-def candidates(
-    target: Target, camera: CameraModel, options: CameraOptions, *, range_mm: tuple[float, float], spin_rad: float = 0.0
-) -> list[Candidate]:
-    """Poses at three distances, nine places of the image, nine tilts, in which the target could be found.
+def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[Candidate]:
+    """Poses at three distances in the working range, nine places, nine tilts, in which the target could be found.
 
-    Parameters
-    ----------
-    range_mm : (nearest, farthest); distances along the camera's axis
-    spin_rad : how the target is turned in the image, from its x axis to the image's
+    Tilts are none and those that make one of eight sides of the image farther. ``spin_rad`` is how the target is turned
+    in the image, from its x axis to the image's.
     """
-    points, middle = target.points_mm, target_middle(target)
+    target, volume, window = setting.target, setting.sensor.volume, setting.sensor.camera.window
+    outer = window.distance_mm + window.thickness_mm
+    nearest, farthest = outer + volume.near_mm, outer + volume.far_mm
+    points, middle = target.points_mm, target.points_mm.mean(axis=0)
+    largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
     step = max(1, len(points) // _SAMPLE)
-    found = []
-    for depth, x, y, rotation in product(_DEPTHS, _PLACES, _PLACES, _rotations(spin_rad)):
-        distance = range_mm[0] + depth * (range_mm[1] - range_mm[0])
-        ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = ray / ray[2] * distance - rotation @ middle
-        pixels = _seen(points, pose, camera)
-        largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
-        inside = np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
-        if not target.findable(inside):
-            continue
-        sample = np.flatnonzero(inside)[::step]
-        added = information_of(points[sample], pixels[sample], pose, camera, options)
-        found.append(Candidate(pose, pixels[inside], added * inside.sum() / len(sample)))
-    return found
-
-
-def _rotations(spin_rad: float) -> list[np.ndarray]:
-    """Rotations (3, 3): square to the camera, and tilted so that one of eight sides of the image is farther."""
     spin = cv2.Rodrigues(np.array([0.0, 0.0, spin_rad]))[0]
     sides = np.arange(8) * np.pi / 4
     tilts = [np.zeros(3), *(TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
-    return [cv2.Rodrigues(tilt)[0] @ spin for tilt in tilts]
-
-
-def _seen(points: np.ndarray, pose: np.ndarray, camera: CameraModel) -> np.ndarray:
-    """Pixels (N, 2) of the target's points; far outside the image where a point lies behind the camera."""
-    rotation = cv2.Rodrigues(pose[:3, :3])[0]
-    pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
-    behind = points @ pose[2, :3] + pose[2, 3] <= 0
-    return np.where(behind[:, None], -1e6, pixels)
+    found = []
+    for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
+        distance = nearest + depth * (farthest - nearest)
+        ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(tilt)[0] @ spin
+        pose[:3, 3] = ray / ray[2] * distance - pose[:3, :3] @ middle
+        rotation = cv2.Rodrigues(pose[:3, :3])[0]
+        pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
+        ahead = points @ pose[2, :3] + pose[2, 3] > 0
+        inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
+        if target.findable(inside):
+            sample = np.flatnonzero(inside)[::step]
+            added = information_of(points[sample], pixels[sample], pose, camera, setting)
+            found.append(Candidate(pose, pixels[inside], added * inside.sum() / len(sample)))
+    return found
 
 
 _LONG_SIDE_CELLS = 8  # fine enough for distortion, coarse enough to be filled by some ten images
@@ -114,13 +86,7 @@ _POINTS_IN_CELL = 3  # one or two may be a corner of the target that touches the
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Points of all images in a grid of nearly square cells over the image.
-
-    Attributes
-    ----------
-    counts : (rows, columns); points in each cell
-    width_px, height_px : size of the image
-    """
+    """Points of all images in a grid of nearly square cells over the image: ``counts`` (rows, columns) in each."""
 
     counts: np.ndarray
     width_px: int
@@ -171,13 +137,14 @@ def coverage_of(views: Sequence[np.ndarray], *, width_px: int, height_px: int) -
 def place_words(x: float, y: float) -> str:
     """A place in the image, x and y as shares of its width and height, in words."""
     across = "left" if x < 0.4 else "right" if x > 0.6 else ""
-    down = "upper" if y < 0.4 else "lower" if y > 0.6 else ""
-    if across and down:
-        return f"{down} {across}"
-    return across or {"upper": "top", "lower": "bottom", "": "middle"}[down]
+    if 0.4 <= y <= 0.6:
+        return across or "middle"
+    if across:
+        return f"{'upper' if y < 0.4 else 'lower'} {across}"
+    return "top" if y < 0.4 else "bottom"
 
 
 def tilts_rad(pose: np.ndarray) -> tuple[float, float]:
-    """How far the target of a pose ``T_camera_target`` (4, 4) is tilted: right side farther, lower side farther."""
+    """Tilts of the target at a pose ``T_camera_target`` (4, 4): right side farther, lower side farther."""
     normal = pose[:3, 2] * np.sign(pose[2, 2] or 1.0)
     return float(np.arctan2(-normal[0], normal[2])), float(np.arctan2(-normal[1], normal[2]))

@@ -1,7 +1,7 @@
 """Advice during a camera calibration: what is still missing, and the pose of the target that would help most."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,15 +13,14 @@ from uwlts.calibration.guidance.coverage import (
     coverage_of,
     information_of,
     place_words,
-    target_middle,
     tilts_rad,
-    working_range_mm,
 )
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, nominal_camera, pose_of, sheet_of, solve_recorded
-from uwlts.calibration.intrinsics import Intrinsics
+from uwlts.calibration.guidance.solution import RecordedPose, Setting, nominal_camera, pose_of, solve_recorded
+from uwlts.calibration.sheet import fit_sheet, points_on_target
 from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter
+from uwlts.model.placement import laser_pose
 from uwlts.optics.camera import project
 from uwlts.targets import TargetView
 
@@ -96,13 +95,28 @@ class State:
     def std(self) -> dict[LensParameter, float]:
         """Standard deviation of every camera parameter: the solution's, or what is expected without one."""
         if self.solution is None:
-            return self.expected_std(self.information)
-        return dict(zip(_intrinsics(self.setting).keys, self.solution.std().values(), strict=True))
+            return self.expected_std()
+        return dict(zip(self.setting.intrinsics().keys, self.solution.std().values(), strict=True))
 
-    def expected_std(self, information: np.ndarray) -> dict[LensParameter, float]:
-        """Standard deviations that belong to information (P, P)."""
-        std = np.sqrt(np.diag(np.linalg.inv(information))).tolist()
-        return dict(zip(_intrinsics(self.setting).keys, std, strict=True))
+    def expected_std(self) -> dict[LensParameter, float]:
+        """Standard deviations that belong to the information."""
+        std = np.sqrt(np.diag(np.linalg.inv(self.information))).tolist()
+        return dict(zip(self.setting.intrinsics().keys, std, strict=True))
+
+    def with_image(self, pose: np.ndarray, pixels: np.ndarray, information: np.ndarray) -> "State":
+        """As expected with one more image: its pose (4, 4), pixels (N, 2) and information (P, P) by points of 1 px."""
+        sigma = _USUAL_SIGMA_PX if self.solution is None else max(self.solution.sigma_px, _LEAST_SIGMA_PX)
+        return replace(
+            self,
+            poses=np.concatenate([self.poses, pose[None]]),
+            coverage=self.coverage.with_points(pixels),
+            information=self.information + information / sigma**2,
+        )
+
+    def with_view(self, view: TargetView, pose: np.ndarray) -> "State":
+        """As expected with one more image that shows the target at a pose ``T_camera_target`` (4, 4)."""
+        information = information_of(view.points_mm, view.pixels, pose, self.camera, self.setting)
+        return self.with_image(pose, view.pixels, information)
 
     @property
     def enough(self) -> bool:
@@ -137,98 +151,101 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
             camera, undetermined = solution.model, ""
         except CalibrationError as error:
             undetermined = str(error)
-    poses = np.array([pose_of(pose.view, camera) for pose in recorded]) if solution is None else solution.target_poses
-    sigma = _sigma(solution)
-    information = _prior(setting, camera)
-    for pose, where in zip(recorded, poses, strict=True):
-        information = information + _scaled(pose.view, where, camera, setting, sigma)
     image = setting.sensor.camera
-    return State(
+    size = dict.fromkeys(_FOCAL, camera.fx_px) | {LensParameter.FY: camera.fy_px}
+    size |= {LensParameter.CX: camera.width_px, LensParameter.CY: camera.height_px}
+    stds = [_PRIOR[key] * size.get(key, 1.0) for key in setting.intrinsics().keys]
+    state = State(
         setting=setting,
         wanted=wanted,
         recorded=tuple(recorded),
         camera=camera,
         solution=solution,
         undetermined=undetermined,
-        poses=poses.reshape(-1, 4, 4),
-        coverage=coverage_of([p.view.pixels for p in recorded], width_px=image.width_px, height_px=image.height_px),
-        information=information,
+        poses=np.empty((0, 4, 4)),
+        coverage=coverage_of([], width_px=image.width_px, height_px=image.height_px),
+        information=np.diag(np.array(stds) ** -2.0),
     )
+    poses = [pose_of(one.view, camera) for one in recorded] if solution is None else solution.target_poses
+    for one, pose in zip(recorded, poses, strict=True):
+        state = state.with_view(one.view, pose)
+    return state
 
 
-def lack(state: State, information: np.ndarray, coverage: Coverage, poses: Iterable[np.ndarray]) -> float:
+def lack(state: State) -> float:
     """How much is missing: 0 once all that is wanted is reached, else logarithms of ratios and weighted shares."""
-    std = state.expected_std(information)
+    std, share = state.expected_std(), state.coverage.share
     ratios = np.log([std[key] / limit for key, limit in state.wanted.std_px().items() if key in std])
-    short = state.wanted.coverage - coverage.share
-    tilts = _untilted(state, poses).sum()
-    beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - coverage.share))
-    return float(np.maximum(ratios, 0).sum() + _COVERAGE_WEIGHT * max(short, 0.0) + _SPREAD_WEIGHT * tilts + beyond)
+    beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - share))
+    short = _COVERAGE_WEIGHT * max(state.wanted.coverage - share, 0.0)
+    return float(np.maximum(ratios, 0).sum() + short + _SPREAD_WEIGHT * _untilted(state).sum() + beyond)
 
 
-def _untilted(state: State, poses: Iterable[np.ndarray]) -> np.ndarray:
+def _untilted(state: State) -> np.ndarray:
     """For each of the target's four sides, what share (4,) of the wanted tilt it was never farther by."""
     if state.setting.poses != "free":
         return np.zeros(4)
-    across, down = np.array([tilts_rad(pose) for pose in poses]).reshape(-1, 2).T
+    across, down = np.array([tilts_rad(pose) for pose in state.poses]).reshape(-1, 2).T
     reached = np.array([np.max(tilts, initial=0.0) for tilts in (across, -across, down, -down)])
     return np.maximum(1 - reached / state.wanted.tilt_rad, 0.0)
 
 
 def best_pose(state: State, *, spin_rad: float = 0.0) -> PoseAdvice | None:
     """The candidate pose that leaves least missing; None where the target can be found in none."""
-    setting = state.setting
-    options = candidates(
-        setting.target, state.camera, setting.camera, range_mm=working_range_mm(setting.sensor), spin_rad=spin_rad
-    )
+    options = candidates(state.setting, state.camera, spin_rad=spin_rad)
     if not options:
         return None
-    sigma = _sigma(state.solution)
-    before = lack(state, state.information, state.coverage, state.poses)
-    after = [
-        lack(
-            state,
-            state.information + c.information / sigma**2,
-            state.coverage.with_points(c.pixels),
-            [*state.poses, c.pose],
-        )
-        for c in options
-    ]
+    after = [lack(state.with_image(each.pose, each.pixels, each.information)) for each in options]
     best = int(np.argmin(after))
     place, distance = middle_of(options[best].pose, state)
-    return PoseAdvice(options[best], before - after[best], place, distance)
+    return PoseAdvice(options[best], lack(state) - after[best], place, distance)
 
 
 def gain_of(state: State, view: TargetView, pose: np.ndarray) -> float:
     """By how much an image, seen at a pose ``T_camera_target`` (4, 4), would lessen what is missing."""
-    information = state.information + _scaled(view, pose, state.camera, state.setting, _sigma(state.solution))
-    before = lack(state, state.information, state.coverage, state.poses)
-    return before - lack(state, information, state.coverage.with_points(view.pixels), [*state.poses, pose])
+    return lack(state) - lack(state.with_view(view, pose))
 
 
 def middle_of(pose: np.ndarray, state: State) -> tuple[tuple[float, float], float]:
-    """Where the target's middle appears, as shares of the image's sides, and its distance in mm along the axis."""
-    middle = pose[:3, :3] @ target_middle(state.setting.target) + pose[:3, 3]
+    """Place of the target's middle in shares of the image's sides, and its distance in mm along the axis."""
+    middle = pose[:3, :3] @ state.setting.target.points_mm.mean(axis=0) + pose[:3, 3]
     u, v = project(state.camera, middle[None])[0]
     return (float(u / state.camera.width_px), float(v / state.camera.height_px)), float(middle[2])
 
 
 def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None) -> str:
     """What to do with the target to bring it from its present pose (4, 4), None if unknown, to the advised one."""
-    parts = []
-    across, down = tilts_rad(advice.candidate.pose)
-    if pose is None or _angle(pose[:3, 2], advice.candidate.pose[:3, 2]) > _SAME_TILT_RAD:
-        parts.append(_tilt_words(across, down, pose))
+    parts, aim = [], advice.candidate.pose
     place, distance = (None, None) if pose is None else middle_of(pose, state)
+    if pose is None or np.arccos(np.clip(pose[:3, 2] @ aim[:3, 2], -1, 1)) > _SAME_TILT_RAD:
+        parts.append(_tilt_words(aim, pose))
     if place is None or not np.linalg.norm(np.subtract(place, advice.place)) <= _SAME_PLACE:
         there = place_words(*advice.place)
         nothing = ": nothing seen there yet" if there == state.coverage.emptiest() else ""
         parts.append(f"bring its middle to the {there} of the image{nothing}")
-    if distance is None or abs(distance / advice.distance_mm - 1) > _SAME_DISTANCE:
-        how = "" if distance is None else "nearer, " if advice.distance_mm < distance else "farther, "
-        now = "" if distance is None else f" (now {distance:.0f} mm)"
-        parts.append(f"{how}to about {advice.distance_mm:.0f} mm from the camera{now}")
+    if distance is None:
+        parts.append(f"to about {advice.distance_mm:.0f} mm from the camera")
+    elif abs(distance / advice.distance_mm - 1) > _SAME_DISTANCE:
+        how = "nearer" if advice.distance_mm < distance else "farther"
+        parts.append(f"{how}, to about {advice.distance_mm:.0f} mm from the camera (now {distance:.0f} mm)")
     return "; ".join(parts) or "hold it still, just like this"
+
+
+def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
+    """Which side of the target shall be farther, and by how much."""
+    across, down = tilts_rad(aim)
+    size = np.degrees(np.arccos(np.clip(1 / np.sqrt(1 + np.tan(across) ** 2 + np.tan(down) ** 2), -1, 1)))
+    if size < 5:
+        return "hold the target square to the camera"
+    farther = {"lower": down, "upper": -down, "right": across, "left": -across}
+    sides = [side for side, tilt in farther.items() if tilt > np.radians(5)]
+    what = f"{sides[0]} side" if len(sides) == 1 else f"{' '.join(sides)} corner"
+    now = (
+        ""
+        if pose is None
+        else f" (now it is tilted by {np.degrees(np.arccos(np.clip(abs(pose[2, 2]), 0, 1))):.0f} deg)"
+    )
+    return f"tilt the target so that its {what} is farther, {size:.0f} deg{now}"
 
 
 def missing(state: State) -> list[str]:
@@ -249,59 +266,22 @@ def missing(state: State) -> list[str]:
             f"{100 * state.coverage.share:.0f} % of the image is covered, {100 * wanted.coverage:.0f} % are wanted: "
             f"most is missing at the {state.coverage.emptiest()}"
         )
-    level = [side for side, short in zip(_SIDES, _untilted(state, state.poses), strict=True) if short > 0]
+    level = [side for side, short in zip(_SIDES, _untilted(state), strict=True) if short > 0]
     if level:
         said.append(f"the target's {', '.join(level)} was never farther by {np.degrees(wanted.tilt_rad):.0f} deg")
     return said
-
-
-def _scaled(view: TargetView, pose: np.ndarray, camera: CameraModel, setting: Setting, sigma: float) -> np.ndarray:
-    return information_of(view.points_mm, view.pixels, pose, camera, setting.camera) / sigma**2
-
-
-def _sigma(solution: CameraSolution | None) -> float:
-    return _USUAL_SIGMA_PX if solution is None else max(solution.sigma_px, _LEAST_SIGMA_PX)
-
-
-def _intrinsics(setting: Setting) -> Intrinsics:
-    camera = setting.sensor.camera
-    return Intrinsics(setting.camera, width_px=camera.width_px, height_px=camera.height_px)
-
-
-def _prior(setting: Setting, camera: CameraModel) -> np.ndarray:
-    """Information (P, P) of the description."""
-    size = dict.fromkeys(_FOCAL, camera.fx_px) | {LensParameter.FY: camera.fy_px}
-    size |= {LensParameter.CX: camera.width_px, LensParameter.CY: camera.height_px}
-    stds = [_PRIOR[key] * size.get(key, 1.0) for key in _intrinsics(setting).keys]
-    return np.diag(np.array(stds) ** -2.0)
-
-
-def _angle(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.arccos(np.clip(one @ other, -1, 1)))
-
-
-def _tilt_words(across: float, down: float, pose: np.ndarray | None) -> str:
-    """Which side of the target shall be farther, and by how much."""
-    size = np.degrees(np.arccos(np.clip(1 / np.sqrt(1 + np.tan(across) ** 2 + np.tan(down) ** 2), -1, 1)))
-    if size < 5:
-        return "hold the target square to the camera"
-    sides = [word for value, word in ((down, "lower"), (-down, "upper")) if value > np.radians(5)]
-    sides += [word for value, word in ((across, "right"), (-across, "left")) if value > np.radians(5)]
-    what = f"{sides[0]} side" if len(sides) == 1 else f"{' '.join(sides)} corner"
-    now = ""
-    if pose is not None:
-        square = np.degrees(np.arccos(np.clip(abs(pose[2, 2]), 0, 1)))
-        now = f" (now it is tilted by {square:.0f} deg)"
-    return f"tilt the target so that its {what} is farther, {size:.0f} deg{now}"
 
 
 def missing_sheet(state: State) -> list[str]:
     """What the laser sheet still lacks; nothing as long as the camera is not known."""
     if state.solution is None:
         return []
-    shown = sum(len(pose.stripe) > 0 for pose in state.recorded)
+    target, stripes = state.setting.target, [pose.stripe for pose in state.recorded]
+    extent, margin = target.extent_mm, target.spacing_mm / 2
     try:
-        sheet_of(state.recorded, state.solution, state.setting)
+        points = points_on_target(state.camera, stripes, state.poses, extent_mm=extent, margin_mm=margin).points_mm
+        fit_sheet(points, nominal_normal=laser_pose(state.setting.sensor).normal)
     except CalibrationError as error:
+        shown = sum(len(stripe) > 0 for stripe in stripes)
         return [f"the laser line is on the target in {shown} of {len(state.recorded)} images: {error}"]
     return []

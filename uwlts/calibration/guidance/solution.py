@@ -7,12 +7,10 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
-from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.sheet import SheetSolution, fit_sheet, points_on_target
+from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError, RangeError
-from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.targets import Target, TargetView
 
@@ -39,6 +37,11 @@ class Setting:
     poses: Poses
     approaching: bool = True
     camera: CameraOptions = CameraOptions()
+
+    def intrinsics(self) -> Intrinsics:
+        """The camera parameters that are estimated."""
+        camera = self.sensor.camera
+        return Intrinsics(self.camera, width_px=camera.width_px, height_px=camera.height_px)
 
 
 def nominal_camera(setting: Setting) -> CameraModel:
@@ -82,34 +85,18 @@ def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tupl
     """Why the last image of ``after`` contradicts those before it, which ``before`` was solved from; empty if not."""
     if before is None:
         return ()
-    rms = after.image_rms_px()
-    usual = before.rms_px()
+    rms, usual = after.image_rms_px(), before.rms_px()
     limit = _CONTRADICTION * usual + _ALLOWANCE_PX
     # A wrong image pulls the others along, so they are looked at too.
     worst = max(float(rms[-1]), float(np.sqrt(np.mean(rms[:-1] ** 2))))
-    if worst <= limit:
-        return ()
-    return (
+    reason = (
         f"contradicts the others: with it the residual is {worst:.2f} px, without it {usual:.2f} px, at most "
-        f"{limit:.2f} px is plausible; did the target bend, the stage slip, the lens turn?",
+        f"{limit:.2f} px is plausible; did the target bend, the stage slip, the lens turn?"
     )
-
-
-def sheet_of(recorded: Sequence[RecordedPose], solution: CameraSolution, setting: Setting) -> SheetSolution:
-    """The laser sheet by the recorded stripes; CalibrationError where they do not determine it yet."""
-    target = setting.target
-    points = points_on_target(
-        solution.model,
-        [pose.stripe for pose in recorded],
-        solution.target_poses,
-        extent_mm=target.extent_mm,
-        margin_mm=target.spacing_mm / 2,
-    )
-    return fit_sheet(points.points_mm, nominal_normal=laser_pose(setting.sensor).normal)
+    return () if worst <= limit else (reason,)
 
 
 def without_window(sensor: Sensor) -> Sensor:
     """The sensor with its camera's window taken off."""
-    camera = sensor.camera
-    window = camera.window.model_copy(update={"mounted": False})
-    return sensor.model_copy(update={"camera": camera.model_copy(update={"window": window})})
+    window = sensor.camera.window.model_copy(update={"mounted": False})
+    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
