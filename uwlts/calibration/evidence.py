@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import ValidationError
 from uwlts.calibration.image_quality import why_not_found
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError
+from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
 from uwlts.stripe.recording import has_stripe
@@ -27,7 +28,7 @@ _STRIPE = StripeOptions()
 
 @dataclass(frozen=True, eq=False)
 class AirEvidence:
-    """What the captures in air show.
+    """Target points and stripes in the captures in air.
 
     Attributes
     ----------
@@ -83,7 +84,7 @@ def air_evidence(
                 view = targets[0].detect(image)
                 images.append(TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), number))
                 frames.append((number, frame))
-                stripes.append([])
+                stripes.append(np.empty((0, 2)))
             except (TargetError, CalibrationError) as error:
                 reason = why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
                 reasons[reason] += 1
@@ -93,7 +94,8 @@ def air_evidence(
         for frame, image in capture.frames(laser_on=True):
             here = np.flatnonzero(np.abs(positions - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
             if len(here):
-                _add_stripe(stripes[first + int(here[0])], capture, frame, image, stripe, warnings)
+                place, more = first + int(here[0]), _stripe_of(capture, frame, image, stripe, warnings)
+                stripes[place] = np.vstack([stripes[place], more])
             else:
                 warnings.append(
                     f"{capture.path.name}, frame {frame}: stripe left out, no target was found at "
@@ -104,9 +106,8 @@ def air_evidence(
         raise CalibrationError(
             f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
         )
-    joined = [np.vstack(pieces) if pieces else np.empty((0, 2)) for pieces in stripes]
-    no_stripe = "" if any(map(len, joined)) else no_stripe_in(captures)
-    return AirEvidence(targets[0], images, frames, joined, warnings, no_stripe)
+    no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
+    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe)
 
 
 def step_evidence(
@@ -130,15 +131,14 @@ def step_evidence(
         try:
             standard = StepStandard.model_validate(capture.header.artefact)
         except ValidationError as error:
-            details = "; ".join(f"{'.'.join(map(str, p['loc'])) or 'artefact'}: {p['msg']}" for p in error.errors())
-            raise DescriptionError(f"{capture.path.name} does not describe its step standard: {details}") from error
+            problems = problems_of(error).removeprefix(": ")
+            raise DescriptionError(f"{capture.path.name} does not describe its step standard: {problems}") from error
         wavelength = capture.header.sensor.laser.wavelength_nm
         index = capture.header.medium.refractive_index(wavelength) if medium_index is None else medium_index
         for frame, image in capture.frames(laser_on=True):
-            pieces: list[np.ndarray] = []
-            _add_stripe(pieces, capture, frame, image, stripe, warnings)
-            if pieces:
-                found.append(StepEvidence(pieces[0], standard, index, f"{capture.path.name}, frame {frame}"))
+            pixels = _stripe_of(capture, frame, image, stripe, warnings)
+            if len(pixels):
+                found.append(StepEvidence(pixels, standard, index, f"{capture.path.name}, frame {frame}"))
             done = _report(progress, "step", done, total)
     return found, warnings
 
@@ -164,11 +164,13 @@ def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter
     """Why none of the images shows the target; ``reasons`` count what was wrong with those with the laser off."""
     if not any(map(len, captures)):
         return "there are no images in it"
-    if any(_shows(image, target) for capture in captures for image in _lit(capture, 3)):
-        return (
-            "images marked as taken with the laser on show it instead: lamp and laser images are exchanged, or none is "
-            "marked as a lamp image"
-        )
+    for image in [image for capture in captures for image in _lit(capture, 3)]:
+        with suppress(TargetError, CalibrationError):
+            target.detect(image)
+            return (
+                "images marked as taken with the laser on show it instead: lamp and laser images are exchanged, or "
+                "none is marked as a lamp image"
+            )
     count = reasons.total()
     if not count:
         return "all of them were taken with the laser on; take one under the lamp at every position too"
@@ -182,35 +184,20 @@ def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
         yield capture.image(int(lit[place]))
 
 
-def _shows(image: np.ndarray, target: Target) -> bool:
-    try:
-        target.detect(image)
-    except (TargetError, CalibrationError):
-        return False
-    return True
-
-
-def _add_stripe(
-    pieces: list[np.ndarray],
-    capture: Capture,
-    frame: int,
-    image: np.ndarray,
-    options: StripeOptions,
-    warnings: list[str],
-) -> None:
+def _stripe_of(
+    capture: Capture, frame: int, image: np.ndarray, options: StripeOptions, warnings: list[str]
+) -> np.ndarray:
+    """Stripe pixels (N, 2) of an image; none, and a warning, if it shows no stripe of use."""
     along, clip = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     try:
         pixels = extract_stripe(image, stripe_along=along, options=options, saturation=clip).pixels()
+        if len(pixels) >= _FEWEST_LINES:
+            return pixels
+        reason = f"found on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
     except ImageError as error:
-        warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {error}")
-        return
-    if len(pixels) < _FEWEST_LINES:
-        warnings.append(
-            f"{capture.path.name}, frame {frame}: stripe left out, found on {len(pixels)} lines only, at least "
-            f"{_FEWEST_LINES} are of use"
-        )
-    else:
-        pieces.append(pixels)
+        reason = str(error)
+    warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {reason}")
+    return np.empty((0, 2))
 
 
 def _report(progress: Progress | None, name: str, done: int, total: int) -> int:

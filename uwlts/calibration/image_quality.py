@@ -58,7 +58,7 @@ class QualityLimits:
 
 @dataclass(frozen=True)
 class TargetQuality:
-    """How good an image of the target is; ``reasons`` are why it is refused, empty if it is not.
+    """Quality of an image of the target; ``reasons`` are why it is refused, empty if it is not.
 
     ``points`` is how many were found, ``share`` of how many the target has, ``blur_px`` the edges' Gaussian blur,
     ``contrast`` and ``saturated`` are shares of the full scale and of the target's pixels.
@@ -74,7 +74,7 @@ class TargetQuality:
 
 @dataclass(frozen=True, eq=False)
 class StripeQuality:
-    """How good a laser image is: stripe pixels (N, 2) on the target, the share of them saturated, and the reasons."""
+    """Quality of a laser image: stripe pixels (N, 2) on the target, the share of them saturated, and the reasons."""
 
     pixels: np.ndarray
     saturated: float
@@ -89,40 +89,31 @@ class StripeQuality:
 def judge_target(
     image: np.ndarray, view: TargetView, target: Target, *, full_dn: int, limits: QualityLimits = QualityLimits()
 ) -> TargetQuality:
-    """How good an image (H, W) is in which the target was found.
-
-    Parameters
-    ----------
-    full_dn : grey value at which pixels clip
-    """
+    """Quality of an image (H, W) in which the target was found; pixels clip at the grey value ``full_dn``."""
     count, of_all = len(view.pixels), len(target.indices)
     share = count / of_all
     blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
     contrast = float(np.median(view.quality["contrast"])) / full_dn
-    saturated = _saturated(image, view.pixels, full_dn)
-    reasons = []
-    if count < min(limits.fewest_points, of_all) or share < limits.smallest_share:
-        reasons.append(f"partial: {count} of {of_all} points found; bring more of the target into the image")
-    if blur > limits.largest_blur_px:
-        reasons.append(
-            f"blurred: edges are {blur:.1f} px wide, at most {limits.largest_blur_px:g} are good; focus, or change "
-            "the distance"
-        )
-    if contrast < limits.smallest_contrast:
-        reasons.append(
-            LampFault(
-                f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
-                f"{100 * limits.smallest_contrast:.0f} % are good; more light or a longer lamp_ms"
-            )
-        )
-    if saturated > limits.largest_saturated:
-        reasons.append(
-            LampFault(
-                f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
-                f"{100 * limits.largest_saturated:.0f} % are good; less light or a shorter lamp_ms"
-            )
-        )
-    return TargetQuality(count, share, blur, contrast, saturated, tuple(reasons))
+    covered = np.zeros(image.shape, np.uint8)
+    cv2.fillConvexPoly(covered, np.rint(_hull(view.pixels)).astype(np.int32), 1)
+    saturated = float(np.mean(image[covered > 0] >= full_dn))
+    reasons = {
+        f"partial: {count} of {of_all} points found; bring more of the target into the image": (
+            count < min(limits.fewest_points, of_all) or share < limits.smallest_share
+        ),
+        f"blurred: edges are {blur:.1f} px wide, at most {limits.largest_blur_px:g} are good; focus, or change the "
+        "distance": blur > limits.largest_blur_px,
+        LampFault(
+            f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
+            f"{100 * limits.smallest_contrast:.0f} % are good; more light or a longer lamp_ms"
+        ): contrast < limits.smallest_contrast,
+        LampFault(
+            f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
+            f"{100 * limits.largest_saturated:.0f} % are good; less light or a shorter lamp_ms"
+        ): saturated > limits.largest_saturated,
+    }
+    refused = tuple(reason for reason, applies in reasons.items() if applies)
+    return TargetQuality(count, share, blur, contrast, saturated, refused)
 
 
 def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> float:
@@ -147,13 +138,11 @@ def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
     brightest = float(np.quantile(image, 0.995)) / full_dn
     clipped = float(np.mean(image >= full_dn))
     if brightest < 0.1:
-        return LampFault(
-            f"too dark: the image reaches {100 * brightest:.0f} % of the full scale; more light or a longer lamp_ms"
-        )
+        reached = f"the image reaches {100 * brightest:.0f} % of the full scale"
+        return LampFault(f"too dark: {reached}; more light or a longer lamp_ms")
     if clipped > 0.3:
-        return LampFault(
-            f"saturated: {100 * clipped:.0f} % of the image is at the full scale; less light or a shorter lamp_ms"
-        )
+        filled = f"{100 * clipped:.0f} % of the image is at the full scale"
+        return LampFault(f"saturated: {filled}; less light or a shorter lamp_ms")
     return error
 
 
@@ -172,11 +161,9 @@ def way_px(one: TargetView, other: TargetView) -> float:
 
 def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = QualityLimits()) -> tuple[str, ...]:
     """Why two images of one pose do not belong together; empty if they do."""
-    way = way_px(before, after)
-    if way <= limits.largest_motion_px:
-        return ()
-    most = limits.largest_motion_px
-    return (MotionFault(f"moved: the target went {way:.1f} px between its images, at most {most:g} are good"),)
+    way, most = way_px(before, after), limits.largest_motion_px
+    reason = MotionFault(f"moved: the target went {way:.1f} px between its images, at most {most:g} are good")
+    return () if way <= most else (reason,)
 
 
 def judge_novelty(
@@ -199,7 +186,7 @@ def judge_stripe(
     options: StripeOptions = _STRIPE,
     limits: QualityLimits = QualityLimits(),
 ) -> StripeQuality:
-    """How good a laser image (H, W) is, taken at the pose in which the lamp showed the target in ``view``.
+    """Quality of a laser image (H, W), taken at the pose in which the lamp showed the target in ``view``.
 
     A stripe that misses the target is no fault of the image: then there are no lines, and no reasons.
     """
@@ -207,25 +194,17 @@ def judge_stripe(
         stripe = extract_stripe(image, stripe_along=stripe_along, options=options, saturation=full_dn)
     except ImageError as error:
         return StripeQuality(np.empty((0, 2)), 0.0, (str(error),))
+    found, pixels = stripe.status == StripeStatus.OK, stripe.pixels()
+    outline = _hull(view.pixels, margin_px=_spacing_px(view, target)).astype(np.float32)
+    on_target = [cv2.pointPolygonTest(outline, (float(u), float(v)), False) >= 0 for u, v in pixels]
     brightest = image.max(axis=0 if stripe_along == "width" else 1)
-    found = stripe.status == StripeStatus.OK
-    pixels = stripe.pixels()
-    on_target = _within(pixels, _hull(view.pixels, margin_px=_spacing_px(view, target)))
     clipped = (brightest >= full_dn) & (found | (stripe.status == StripeStatus.SATURATED))
     lit = max(int(found.sum()), int(clipped.sum()), 1)
-    saturated = float(clipped.sum()) / lit
-    reasons = ()
+    saturated, reasons = float(clipped.sum()) / lit, ()
     if lit >= limits.fewest_lines and saturated > 0.05:
         share = f"{100 * saturated:.0f} % of its lines, at most 5 % are good"
         reasons = (LaserFault(f"stripe saturated on {share}; shorten laser_ms"),)
-    return StripeQuality(pixels[on_target], saturated, reasons)
-
-
-def _saturated(image: np.ndarray, pixels: np.ndarray, full_dn: int) -> float:
-    """Share of the pixels within the points' hull that are at the full scale."""
-    mask = np.zeros(image.shape, np.uint8)
-    cv2.fillConvexPoly(mask, np.rint(_hull(pixels)).astype(np.int32), 1)
-    return float(np.mean(image[mask > 0] >= full_dn))
+    return StripeQuality(pixels[np.array(on_target, dtype=bool)], saturated, reasons)
 
 
 def _hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
@@ -233,12 +212,6 @@ def _hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
     hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
     outward = hull - hull.mean(axis=0)
     return hull + margin_px * outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-
-
-def _within(pixels: np.ndarray, hull: np.ndarray) -> np.ndarray:
-    """Which (N,) of the pixels (N, 2) lie in a convex polygon (K, 2)."""
-    outline = hull.astype(np.float32)
-    return np.array([cv2.pointPolygonTest(outline, (float(u), float(v)), False) >= 0 for u, v in pixels], dtype=bool)
 
 
 def _spacing_px(view: TargetView, target: Target) -> float:

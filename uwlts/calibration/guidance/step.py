@@ -25,11 +25,7 @@ _STRIPE = StripeOptions()
 
 @dataclass(frozen=True, eq=False)
 class StepQuality:
-    """What a laser image shows of the step standard.
-
-    ``pixels`` (N, 2) are the stripe's, ``depth_mm`` is how far outside the window it is seen, by the nominal window,
-    ``reasons`` are why the image is refused.
-    """
+    """Stripe pixels (N, 2) on the step standard, their depth outside the nominal window, and reasons to refuse it."""
 
     pixels: np.ndarray
     depth_mm: float | None
@@ -52,8 +48,7 @@ def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
     """Those of the depths that are far from each other."""
     chosen: list[float] = []
     for depth in seen_mm:
-        if is_new(depth, chosen, sensor):
-            chosen.append(depth)
+        chosen += [depth] if is_new(depth, chosen, sensor) else []
     return chosen
 
 
@@ -77,29 +72,27 @@ def judge_step(
     full_dn: int,
     options: StripeOptions = _STRIPE,
 ) -> StepQuality:
-    """How good a laser image (H, W) of the step standard is, by a calibration in air and the nominal window."""
+    """Quality of a laser image (H, W) of the step standard, by a calibration in air and the nominal window."""
     along = calibration.stripe_along
     try:
         stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)
     except ImageError as error:
         return StepQuality(np.empty((0, 2)), None, (str(error),))
-    pixels = stripe.pixels()
+    pixels, reasons = stripe.pixels(), []
     if len(pixels) < _FEWEST_LINES:
         reason = f"the laser line is seen on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
         return StepQuality(pixels, None, (f"{reason}; is the laser lit, the standard in the sheet?",))
-    reasons = []
     clipped = (image.max(axis=0 if along == "width" else 1) >= full_dn) & (stripe.status != StripeStatus.NO_STRIPE)
     saturated = float(clipped.sum()) / len(pixels)
     if saturated > _MOST_SATURATED:
         reasons.append(LaserFault(f"stripe saturated on {100 * saturated:.0f} % of its lines; shorten laser_ms"))
-    evidence = StepEvidence(pixels, standard, medium_index, "this image")
     try:
-        label_step(calibration, window, evidence)
+        label_step(calibration, window, StepEvidence(pixels, standard, medium_index, "this image"))
     except EvaluationError as error:
         reasons.append(f"no step: {error}")
     placed = calibration.model_copy(update={"window": window})
     depths = points_on_sheet(placed, pixels, medium_index=medium_index).points_camera_mm[:, 2]
-    seen = depths[np.isfinite(depths)]
-    if not len(seen):
+    if not np.isfinite(depths).any():
         return StepQuality(pixels, None, (*reasons, "the laser line does not lie on the sheet"))
-    return StepQuality(pixels, float(np.median(seen)) - window.distance_mm - window.thickness_mm, tuple(reasons))
+    depth = float(np.median(depths[np.isfinite(depths)])) - window.distance_mm - window.thickness_mm
+    return StepQuality(pixels, depth, tuple(reasons))
