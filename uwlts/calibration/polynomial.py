@@ -24,10 +24,8 @@ from uwlts.stripe import StripeOptions
 
 MOST_SMOOTH = 8
 """Degree of the coefficients over the lines."""
-# A degree over the lines needs several lines of its own.
-_LINES_PER_DEGREE = 10
-# Smallest singular value over the largest one: a full view has 0.1, one cut to a triangle some thousandths.
-_DETERMINED = 1e-6
+_LINES_PER_DEGREE = 10  # a degree over the lines needs several lines of its own
+_DETERMINED = 1e-6  # smallest singular value over the largest: a full view has 0.1, one cut to a triangle thousandths
 _OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
 # Outliers may return for so many rounds, then they stay out, so that the rounds end.
 _ROUNDS, _RETURNING_ROUNDS = 20, 10
@@ -60,15 +58,9 @@ class LinePolynomials:
 def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, degree: int) -> LinePolynomials:
     """Polynomials y(x) of all lines by least squares, their coefficients themselves polynomials of the line's number.
 
-    The model is the sum over i, j of ``a_ij P_i(line) P_j(x)`` with Legendre polynomials P on the scaled ranges of the
-    lines and of x, j up to ``degree`` and i up to `MOST_SMOOTH`. Data off by more than five robust standard deviations
-    are left out, and the fit repeated until nothing changes.
-
-    Parameters
-    ----------
-    lines : (N,) int
-    x, y : (N,)
-    degree : of each line's polynomial
+    From lines (N,), x and y (N,). The model is the sum over i, j of ``a_ij P_i(line) P_j(x)`` with Legendre polynomials
+    P on the scaled ranges of the lines and of x, j up to ``degree`` and i up to `MOST_SMOOTH`. Data off by more than
+    five robust standard deviations are left out, and the fit repeated until nothing changes.
 
     Raises CalibrationError: the data do not determine the polynomials.
     """
@@ -116,14 +108,9 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
 def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *, largest_gap: int) -> np.ndarray:
     """Range (L, 2) of the stripe positions that each line has seen, from the first to the last line with data.
 
-    At each pose lines without a centre borrow one from their neighbours on both sides, by interpolation, unless more
-    than ``largest_gap`` lines in succession have none. Lines that have seen nothing get NaN.
-
-    Parameters
-    ----------
-    lines : (N,) int
-    pose : (N,) int; number of the image of each stripe point
-    centres_px : (N,); stripe centre on the line
+    The stripe points have lines (N,), numbers (N,) of their images and centres (N,) on the line. At each pose lines
+    without a centre borrow one from their neighbours on both sides, by interpolation, unless more than ``largest_gap``
+    lines in succession have none. Lines that have seen nothing get NaN.
     """
     first, count = int(lines.min()), int(np.ptp(lines)) + 1
     domains = np.tile([np.inf, -np.inf], (count, 1))
@@ -143,10 +130,10 @@ def _scaled(x: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 _LARGEST_REJECTED = 0.2  # outliers are few; more contradict the positions or the target
-# Share of the lines that may lack a centre in succession and still borrow their range from both sides.
-_LARGEST_GAP = 0.1
-# The map should be good to two thousandths of the circles' spacing; twice that is reported.
-_LARGEST_MAP_SHARE = 0.004
+_LARGEST_GAP = (
+    0.1  # share of the lines that may lack a centre in succession and still borrow their range from both sides
+)
+_LARGEST_MAP_SHARE = 0.004  # the map should be good to two thousandths of the circles' spacing; twice that is reported
 _LARGEST_LINE_EXCESS = 1.5  # 1 by chance, within a few percent for thousands of points
 
 
@@ -229,19 +216,20 @@ def fit_polynomials(
             f"{100 * rejected:.0f} % of the stripe points do not lie on the polynomials of the others: check the stage "
             "positions, and that the stripe falls on the target"
         )
-    gap = int(_LARGEST_GAP * header.sensor.camera.lines())
+    sensor, camera = header.sensor, header.sensor.camera
+    gap = int(_LARGEST_GAP * camera.lines())
     domains = line_domains(stripes.lines[kept], stripes.pose[kept], stripes.centres_px[kept], largest_gap=gap)
     first = int(stripes.lines[kept].min())
     rows = [slice(first - fit.first_line, first - fit.first_line + len(domains)) for fit in (depth, along)]
     calibration = PolynomialCalibration(
-        sensor_name=header.sensor.name,
-        stripe_along=header.sensor.camera.stripe_along,
-        wavelength_nm=header.sensor.laser.wavelength_nm,
+        sensor_name=sensor.name,
+        stripe_along=camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
         medium_name=header.medium_name,
         medium=header.medium,
-        window_mounted=header.sensor.camera.window.mounted,
-        width_px=header.sensor.camera.width_px,
-        height_px=header.sensor.camera.height_px,
+        window_mounted=camera.window.mounted,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
         degree=degree,
         first_line=first,
         position_range_px=depth.range,
@@ -250,22 +238,34 @@ def fit_polynomials(
         depth_coefficients=tuple(map(tuple, depth.coefficients[rows[0]].tolist())),
         along_coefficients=tuple(map(tuple, along.coefficients[rows[1]].tolist())),
     )
-    map_rms_mm = float(np.sqrt(np.mean(np.concatenate([m.to_plate.residuals for m in maps]) ** 2) * 2))
-    excess = _line_excess(depth, stripes.lines)
+    map_rms_mm = float(np.sqrt(np.mean(np.concatenate([m.residuals for m in maps]) ** 2) * 2))
+    used, lines = depth.used, stripes.lines
+    excess, along_excess = _line_excess(depth, lines), _line_excess(along, lines[used])
+    poses, stripe_points = np.unique(stripes.pose, return_counts=True)
     figures = {
         "poses": {
-            "stage_mm": [evidence.images[pose].stage_mm for pose in np.unique(stripes.pose).tolist()],
-            "stripe_points": np.unique(stripes.pose, return_counts=True)[1].tolist(),
+            "stage_mm": [evidence.images[pose].stage_mm for pose in poses.tolist()],
+            "stripe_points": stripe_points.tolist(),
         },
         "map": {
             "rms_mm": map_rms_mm,
             "largest_image_rms_mm": max(m.rms_mm() for m in maps),
-            "points": sum(len(m.to_plate.residuals) for m in maps),
+            "points": sum(len(m.residuals) for m in maps),
         },
         "depth": _fit_figures(depth, excess, stripes.pose),
-        "along": _fit_figures(along, _line_excess(along, stripes.lines[depth.used]), stripes.pose[depth.used]),
+        "along": _fit_figures(along, along_excess, stripes.pose[used]),
     }
-    warnings += _fit_warnings(map_rms_mm, excess, evidence)
+    largest = _LARGEST_MAP_SHARE * evidence.target.spacing_mm
+    if map_rms_mm > largest:
+        warnings.append(
+            f"the target's points scatter by {map_rms_mm:.3f} mm about a smooth map of its plane; "
+            f"expected less than {largest:.3f} mm: is the target flat, sharp and described rightly?"
+        )
+    if excess > _LARGEST_LINE_EXCESS:
+        warnings.append(
+            f"residuals of the same line go together, {excess:.1f} times as much as chance would have it: the laser "
+            "line has a shape that is too fine for polynomials smooth over the lines"
+        )
     provenance = {"source": "polynomials from captures", "captures": list(sources), "warnings": warnings}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
     return PolynomialResult(calibration, stripes, maps, depth, along, warnings)
@@ -292,19 +292,3 @@ def _fit_figures(fit: LinePolynomials, excess: float, pose: np.ndarray) -> dict[
         "line_excess": excess,
         "pose_means_mm": (np.bincount(image, left[used]) / points).tolist(),
     }
-
-
-def _fit_warnings(map_rms_mm: float, excess: float, evidence: AirEvidence) -> list[str]:
-    warnings = []
-    largest = _LARGEST_MAP_SHARE * evidence.target.spacing_mm
-    if map_rms_mm > largest:
-        warnings.append(
-            f"the target's points scatter by {map_rms_mm:.3f} mm about a smooth map of its plane; "
-            f"expected less than {largest:.3f} mm: is the target flat, sharp and described rightly?"
-        )
-    if excess > _LARGEST_LINE_EXCESS:
-        warnings.append(
-            f"residuals of the same line go together, {excess:.1f} times as much as chance would have it: the laser "
-            "line has a shape that is too fine for polynomials smooth over the lines"
-        )
-    return warnings

@@ -57,39 +57,29 @@ class SmoothMap:
 
 
 @dataclass(frozen=True, eq=False)
-class PlateMap:
-    """Map from pixels to the plane of the target (plate).
+class PlateMap(SmoothMap):
+    """Map from pixels to the plane of the target (plate) in mm, fitted to the target's points.
 
-    Attributes
-    ----------
-    to_plate : from pixels to plate coordinates in mm; its residuals are those of the target's points
-    hull : (K, 3); sides of the points' convex hull on the plate: outward normal and offset in mm
+    ``hull`` (K, 3) are the sides of the points' convex hull on the plate: outward normal and offset in mm.
     """
 
-    to_plate: SmoothMap
     hull: np.ndarray
-
-    def __call__(self, pixels: np.ndarray) -> np.ndarray:
-        """Plate coordinates (M, 2) in mm of pixels (M, 2)."""
-        return self.to_plate(pixels)
 
     def beyond_mm(self, pixels: np.ndarray) -> np.ndarray:
         """How far (M,) outside the hull of the target's points pixels (M, 2) look, in mm; negative inside."""
-        return np.max(self.to_plate.coarsely(pixels) @ self.hull[:, :2].T + self.hull[:, 2], axis=1)
+        return np.max(self.coarsely(pixels) @ self.hull[:, :2].T + self.hull[:, 2], axis=1)
 
     def rms_mm(self) -> float:
         """Root mean square length of the residuals."""
-        return float(np.sqrt(np.mean(np.sum(self.to_plate.residuals**2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
 
 
 def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None) -> PlateMap:
     """Map from pixels to the plate through the points of one image.
 
-    Parameters
-    ----------
-    circle_diameter_mm : the points are circles of this diameter and their pixels the centres of their images. The
-        offsets from the images of their centres are taken out by the map itself: refraction that stretches the image
-        outwards shifts the centres as much as perspective does.
+    Where the points are circles of a diameter, their pixels are centres of the circles' images; the offsets from the
+    images of their centres are taken out by the map itself: refraction that stretches the image outwards shifts the
+    centres as much as perspective does.
 
     Raises
     ------
@@ -104,7 +94,7 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
         pixels = pixels - circle_centre_bias(
             lambda rim: to_image(rim[:, :2]), points, diameter_mm=circle_diameter_mm, axis_u=_X, axis_v=_Y
         )
-    return PlateMap(fit_smooth_map(pixels, points[:, :2]), ConvexHull(points[:, :2]).equations)
+    return PlateMap(**vars(fit_smooth_map(pixels, points[:, :2])), hull=ConvexHull(points[:, :2]).equations)
 
 
 def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
@@ -112,16 +102,17 @@ def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
 
     Raises CalibrationError: there are too few points, or they determine no homography.
     """
-    degrees = [d for d in range(_LOWEST_DEGREE, _HIGHEST_DEGREE + 1) if _POINTS_PER_TERM * _count(d) <= len(start)]
-    if not degrees:
+    counts = {d: (d + 1) * (d + 2) // 2 for d in range(_LOWEST_DEGREE, _HIGHEST_DEGREE + 1)}
+    degree = max((d for d, count in counts.items() if _POINTS_PER_TERM * count <= len(start)), default=None)
+    if degree is None:
         raise CalibrationError(
-            f"only {len(start)} points of the target are seen; at least {_POINTS_PER_TERM * _count(_LOWEST_DEGREE)} "
+            f"only {len(start)} points of the target are seen; at least {_POINTS_PER_TERM * counts[_LOWEST_DEGREE]} "
             "are needed to find where on the target the stripe lies"
         )
     found = cv2.findHomography(np.ascontiguousarray(start), np.ascontiguousarray(end), method=0)[0]
     if found is None or not np.isfinite(found).all():
         raise CalibrationError(f"the {len(start)} points of the target determine no homography of image and target")
-    low, high, degree = start.min(axis=0), start.max(axis=0), degrees[-1]
+    low, high = start.min(axis=0), start.max(axis=0)
     left, terms = end - _project(found, start), _terms(start, low, high, degree)
     coefficients = np.linalg.lstsq(terms, left, rcond=None)[0]
     return SmoothMap(found, low, high, degree, coefficients, left - terms @ coefficients)
@@ -130,11 +121,6 @@ def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
 def _project(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
     mapped = np.column_stack([points, np.ones(len(points))]) @ homography.T
     return mapped[:, :2] / mapped[:, 2:]
-
-
-def _count(degree: int) -> int:
-    """Number of terms of a polynomial in two variables of a total degree."""
-    return (degree + 1) * (degree + 2) // 2
 
 
 def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -> np.ndarray:
@@ -146,10 +132,8 @@ def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -
 
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
-# Cosine of the angle between the stage's direction and the laser's axis.
-_ALONG_Z = 0.9
-# Stripe points about the camera's axis on which the origin of the OCS rests.
-_ORIGIN_POINTS = 100
+_ALONG_Z = 0.9  # cosine of the angle between the stage's direction and the laser's axis
+_ORIGIN_POINTS = 100  # stripe points about the camera's axis on which the origin of the OCS rests
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +143,9 @@ class PlateStripes:
     Attributes
     ----------
     pixels : (N, 2)
-    lines : (N,) int; profile line of each point
-    centres_px : (N,); stripe centre on the line
+    lines, centres_px : (N,); profile line of each point (int), and the stripe's centre on it
     plate_mm : (N, 2); place on the plate, in the target's frame
-    pose : (N,) int; number of the image
-    stage_mm : (N,)
+    pose, stage_mm : (N,); number of the image (int), and where the stage stood
     """
 
     pixels: np.ndarray
@@ -215,17 +197,10 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
 def stripes_on_plate(
     evidence: AirEvidence, header: CaptureHeader, degree: int
 ) -> tuple[PlateStripes, list[PlateMap], list[str]]:
-    """Stripe points that fall on the plate among or next to the target's points seen at the same position.
+    """Stripe points on the plate among or next to the target's points in the same image, the maps, and warnings.
 
     A point counts up to one spacing outside the hull of the target's points in the image, and up to half of one outside
-    the pattern.
-
-    Returns
-    -------
-    stripes : PlateStripes
-    maps : list of PlateMap
-        Of the images that have such points.
-    warnings : list of str
+    the pattern. Images without such points have no map.
 
     Raises CalibrationError: there are fewer positions than a polynomial of this degree has coefficients.
     """
@@ -259,15 +234,15 @@ def stripes_on_plate(
             f"target and stripe were found together at {different} stage positions; polynomials of degree {degree} "
             f"need at least {degree + 1}, better twice as many: {'; '.join([*evidence.warnings, *warnings][:3])}"
         )
-    pixels = np.vstack([part[0] for part in parts])
-    counts = [len(part[0]) for part in parts]
+    each_pixels, each_plate, numbers, stage_mm = zip(*parts, strict=True)
+    pixels, counts = np.vstack(each_pixels), [len(part) for part in each_pixels]
     stripes = PlateStripes(
         pixels=pixels,
         lines=np.rint(pixels[:, along]).astype(int),
         centres_px=pixels[:, 1 - along],
-        plate_mm=np.vstack([part[1] for part in parts]),
-        pose=np.repeat([part[2] for part in parts], counts),
-        stage_mm=np.repeat([part[3] for part in parts], counts),
+        plate_mm=np.vstack(each_plate),
+        pose=np.repeat(numbers, counts),
+        stage_mm=np.repeat(stage_mm, counts),
     )
     return stripes, maps, warnings
 
@@ -282,7 +257,9 @@ def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np
     camera = header.sensor.camera
     direction = np.array(header.stage_direction)
     depth = -direction[2] * stripes.stage_mm
-    centred = stripes.plate_mm - _pose_means(stripes.plate_mm, stripes.pose)
+    _, number, count = np.unique(stripes.pose, return_inverse=True, return_counts=True)
+    means = np.column_stack([np.bincount(number, column) / count for column in stripes.plate_mm.T])
+    centred = stripes.plate_mm - means[number]
     along_stripe = np.linalg.svd(centred, full_matrices=False)[2][0]
     along = stripes.plate_mm @ along_stripe
     with_lines = np.sum(centred @ along_stripe * (stripes.lines - stripes.lines.mean()))
@@ -301,7 +278,8 @@ def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np
             "stripe_along"
         )
     _, along_nominal, depth_nominal = seen.points_mm[known].T
-    if np.sum((depth_nominal - np.median(depth_nominal)) * (depth[known] - np.median(depth[known]))) <= 0:
+    nominal_motion, motion = (values - np.median(values) for values in (depth_nominal, depth[known]))
+    if np.sum(nominal_motion * motion) <= 0:
         raise CalibrationError(
             "the stripe moves through the image the other way than the stage's positions say: check the sign of the "
             f"captures' stage_direction, {header.stage_direction}, on which side the laser stands, and that the images "
@@ -309,14 +287,5 @@ def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np
         )
     from_axis = np.hypot(*(stripes.pixels[known] - camera.principal_point()).T)
     middle = np.argsort(from_axis, kind="stable")[:_ORIGIN_POINTS]
-    depth = depth + np.median(depth_nominal[middle] - depth[known][middle])
-    along = along + np.median(along_nominal[middle] - along[known][middle])
-    return depth, along
-
-
-def _pose_means(values: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Mean (N, K) over the points of the same pose of values (N, K)."""
-    _, number, count = np.unique(pose, return_inverse=True, return_counts=True)
-    sums = np.zeros((len(count), values.shape[1]))
-    np.add.at(sums, number, values)
-    return (sums / count[:, None])[number]
+    depth_shift = np.median(depth_nominal[middle] - depth[known][middle])
+    return depth + depth_shift, along + np.median(along_nominal[middle] - along[known][middle])
