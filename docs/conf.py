@@ -5,8 +5,6 @@ import shutil
 from importlib.metadata import version as version_of
 from pathlib import Path
 
-# While autodoc imports modules, pydantic does not resolve the annotations of models that keep unknown keys.
-import uwlts.model.joint_estimate  # noqa: F401
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 

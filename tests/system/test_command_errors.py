@@ -403,6 +403,15 @@ def test_info_on_damaged_json(fails, folder: Path, tmp_path: Path):
         fails("uwlts", "info", path, says="a.json")
 
 
+def test_damaged_residuals_are_refused_by_every_command(fails, folder: Path, tmp_path: Path):
+    content = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+    path, cloud = tmp_path / "calibration.json", tmp_path / "x.ply"
+    for residuals in ({"camera": "good"}, {"camera": {"rms_px": "good"}}):
+        path.write_text(json.dumps(content | {"residuals": residuals}), encoding="utf-8")
+        fails("uwlts", "report", tmp_path, says="calibration.json is not a valid calibration: residuals.camera")
+        fails("uwlts", "reconstruct", folder / "scan.h5", "--calibration", path, "--out", cloud, says="residuals.camera")
+
+
 def test_cloud_without_points(command, tmp_path: Path):
     empty = PointCloud(np.empty((0, 3)), np.empty(0), np.empty(0), np.empty(0), metadata={"sensor": "small"})
     write_cloud(tmp_path / "a.ply", empty)

@@ -1,15 +1,37 @@
 """The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
 
-import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, JsonValue, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import AfterValidator, Field, JsonValue, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from uwlts.model.joint_estimate import JointEstimate, Origin, joint_estimate_in
-from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Vector, Window
+from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, UnitVector, Vector, Window
 
-Matrix4 = tuple[tuple[float, float, float, float], ...]
+_Rows = tuple[tuple[float, float, float, float], ...]
+
+
+def _rigid(matrix: _Rows) -> _Rows:
+    """A matrix (4, 4) that is a rotation, not a reflection, and a shift, to 1e-6, as text may be rounded."""
+    if len(matrix) == 4:
+        rotation = np.array(matrix)[:3, :3]
+        square = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
+        if square and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
+            return matrix
+    raise ValueError("must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
+
+
+def _with_numbers(figures: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    """Figures of a step of which those that commands print and plot, where they are given, are numbers."""
+    for name in ("rms_px", "rms_mm", "max_mm", "std_mm"):
+        if not isinstance(value := figures.get(name), int | float | None):
+            raise ValueError(f"{name} is {value!r}; expected a number")
+    return figures
+
+
+RigidTransform = Annotated[_Rows, AfterValidator(_rigid)]
+Residuals = dict[str, Annotated[dict[str, JsonValue], AfterValidator(_with_numbers)]]
+"""Named figures of each step of a calibration."""
 
 
 class CameraModel(Description):
@@ -57,7 +79,7 @@ class WindowModel(Description):
 
     refractions: Literal[1, 2]
     distance_mm: Positive
-    normal: Vector = (0.0, 0.0, 1.0)
+    normal: UnitVector = (0.0, 0.0, 1.0)
     thickness_mm: Annotated[float, Field(ge=0)] = 0.0
     glass_index: Annotated[float, Field(ge=1, lt=4)] = 1.0
 
@@ -85,7 +107,7 @@ class FanModel(Description):
     """
 
     apex_mm: Vector
-    axis: Vector
+    axis: UnitVector
     pivot_mm: Vector
     bow_rad: float = 0.0
     window_turn_rad: float = 0.0
@@ -97,7 +119,7 @@ class SheetModel(Description):
     Without a ``fan`` it is that plane in every medium; `uwlts.optics.sheet` says what it is with one.
     """
 
-    normal: Vector
+    normal: UnitVector
     offset_mm: float
     fan: FanModel | None = None
 
@@ -136,16 +158,16 @@ class Calibration(Description):
     camera: CameraModel
     window: WindowModel | None
     sheet: SheetModel
-    camera_from_object: Matrix4
+    camera_from_object: RigidTransform
     media: tuple[KnownMedium, ...] = ()
     stages: tuple[KnownStage, ...] = ()
-    residuals: dict[str, JsonValue] = {}
+    residuals: Residuals = {}
     provenance: dict[str, JsonValue] = {}
     joint: JointEstimate | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _from_file(cls, content: Any) -> Any:
+    def _from_file(cls, content: object) -> object:
         residuals = content.get("residuals") if isinstance(content, dict) else None
         if not (isinstance(residuals, dict) and "joint" in residuals):
             return content
@@ -158,22 +180,10 @@ class Calibration(Description):
         del content["joint"]
         return content
 
-    @model_validator(mode="after")
-    def _consistent(self) -> "Calibration":
-        if not _is_rigid(self.camera_from_object):
-            raise ValueError("camera_from_object must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
-        _require_unit(self.sheet.normal, "the sheet's normal")
-        if self.sheet.fan is not None:
-            _require_unit(self.sheet.fan.axis, "the axis of the fan")
-        if self.window is not None:
-            _require_unit(self.window.normal, "the window's normal")
-        require_plain_json(self.residuals, self.provenance)
-        return self
-
     def residuals_in_file(self) -> dict[str, JsonValue]:
         """The residuals as files have them, the joint estimate among them as plain JSON."""
         if self.joint is None:
-            return self.residuals
+            return {**self.residuals}
         # After the camera's figures, as files have always had it, so that digests stay.
         figures = list(self.residuals.items())
         place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
@@ -181,7 +191,7 @@ class Calibration(Description):
 
     def figures(self, step: str) -> dict[str, JsonValue]:
         """Figures of a step among the residuals; none where there are none of it."""
-        return figures_of(self.residuals, step)
+        return self.residuals.get(step, {})
 
     def origin(self) -> Origin:
         """What the calibration was made from, by its provenance."""
@@ -211,33 +221,3 @@ class Calibration(Description):
     def object_transform(self) -> np.ndarray:
         """``T_camera_object`` as an array (4, 4)."""
         return np.array(self.camera_from_object)
-
-
-def figures_of(residuals: dict[str, JsonValue], step: str) -> dict[str, JsonValue]:
-    """Figures of a step among residuals; none where there are none of it. ValueError where they are no table."""
-    figures = residuals.get(step, {})
-    if not isinstance(figures, dict):
-        raise ValueError(f"the residuals of the {step} are {figures!r}; expected a table")
-    return figures
-
-
-def require_plain_json(residuals: dict[str, JsonValue], provenance: dict[str, JsonValue]) -> None:
-    """Refuse what a calibration's file cannot hold; ValueError."""
-    try:
-        json.dumps([residuals, provenance], allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"residuals and provenance must be plain JSON with finite numbers: {error}") from error
-
-
-def _is_rigid(matrix: Matrix4) -> bool:
-    """Whether a matrix (4, 4) is a rotation, not a reflection, and a shift; to 1e-6, as text may be rounded."""
-    if len(matrix) != 4:
-        return False
-    rotation = np.array(matrix)[:3, :3]
-    square = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-    return square and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)
-
-
-def _require_unit(vector: Vector, name: str) -> None:
-    if not np.isclose(np.linalg.norm(vector), 1, atol=1e-6):
-        raise ValueError(f"{name} {vector} is not a unit vector")

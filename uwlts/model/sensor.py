@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from uwlts.model import media, phase_functions, waters
 from uwlts.model.errors import DescriptionError
@@ -17,6 +17,15 @@ from uwlts.model.errors import DescriptionError
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Vector = tuple[float, float, float]
+
+
+def _unit(vector: Vector) -> Vector:
+    if not np.isclose(np.linalg.norm(vector), 1, atol=1e-6):
+        raise ValueError(f"{vector} is not a unit vector")
+    return vector
+
+
+UnitVector = Annotated[Vector, AfterValidator(_unit)]
 
 _INDEX_FORMULA = 1.5e-5
 """Error that Quan and Fry (1995) give for their formula of the index of water."""
