@@ -405,11 +405,12 @@ def test_info_on_damaged_json(fails, folder: Path, tmp_path: Path):
 
 def test_damaged_residuals_are_refused_by_every_command(fails, folder: Path, tmp_path: Path):
     content = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
-    path, cloud = tmp_path / "calibration.json", tmp_path / "x.ply"
+    path = tmp_path / "calibration.json"
     for residuals in ({"camera": "good"}, {"camera": {"rms_px": "good"}}):
         path.write_text(json.dumps(content | {"residuals": residuals}), encoding="utf-8")
         fails("uwlts", "report", tmp_path, says="calibration.json is not a valid calibration: residuals.camera")
-        fails("uwlts", "reconstruct", folder / "scan.h5", "--calibration", path, "--out", cloud, says="residuals.camera")
+        used = ("--calibration", path, "--out", tmp_path / "x.ply")
+        fails("uwlts", "reconstruct", folder / "scan.h5", *used, says="residuals.camera")
 
 
 def test_cloud_without_points(command, tmp_path: Path):

@@ -254,7 +254,7 @@ def record_scene(
             "source": "twin",
             "seed": studio.options.seed,
             "spp": studio.options.spp,
-            "effects": studio.options.effects.names(),
+            "effects": [*studio.options.effects.names()],
             "variant": mi.variant(),
             **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
         },

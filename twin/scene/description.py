@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, names, read_table, validated
-from uwlts.model.sensor import Description, NotNegative, Positive, Vector
+from uwlts.model.sensor import Description, NotNegative, Positive, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
@@ -424,8 +424,8 @@ class Scene(Description):
     placements: dict[str, Pose] = {"standoff": Pose()}
     placement: str = "standoff"
     window_mounted: bool = True
-    artefact: dict[str, object] | None = None
-    target: dict[str, object] | None = None
+    artefact: Table | None = None
+    target: Table | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -487,7 +487,7 @@ def load_scene(
     return validated(Scene, table, path)
 
 
-def _with_paths_from(folder: Path, thing: dict[str, object]) -> dict[str, object]:
+def _with_paths_from(folder: Path, thing: Table) -> Table:
     """An object's table with relative paths of mesh and texture starting at a folder."""
     paths = {key: thing.get(key) for key in ("path", "texture")}
     return thing | {key: str(folder / path) for key, path in paths.items() if isinstance(path, str)}

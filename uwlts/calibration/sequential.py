@@ -18,8 +18,7 @@ from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
-from uwlts.storage.capture import Capture
-from uwlts.storage.capture_sources import source_of
+from uwlts.storage.capture import Capture, source_of
 from uwlts.stripe import StripeOptions
 
 
@@ -351,7 +350,7 @@ def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence
         "source": "calibration from captures",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "software": f"uwlts {uwlts.__version__}",
-        "air_captures": [source_of(capture) for capture in air],
-        "step_captures": [source_of(capture) for capture in steps],
-        "scan_captures": [source_of(capture) for capture in scans],
+        "air_captures": [source_of(capture).in_file() for capture in air],
+        "step_captures": [source_of(capture).in_file() for capture in steps],
+        "scan_captures": [source_of(capture).in_file() for capture in scans],
     }

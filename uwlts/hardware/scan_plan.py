@@ -2,22 +2,21 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, JsonValue
+from pydantic import AfterValidator, Field
 
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.errors import DescriptionError, DesignError, RangeError
 from uwlts.model.library import load_sensor, read_table, validated
 from uwlts.model.placement import check_design
-from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Vector
+from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
 Light = Literal["laser", "lamp"]
-Table = dict[str, JsonValue]
 """The description of a target or an artefact, or provenance, as it is written to captures."""
 
 
@@ -198,7 +197,7 @@ def load_plan(path: Path) -> ScanPlan:
     return validated(ScanPlan, plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path)
 
 
-def plan_table(path: Path, *, wanted: str) -> dict[str, Any]:
+def plan_table(path: Path, *, wanted: str) -> Table:
     """A plan's TOML with the path of a sensor that lies beside it; DescriptionError where it is missing or no TOML."""
     if not path.is_file():
         raise DescriptionError(f"no plan at {path}: write one that gives {wanted}")

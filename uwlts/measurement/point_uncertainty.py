@@ -17,8 +17,8 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.storage.capture import Capture, CaptureHeader
-from uwlts.storage.capture_sources import sha256_of
 from uwlts.storage.cloud import PAIRS, PointUncertainty
+from uwlts.storage.files import sha256_of
 
 _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.

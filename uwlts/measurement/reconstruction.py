@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import numpy as np
-from pydantic import JsonValue
 
 from uwlts.measurement.point_uncertainty import point_uncertainty
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
@@ -147,7 +145,7 @@ def reconstruct_stripes(
             "sensor": calibration.sensor_name,
             "medium": capture.header.medium_name,
             "medium_index": index,
-            "artefact": cast(JsonValue, capture.header.artefact),  # read from JSON or TOML
+            "artefact": capture.header.artefact,
             "calibration": calibration_digest(calibration),
         },
         stripe=sharp[good],

@@ -3,10 +3,18 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, JsonValue, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
-from uwlts.model.joint_estimate import JointEstimate, Origin, joint_estimate_in
-from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, UnitVector, Vector, Window
+from uwlts.model.errors import problems_of
+from uwlts.model.joint_estimate import JointEstimate, Origin
+from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
 
 _Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -21,7 +29,7 @@ def _rigid(matrix: _Rows) -> _Rows:
     raise ValueError("must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
 
 
-def _with_numbers(figures: dict[str, JsonValue]) -> dict[str, JsonValue]:
+def _with_numbers(figures: Table) -> Table:
     """Figures of a step of which those that commands print and plot, where they are given, are numbers."""
     for name in ("rms_px", "rms_mm", "max_mm", "std_mm"):
         if not isinstance(value := figures.get(name), int | float | None):
@@ -29,8 +37,17 @@ def _with_numbers(figures: dict[str, JsonValue]) -> dict[str, JsonValue]:
     return figures
 
 
+def _with_origin(provenance: Table) -> Table:
+    """A provenance from which `Calibration.origin` can be read."""
+    try:
+        Origin.model_validate(provenance)
+    except ValidationError as error:
+        raise ValueError(problems_of(error)) from error
+    return provenance
+
+
 RigidTransform = Annotated[_Rows, AfterValidator(_rigid)]
-Residuals = dict[str, Annotated[dict[str, JsonValue], AfterValidator(_with_numbers)]]
+Residuals = dict[str, Annotated[Table, AfterValidator(_with_numbers)]]
 """Named figures of each step of a calibration."""
 
 
@@ -162,25 +179,27 @@ class Calibration(Description):
     media: tuple[KnownMedium, ...] = ()
     stages: tuple[KnownStage, ...] = ()
     residuals: Residuals = {}
-    provenance: dict[str, JsonValue] = {}
+    provenance: Annotated[Table, AfterValidator(_with_origin)] = {}
     joint: JointEstimate | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _from_file(cls, content: object) -> object:
-        residuals = content.get("residuals") if isinstance(content, dict) else None
+        if not isinstance(content, dict):
+            return content
+        residuals = content.get("residuals")
         if not (isinstance(residuals, dict) and "joint" in residuals):
             return content
-        joint = joint_estimate_in(residuals["joint"], content.get("provenance", {}))
-        return content | {"residuals": {key: each for key, each in residuals.items() if key != "joint"}, "joint": joint}
+        figures = {key: each for key, each in residuals.items() if key != "joint"}
+        return content | {"residuals": figures, "joint": residuals["joint"]}
 
     @model_serializer(mode="wrap")
-    def _into_file(self, handler: SerializerFunctionWrapHandler) -> dict[str, JsonValue]:
+    def _into_file(self, handler: SerializerFunctionWrapHandler) -> Table:
         content = handler(self) | {"residuals": self.residuals_in_file()}
         del content["joint"]
         return content
 
-    def residuals_in_file(self) -> dict[str, JsonValue]:
+    def residuals_in_file(self) -> Table:
         """The residuals as files have them, the joint estimate among them as plain JSON."""
         if self.joint is None:
             return {**self.residuals}
@@ -189,7 +208,7 @@ class Calibration(Description):
         place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
         return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
 
-    def figures(self, step: str) -> dict[str, JsonValue]:
+    def figures(self, step: str) -> Table:
         """Figures of a step among the residuals; none where there are none of it."""
         return self.residuals.get(step, {})
 

@@ -3,10 +3,10 @@
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, JsonValue, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, JsonValue, model_validator
 
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
-from uwlts.model.sensor import Uncertainty, Vector
+from uwlts.model.sensor import Table, Uncertainty, Vector
 
 _Count = Annotated[int, Field(ge=0)]
 _Std = Annotated[FiniteFloat, Field(ge=0)]
@@ -17,6 +17,10 @@ class _Stored(BaseModel):
     """Base of what files hold of a joint estimate; keys that other versions add are kept."""
 
     model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True, allow_inf_nan=False)
+
+    def in_file(self) -> dict[str, JsonValue]:
+        """Plain JSON with the keys of files."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
 class CoveredRegion(_Stored):
@@ -106,40 +110,33 @@ class JointEstimate(_Stored):
         """The covariance as an array (P, P)."""
         return np.array(self.covariance, dtype=np.float64).reshape(len(self.parameters), -1)
 
-    def in_file(self) -> dict[str, JsonValue]:
-        """The estimate as plain JSON with the keys of files."""
-        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
-
-class CaptureSource(BaseModel):
-    """A capture that a calibration was made from."""
+class CaptureSource(_Stored):
+    """A capture that a calibration was made from: its file, numbers of images, medium and subject."""
 
     file: str
+    name: str | None = None
     sha256: str
+    lamp_images: _Count | None = None
+    laser_images: _Count | None = None
+    medium: str | None = None
+    window: bool | None = None
+    temperature_c: float | None = None
+    salinity_g_kg: float | None = None
+    target: Table | None = None
+    artefact: Table | None = None
 
 
 class Origin(BaseModel):
-    """What a calibration was made from: captures, target, how well the sensor was known before; warnings of it."""
+    """Captures and target that a calibration was made from, how well the sensor was known before, and warnings."""
 
     known_before: Uncertainty = Uncertainty()
     air_captures: tuple[CaptureSource, ...] = ()
     step_captures: tuple[CaptureSource, ...] = ()
     scan_captures: tuple[CaptureSource, ...] = ()
-    target: dict[str, JsonValue] | None = None
+    target: Table | None = None
     warnings: tuple[str, ...] = ()
 
     def captures(self) -> tuple[CaptureSource, ...]:
-        """Those of targets, of steps and of scans."""
+        """All captures: of targets, of steps and of scans."""
         return self.air_captures + self.step_captures + self.scan_captures
-
-
-def joint_estimate_in(figures: JsonValue, provenance: JsonValue) -> JointEstimate:
-    """The joint estimate of a file's figures; ValueError where it or its provenance is damaged."""
-    try:
-        joint = JointEstimate.model_validate(figures)
-        Origin.model_validate(provenance)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place, what = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        raise ValueError(f"the joint estimate is damaged: {place + ': ' if place else ''}{what}") from error
-    return joint

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from uwlts.model.errors import DescriptionError, Error
-from uwlts.model.sensor import Description, Sensor
+from uwlts.model.sensor import Description, Sensor, Table
 
 AnyDescription = TypeVar("AnyDescription", bound=Description)
 
@@ -45,7 +45,7 @@ def find(name_or_path: str | Path, folder: str = "") -> Path:
     return shipped
 
 
-def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
+def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> Table:
     """Table of a TOML file with its ``base`` filled in; nested tables are merged, everything else is replaced."""
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
@@ -66,16 +66,16 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
 
 
-def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+def merged(base: Table, changes: Table) -> Table:
     """A new table: ``base`` with ``changes`` laid over it, tables merged key by key."""
     result = dict(base)
     for key, value in changes.items():
-        both = isinstance(value, dict) and isinstance(base.get(key), dict)
-        result[key] = merged(base[key], value) if both else value
+        below = base.get(key)
+        result[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return result
 
 
-def validated(model: type[AnyDescription], table: dict[str, Any], source: str | Path) -> AnyDescription:
+def validated(model: type[AnyDescription], table: object, source: str | Path) -> AnyDescription:
     """The table as a description; DescriptionError names each wrong key, what was found and what is expected."""
     try:
         return model.model_validate(table)

@@ -3,10 +3,10 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, JsonValue, model_validator
+from pydantic import Field, model_validator
 
 from uwlts.model.calibration import Residuals
-from uwlts.model.sensor import Description, Medium, Positive
+from uwlts.model.sensor import Description, Medium, Positive, Table
 
 Pair = tuple[float, float]
 
@@ -48,7 +48,7 @@ class PolynomialCalibration(Description):
     depth_coefficients: Rows
     along_coefficients: Rows
     residuals: Residuals = {}
-    provenance: dict[str, JsonValue] = {}
+    provenance: Table = {}
 
     @property
     def joint(self) -> None:
@@ -75,7 +75,7 @@ class PolynomialCalibration(Description):
             raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
         return self
 
-    def figures(self, step: str) -> dict[str, JsonValue]:
+    def figures(self, step: str) -> Table:
         """Figures of a step among the residuals; none where there are none of it."""
         return self.residuals.get(step, {})
 

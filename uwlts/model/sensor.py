@@ -9,7 +9,17 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import to_jsonable_python
 
 from uwlts.model import media, phase_functions, waters
 from uwlts.model.errors import DescriptionError
@@ -29,6 +39,10 @@ UnitVector = Annotated[Vector, AfterValidator(_unit)]
 
 _INDEX_FORMULA = 1.5e-5
 """Error that Quan and Fry (1995) give for their formula of the index of water."""
+
+
+Table = Annotated[dict[str, JsonValue], BeforeValidator(to_jsonable_python)]
+"""A table of a TOML or JSON file that is checked where it is used."""
 
 
 class Description(BaseModel):

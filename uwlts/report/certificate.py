@@ -20,8 +20,7 @@ from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium
 from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
-from uwlts.storage.capture_sources import sha256_of
-from uwlts.storage.files import read_json
+from uwlts.storage.files import read_json, sha256_of
 
 FORMAT = "uwlts-certificate"
 VERSION = 1

@@ -15,7 +15,7 @@ from uwlts.calibration.joint.observability import regions
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import OutputError
-from uwlts.model.joint_estimate import ImageFit
+from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
 from uwlts.report.certificate_volume import LengthUncertainty, change_from, form_of, in_use, require_same_sensor
@@ -34,7 +34,6 @@ from uwlts.report.page_toolkit import (
 )
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration
-from uwlts.storage.capture_sources import captures_in
 
 _WORST_IMAGES = 5
 
@@ -99,7 +98,7 @@ def certificate_page(
         "uwlts.report",
         "certificate.html.j2",
         c=content,
-        captures=captures_in(content.made_from),
+        captures=[source.in_file() for source in Origin.model_validate(content.made_from).captures()],
         warnings=content.made_from.get("warnings", []),
         known_before=content.made_from.get("known_before", {}),
         parameters=_parameters(content.parameters, before),

@@ -21,10 +21,12 @@ from typing import Annotated
 import h5py
 import hdf5plugin
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from uwlts.model.errors import CaptureError, ImageError, OutputError
-from uwlts.model.sensor import Description, Medium, Sensor, Vector
+from uwlts.model.joint_estimate import CaptureSource
+from uwlts.model.sensor import Description, Medium, Sensor, Table, UnitVector
+from uwlts.storage.files import sha256_of
 from uwlts.storage.hdf5_file import UnfinishedFile, has_writer, read_label, write_label
 
 FORMAT = "uwlts-capture"
@@ -57,18 +59,11 @@ class CaptureHeader(Description):
     sensor: Sensor
     medium_name: str
     medium: Medium
-    stage_direction: Vector
+    stage_direction: UnitVector
     saturation_dn: Annotated[int, Field(gt=0)]
-    target: dict[str, object] | None = None
-    artefact: dict[str, object] | None = None
-    provenance: dict[str, object] = {}
-
-    @field_validator("stage_direction")
-    @classmethod
-    def _unit(cls, value: Vector) -> Vector:
-        if not np.isclose(np.linalg.norm(value), 1, atol=1e-6):
-            raise ValueError(f"stage_direction {value} is not a unit vector")
-        return value
+    target: Table | None = None
+    artefact: Table | None = None
+    provenance: Table = {}
 
 
 @dataclass(frozen=True)
@@ -428,3 +423,16 @@ def opened_captures(captures: Iterable[Capture | str | Path]) -> Iterator[list[C
 def opened_capture(capture: Capture | str | Path) -> AbstractContextManager[Capture]:
     """A context with an opened capture: one that is open already stays so, a file is opened and closed."""
     return nullcontext(capture) if isinstance(capture, Capture) else Capture(capture)
+
+
+def source_of(capture: Capture) -> CaptureSource:
+    """Name, SHA-256 and number of images of a capture, its medium and window, and its subject."""
+    header, laser = capture.header, int(np.count_nonzero(capture.laser_on))
+    medium = header.medium
+    known: Table = {"medium": header.medium_name, "window": header.sensor.camera.window.mounted}
+    if medium.kind in ("fresh", "sea"):
+        known |= {"temperature_c": medium.temperature_c, "salinity_g_kg": medium.salinity_g_kg}
+    known |= {key: thing for key in ("target", "artefact") if (thing := getattr(header, key)) is not None}
+    identity: Table = {"file": capture.path.name, "name": header.name, "sha256": sha256_of(capture.path)}
+    counts: Table = {"lamp_images": len(capture) - laser, "laser_images": laser}
+    return CaptureSource.model_validate(identity | counts | known)

@@ -4,17 +4,19 @@ Outputs are written beside their place, flushed to the disk, then renamed.
 """
 
 import errno
+import hashlib
 import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from uwlts.model.errors import CaptureError, OutputError, problems_of
+from uwlts.model.sensor import Table
 
 
 @contextmanager
@@ -84,10 +86,19 @@ def _flush(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
+def sha256_of(path: str | Path) -> str:
+    """Hash of a file in hexadecimal; CaptureError where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+
+
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
 
-def read_json(path: str | Path, *, called: str) -> dict[str, Any]:
+def read_json(path: str | Path, *, called: str) -> Table:
     """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -126,7 +137,7 @@ def write_model(path: str | Path, model: BaseModel, *, format: str, version: int
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def json_text(content: BaseModel | dict[str, Any] | list[Any], *, indent: int | None = None, ascii: bool = True) -> str:
+def json_text(content: object, *, indent: int | None = None, ascii: bool = True) -> str:
     """Text of a JSON file, of a model with the fields that were set; ValueError for numbers that are not finite."""
     plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
     return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"

@@ -3,13 +3,12 @@
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from uwlts.model.errors import CaptureError
-from uwlts.model.sensor import Description, Medium, Sensor
+from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.storage.files import written_aside
 from uwlts.storage.hdf5_file import read_label, write_label
 
@@ -30,7 +29,7 @@ class TruthHeader(Description):
 
     sensor: Sensor
     medium: Medium
-    scene: dict[str, Any]
+    scene: Table
 
 
 @dataclass(frozen=True)

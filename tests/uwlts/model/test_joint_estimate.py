@@ -68,7 +68,7 @@ def test_a_damaged_estimate_is_noticed_when_it_is_read(written, tmp_path, damage
     damaged(content["residuals"]["joint"])
     path = tmp_path / "damaged.json"
     path.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(CaptureError, match="the joint estimate is damaged") as refused:
+    with pytest.raises(CaptureError, match="is not a valid calibration: joint") as refused:
         read_calibration(path)
     assert said in str(refused.value)
 
@@ -87,7 +87,7 @@ def test_a_damaged_origin_is_noticed_when_it_is_read(written, tmp_path, key, val
     content["provenance"][key] = value
     path = tmp_path / "damaged.json"
     path.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(CaptureError, match="the joint estimate is damaged") as refused:
+    with pytest.raises(CaptureError, match="is not a valid calibration: provenance") as refused:
         read_calibration(path)
     assert said in str(refused.value)
 

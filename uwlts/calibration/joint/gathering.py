@@ -15,6 +15,7 @@ from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sour
 from uwlts.calibration.target_images import Placement, placements
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError
+from uwlts.model.joint_estimate import Origin
 from uwlts.model.parameter_keys import (
     MediumIndex,
     ParameterKey,
@@ -26,7 +27,6 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.storage.capture import Capture
-from uwlts.storage.capture_sources import captures_in
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,11 +158,10 @@ def refuse_two_lenses(gathered: Gathered) -> None:
 def _refuse_twice(provenance: Mapping[str, JsonValue]) -> None:
     """CalibrationError where two captures are the same, as their noise would count as two independent ones."""
     names: dict[str, str] = {}
-    for source in captures_in(provenance):
-        name, digest = source["file"], source["sha256"]
-        if digest in names:
-            raise CalibrationError(f"{names[digest]} and {name} are the same capture: give it once")
-        names[digest] = name
+    for source in Origin.model_validate(provenance).captures():
+        if source.sha256 in names:
+            raise CalibrationError(f"{names[source.sha256]} and {source.file} are the same capture: give it once")
+        names[source.sha256] = source.file
 
 
 def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> View:

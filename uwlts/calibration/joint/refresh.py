@@ -23,13 +23,12 @@ from uwlts.calibration.sheet import object_frame
 from uwlts.model.any_calibration import calibration_digest, check_fits
 from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
 from uwlts.model.errors import CalibrationError, RangeError
-from uwlts.model.joint_estimate import CoveredRegion, JointEstimate
+from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.window import require_index
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, opened_captures
-from uwlts.storage.capture_sources import captures_in
 from uwlts.stripe import StripeOptions
 
 
@@ -205,10 +204,11 @@ def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> Co
 
 def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, JsonValue]:
     old, new = earlier.provenance, sources_of([], []) | gathered.provenance
+    sources = Origin.model_validate(new).captures()
     refreshed = {
         "digest": calibration_digest(earlier),
         **{key: old.get(key) for key in ("source", "date", "software")},
-        "step_captures": [source["file"] for source in captures_in(new)],
+        "step_captures": [source.file for source in sources],
     }
 
     def more(key: str, added: Sequence[JsonValue]) -> list[JsonValue]:
@@ -219,7 +219,7 @@ def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -
         "source": "calibration refreshed in new water",
         "date": new["date"],
         "software": new["software"],
-        "step_captures": more("step_captures", captures_in(new)),
+        "step_captures": more("step_captures", [source.in_file() for source in sources]),
         "refreshed": more("refreshed", [refreshed]),
         "warnings": more("warnings", warnings),
     }
@@ -296,7 +296,7 @@ def refresh(
             _refuse_unsuitable(capture, calibration)
         gathered = gather_jointly([], captures, options=options, progress=progress)
     used = {source.sha256 for source in calibration.origin().captures()}
-    again = [source["file"] for source in captures_in(gathered.provenance) if source["sha256"] in used]
+    again = [source.file for source in Origin.model_validate(gathered.provenance).captures() if source.sha256 in used]
     if again:
         raise CalibrationError(f"the calibration was made from {', '.join(again)} already: take a new image")
     return solve_refreshed(calibration, gathered, options=options, index_std=index_std)

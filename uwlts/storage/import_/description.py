@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, load_sensor, merged, read_table, validated
-from uwlts.model.sensor import Description, NotNegative, Sensor, Vector
+from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.import_.intrinsics import read_intrinsics, with_intrinsics
 from uwlts.targets import parse_target
@@ -57,7 +57,7 @@ class ImportDescription(Description):
 
     header: str | None = None
     name: str | None = None
-    sensor: str | dict[str, object] | None = None
+    sensor: str | Table | None = None
     intrinsics: str | None = None
     medium: str | None = None
     laser: Patterns = ()
@@ -74,9 +74,9 @@ class ImportDescription(Description):
     lamp_exposure_ms: NotNegative | None = None
     repeated: bool = False
     stage: StageMotion = StageMotion()
-    target: dict[str, object] | None = None
-    artefact: dict[str, object] | None = None
-    provenance: dict[str, object] | None = None
+    target: Table | None = None
+    artefact: Table | None = None
+    provenance: Table | None = None
 
     @model_validator(mode="after")
     def _given_once(self) -> "ImportDescription":
@@ -103,7 +103,7 @@ def read_description(path: Path) -> ImportDescription:
 
 
 def capture_header(
-    given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: dict[str, object]
+    given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: Table
 ) -> CaptureHeader:
     """Header of the capture; ``name`` and ``remarks`` (as provenance) serve where the description gives none.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 import uwlts
 from uwlts.model.errors import DescriptionError, ImageError
-from uwlts.model.sensor import Sensor
+from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.description import (
@@ -272,11 +272,9 @@ def _write(
         raise
 
 
-def _remarks(
-    given: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int
-) -> dict[str, object]:
+def _remarks(given: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int) -> Table:
     """Provenance of the capture."""
-    remarks: dict[str, object] = {
+    remarks: Table = {
         "source": "imported images",
         "uwlts": uwlts.__version__,
         "folder": folder.resolve().name,

@@ -89,7 +89,7 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
         )
     changes = {
         "focal_length_mm": 1e-3 * focal * camera.pixel_size_um,
-        "principal_point_px": (known.cx_px, known.cy_px),
+        "principal_point_px": [known.cx_px, known.cy_px],
         "distortion": known.distortion.model_dump(),
     }
     return validated(Sensor, merged(sensor.model_dump(), {"camera": changes}), source)
