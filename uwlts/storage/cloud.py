@@ -3,19 +3,16 @@
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from io import BytesIO
 from pathlib import Path
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
-from pydantic import JsonValue
 
 from uwlts.model.errors import CaptureError
-from uwlts.model.sensor import Description
+from uwlts.model.sensor import Description, Table
 from uwlts.storage.files import written_aside
 from uwlts.storage.hdf5_file import format_of, read_label, write_label
 
@@ -30,6 +27,7 @@ NO_INDEX = -1
 
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _PER_POINT = ("points_mm", "intensity", "frame", "line")
+_KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
 _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
@@ -107,21 +105,24 @@ class PointCloud:
     line: np.ndarray
     deviation_mm: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
-    metadata: dict[str, JsonValue] = field(default_factory=dict)
+    metadata: Table = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        points = _read_only(self.points_mm, np.float64)
+        for name, kind in _KINDS.items():
+            if (values := getattr(self, name)) is not None:
+                column = np.asarray(values, dtype=kind).view()
+                column.flags.writeable = False
+                object.__setattr__(self, name, column)
+        points = self.points_mm
         if points.ndim != 2 or points.shape[1] != 3:
             raise CaptureError(f"the points of a cloud have the shape (N, 3), not {points.shape}")
         unusable = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
         if unusable:
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
-        object.__setattr__(self, "points_mm", points)
-        for name, kind in (("intensity", np.float32), ("frame", np.int32), ("line", np.int32)):
-            object.__setattr__(self, name, _per_point(name, getattr(self, name), kind, len(points)))
-        if self.deviation_mm is not None:
-            deviation = _per_point("deviation_mm", self.deviation_mm, np.float32, len(points))
-            object.__setattr__(self, "deviation_mm", deviation)
+        for name in (*_PER_POINT[1:], "deviation_mm"):
+            column = getattr(self, name)
+            if column is not None and column.shape != (len(points),):
+                raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {len(points)} points")
         if self.uncertainty is not None:
             random, patterns = self.uncertainty.random_mm2, self.uncertainty.patterns_mm
             if random.shape != (len(points), 6) or patterns.shape[1:] != points.shape:
@@ -179,31 +180,8 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
         The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
     """
     path = Path(path)
-    if _in_hdf5(path):
-        return _read_hdf5(path)
-    vertices, comments = _read_ply(path)
-    names = vertices.dtype.names or ()
-    missing = [axis for axis in "xyz" if axis not in names]
-    if missing:
-        raise CaptureError(f"{path}: the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
-
-    def column(name: str, default: float, kind: type) -> np.ndarray:
-        for known_as in (name, f"scalar_{name}"):
-            if known_as in names:
-                return _numbers(path, vertices, known_as).astype(kind)
-        return np.full(len(vertices), default, kind)
-
-    deviation = column("deviation", np.nan, np.float32)
     try:
-        return PointCloud(
-            points_mm=np.column_stack([_numbers(path, vertices, axis).astype(np.float64) for axis in "xyz"]),
-            intensity=column("intensity", np.nan, np.float32),
-            frame=_indices(path, "frame", column("frame", NO_INDEX, np.float64)),
-            line=_indices(path, "line", column("line", NO_INDEX, np.float64)),
-            deviation_mm=None if np.isnan(deviation).all() else deviation,
-            uncertainty=_uncertainty(names, column),
-            metadata=_metadata(path, comments),
-        )
+        return _read_hdf5(path) if _in_hdf5(path) else _read_ply(path)
     except CaptureError as error:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
@@ -232,31 +210,7 @@ def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.n
     return dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
 
 
-def _uncertainty(names: tuple[str, ...], column: Callable[[str, float, type], np.ndarray]) -> PointUncertainty | None:
-    known = {name.removeprefix("scalar_") for name in names}
-    count = sum(f"pattern{m}_x" in known for m in range(len(known)))
-    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
-    if count == 0 or not known.issuperset(wanted):
-        return None
-    columns = np.stack([column(name, np.nan, np.float32) for name in wanted])
-    position, patterns = columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
-    return PointUncertainty(columns[:6].T.copy(), position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
-
-
-def _read_only(values: ArrayLike, kind: type) -> np.ndarray:
-    view = np.asarray(values, dtype=kind).view()
-    view.flags.writeable = False
-    return view
-
-
-def _per_point(name: str, values: ArrayLike, kind: type, count: int) -> np.ndarray:
-    column = _read_only(values, kind)
-    if column.shape != (count,):
-        raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {count} points")
-    return column
-
-
-def _as_json(metadata: dict[str, JsonValue]) -> str:
+def _as_json(metadata: Table) -> str:
     try:
         text = json.dumps(metadata, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     except (TypeError, ValueError) as error:
@@ -266,31 +220,31 @@ def _as_json(metadata: dict[str, JsonValue]) -> str:
     return text
 
 
-def _comments(metadata: dict[str, JsonValue]) -> list[str]:
+def _comments(metadata: Table) -> list[str]:
     text = _as_json(metadata)
     pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
     # The semicolon keeps a piece's last blank from being stripped by readers.
     return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
 
 
-def _metadata(path: Path, comments: list[str]) -> dict[str, JsonValue]:
+def _metadata(comments: list[str]) -> Table:
     own = [comment for comment in comments if comment.startswith(_COMMENT)]
     if not own:
         return {}
     pieces = [_PIECE.fullmatch(comment) for comment in own]
     wanted = [(str(number), str(len(own))) for number in range(1, len(own) + 1)]
     if [piece and piece.groups()[:2] for piece in pieces] != wanted:
-        raise CaptureError(f"{path}: its metadata is incomplete; write the file again or remove those comments")
+        raise CaptureError("its metadata is incomplete; write the file again or remove those comments")
     try:
         metadata = json.loads("".join(piece.group(3) for piece in pieces if piece))
     except json.JSONDecodeError as error:
-        raise CaptureError(f"{path}: its metadata is damaged: {error}") from error
+        raise CaptureError(f"its metadata is damaged: {error}") from error
     if not isinstance(metadata, dict):
-        raise CaptureError(f"{path}: its metadata is a {type(metadata).__name__}; expected a JSON object")
+        raise CaptureError(f"its metadata is a {type(metadata).__name__}; expected a JSON object")
     return metadata
 
 
-def _read_ply(path: Path) -> tuple[np.ndarray, list[str]]:
+def _read_ply(path: Path) -> PointCloud:
     try:
         ply = PlyData.read(str(path))
     except FileNotFoundError as error:
@@ -301,26 +255,50 @@ def _read_ply(path: Path) -> tuple[np.ndarray, list[str]]:
         raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
     if "vertex" not in ply:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
-    return ply["vertex"].data, ply.comments
+    vertices = ply["vertex"].data
+    names = vertices.dtype.names or ()
+    missing = [axis for axis in "xyz" if axis not in names]
+    if missing:
+        raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
+    known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
 
+    def column(name: str, default: float, kind: type = np.float32) -> np.ndarray:
+        if name not in known:
+            return np.full(len(vertices), default, kind)
+        values = vertices[known[name]]
+        if values.dtype.kind not in "iuf":
+            raise CaptureError(f"the property {known[name]} is a list; expected one number per point")
+        return values.astype(kind)
 
-def _numbers(path: Path, vertices: np.ndarray, name: str) -> np.ndarray:
-    if vertices.dtype[name].kind not in "iuf":
-        raise CaptureError(f"{path}: the property {name} is a list; expected one number per point")
-    return vertices[name]
+    def indices(name: str) -> np.ndarray:
+        values = column(name, NO_INDEX, np.float64)
+        wrong = ~(np.isfinite(values) & (values == np.round(values)) & (np.abs(values) < 2**31))
+        if wrong.any():
+            raise CaptureError(f"{np.count_nonzero(wrong)} values of {name} are no whole numbers")
+        return values.astype(np.int32)
 
-
-def _indices(path: Path, name: str, values: np.ndarray) -> np.ndarray:
-    whole = np.isfinite(values) & (values == np.round(values)) & (np.abs(values) < 2**31)
-    if not whole.all():
-        raise CaptureError(f"{path}: {np.count_nonzero(~whole)} values of {name} are no whole numbers")
-    return values.astype(np.int32)
+    uncertainty, count = None, sum(f"pattern{m}_x" in known for m in range(len(known)))
+    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
+    if count and known.keys() >= set(wanted):
+        columns = np.stack([column(name, np.nan) for name in wanted])
+        random, position, patterns = columns[:6].T.copy(), columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
+        uncertainty = PointUncertainty(random, position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
+    deviation = column("deviation", np.nan)
+    return PointCloud(
+        points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
+        intensity=column("intensity", np.nan),
+        frame=indices("frame"),
+        line=indices("line"),
+        deviation_mm=None if np.isnan(deviation).all() else deviation,
+        uncertainty=uncertainty,
+        metadata=_metadata(ply.comments),
+    )
 
 
 class _CloudHeader(Description):
     """Header of a cloud's HDF5 file."""
 
-    metadata: dict[str, JsonValue]
+    metadata: Table
 
 
 def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
@@ -358,12 +336,5 @@ def _read_hdf5(path: Path) -> PointCloud:
     if missing:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
     known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
-    try:
-        return PointCloud(
-            **{name: arrays[name] for name in _PER_POINT},
-            deviation_mm=arrays.get("deviation_mm"),
-            uncertainty=known,
-            metadata=header.metadata,
-        )
-    except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
+    per_point = (arrays[name] for name in _PER_POINT)
+    return PointCloud(*per_point, arrays.get("deviation_mm"), known, header.metadata)

@@ -80,15 +80,13 @@ class ImportDescription(Description):
 
     @model_validator(mode="after")
     def _given_once(self) -> "ImportDescription":
-        if self.header is None:
-            missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
-            if missing:
-                raise ValueError(f"{' and '.join(missing)} missing: a capture says which sensor saw it, in what")
-        else:
-            twice = [name for name in _OF_THE_HEADER if name in self.model_fields_set]
-            twice += ["stage.direction"] if self.stage.direction is not None else []
-            if twice:
-                raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
+        missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
+        if self.header is None and missing:
+            raise ValueError(f"{' and '.join(missing)} missing: a capture says which sensor saw it, in what")
+        twice = [name for name in _OF_THE_HEADER if name in self.model_fields_set]
+        twice += ["stage.direction"] if self.stage.direction is not None else []
+        if self.header is not None and twice:
+            raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
         return self
 
 
@@ -112,23 +110,18 @@ def capture_header(
     """
     if given.header is not None:
         return read_header(beside / given.header)
-    direction = given.stage.direction
-    if direction is None:
-        if not given.stage.free:
-            raise DescriptionError(
-                "stage.direction is missing: give the unit direction in which the stage moves the sensor, in the OCS, "
-                "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
-            )
-        direction = (1.0, 0.0, 0.0)
-    if given.medium is None:
-        raise DescriptionError("medium is missing: a capture states the medium in which the sensor was used")
+    if given.stage.direction is None and not given.stage.free:
+        raise DescriptionError(
+            "stage.direction is missing: give the unit direction in which the stage moves the sensor, in the OCS, "
+            "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
+        )
     if given.target is not None:
         parse_target(given.target)
     if given.artefact is not None:
         parse_artefact(given.artefact)
-    table = {"name": given.name or name, "sensor": sensor, "saturation_dn": saturation_dn, "stage_direction": direction}
-    table |= {"medium_name": given.medium, "medium": sensor.medium(given.medium)}
-    table |= {"target": given.target, "artefact": given.artefact}
+    table = {"name": given.name or name, "sensor": sensor, "saturation_dn": saturation_dn}
+    table |= {"stage_direction": given.stage.direction or (1.0, 0.0, 0.0), "medium_name": given.medium}
+    table |= {"medium": sensor.medium(given.medium or ""), "target": given.target, "artefact": given.artefact}
     table |= {"provenance": remarks if given.provenance is None else given.provenance}
     return validated(CaptureHeader, table, "the header from the description")
 
@@ -148,9 +141,8 @@ def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
     if given.header is not None:
         return read_header(beside / given.header).sensor
     if isinstance(given.sensor, dict):
-        table = dict(given.sensor)
-        base = table.pop("base", None)
-        if base is not None:
+        table = {key: value for key, value in given.sensor.items() if key != "base"}
+        if (base := given.sensor.get("base")) is not None:
             table = merged(read_table(find(_beside(beside, base), "sensors"), "sensors"), table)
         sensor = validated(Sensor, table, "sensor")
     else:

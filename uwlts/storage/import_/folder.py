@@ -1,5 +1,6 @@
 """Import of a folder of images as a capture, with checks for black, saturated and stripe-free images."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import uwlts
 from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.sensor import Sensor, Table
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage.capture import CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.description import (
     NAME,
@@ -19,42 +20,28 @@ from uwlts.storage.import_.description import (
     read_description,
 )
 from uwlts.storage.import_.images import bits_of, grey_values, one_channel, read_image, without_background
-from uwlts.storage.import_.matching import Matched, PlannedFrame, match, planned_frames, read_rows, stage_remark
+from uwlts.storage.import_.matching import Row, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe.recording import BLACK, WHITE, has_stripe, is_black, runs_across, white_share
 
-
-def check_size(image: np.ndarray, sensor: Sensor, *, name: str, first: bool) -> None:
-    """ImageError for an image (H, W) or (H, W, 3) of another size than the sensor's; other advice for the first one."""
-    height, width = image.shape[:2]
-    wanted = sensor.camera.width_px, sensor.camera.height_px
-    if (width, height) == wanted:
-        return
-    match first, (height, width) == wanted:
-        case True, True:
-            advice = "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of "
-            advice += "the sensor and see to stripe_along"
-        case True, _:
-            advice = "give the description of the sensor that took the images, or correct its width_px and height_px"
-        case _, True:
-            advice = "it is turned by a quarter turn: turn it back"
-        case _:
-            advice = "leave it out (ignore), or import it on its own"
-    before = "" if first else " and the images before it"
-    raise ImageError(
-        f"{name} has {width} x {height} pixels; expected {wanted[0]} x {wanted[1]} as the sensor '{sensor.name}' "
-        f"has{before}: {advice}"
-    )
+_SIZE_ADVICE = {
+    (True, True): "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
+    "sensor and see to stripe_along",
+    (True, False): "give the description of the sensor that took the images, or correct its width_px and height_px",
+    (False, True): "it is turned by a quarter turn: turn it back",
+    (False, False): "leave it out (ignore), or import it on its own",
+}
+"""What to do about an image of another size than the sensor's, by whether it is the first, and turned."""
 
 
 @dataclass(eq=False)
-class Content:
-    """Keeps account of the images of one import; ``saturation_dn`` is that of the files, ``target``: one is given.
+class _Content:
+    """Account of the images of one import; ``saturation_dn`` is that of the files, ``target``: one is given.
 
     ``black`` has the names of the dark images and ``seen`` the number of all, by whether the laser was on;
     ``with_stripe`` counts the images with a stripe, ``sideways`` those with one across.
     """
 
-    sensor: Sensor
+    stripe_along: str
     saturation_dn: int
     target: bool
     black: dict[bool, list[str]] = field(default_factory=lambda: {False: [], True: []})
@@ -76,11 +63,10 @@ class Content:
 
     def look_for_stripe(self, image: np.ndarray) -> None:
         """Take a laser image (H, W) into account, from which its background is subtracted if there is one."""
-        along = self.sensor.camera.stripe_along
-        if has_stripe(image, stripe_along=along):
+        if has_stripe(image, stripe_along=self.stripe_along):
             self.with_stripe += 1
         else:
-            self.sideways += runs_across(image, stripe_along=along)
+            self.sideways += runs_across(image, stripe_along=self.stripe_along)
 
     def refuse_black(self) -> None:
         """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
@@ -92,7 +78,7 @@ class Content:
                     f"the {light} on, the exposure long enough,{colour} bits right?"
                 )
 
-    def verdict(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Warnings, once all images were seen."""
         warnings = [
             f"{len(self.black[on])} of {self.seen[on]} {light} images are black, such as {self.black[on][0]}"
@@ -101,19 +87,14 @@ class Content:
         ]
         lasers = self.seen[True]
         if lasers and not self.with_stripe:
-            along = self.sensor.camera.stripe_along
             advice = "check which images are laser images, the channel, and the exposure"
             if self.sideways:
                 advice = f"in {self.sideways} of them one runs across: the images are turned, or the sensor's "
-                advice += f"stripe_along ('{along}') is wrong"
+                advice += f"stripe_along ('{self.stripe_along}') is wrong"
             warnings.append(f"no stripe in any of the {lasers} laser images: {advice}")
         elif self.with_stripe < lasers:
             warnings.append(f"{lasers - self.with_stripe} of {lasers} laser images show no stripe")
         return warnings
-
-
-_UNKNOWN = 0.0
-"""Exposure and time of images of which nobody knows them; the provenance says so."""
 
 
 @dataclass(frozen=True)
@@ -170,32 +151,53 @@ def import_images(
     sensor = described_sensor(given, beside=path.parent)
     rows = None if given.table is None else read_rows(path.parent / given.table)
     matched = match(folder, given, rows)
-    frames = planned_frames(folder, given, matched, in_table=rows is not None)
+    frames = planned_frames(given, matched, in_table=rows is not None)
     reader = _Reader(given, sensor, folder)
-    first, bits = reader.image(frames[0].path, laser_on=frames[0].laser_on)
+    first, bits = reader.image(frames[0].file, laser_on=frames[0].light == "laser")
     zero = _zero_dn(given, frames, bits)
-    saturation = 2**bits - 1 if given.saturation_dn is None else given.saturation_dn
     header = capture_header(
         given,
         sensor,
         beside=path.parent,
         name=folder.resolve().name,
-        saturation_dn=saturation + zero,
+        saturation_dn=(2**bits - 1 if given.saturation_dn is None else given.saturation_dn) + zero,
         remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
     )
-    if header.saturation_dn - zero > np.iinfo(first.dtype).max:
-        raise DescriptionError(
-            f"saturation_dn is {header.saturation_dn - zero}; images of {first.dtype} have no such value"
-        )
-    content = Content(header.sensor, header.saturation_dn - zero, header.target is not None)
+    saturation = header.saturation_dn - zero
+    if saturation > np.iinfo(first.dtype).max:
+        raise DescriptionError(f"saturation_dn is {saturation}; images of {first.dtype} have no such value")
+    content = _Content(header.sensor.camera.stripe_along, saturation, header.target is not None)
     dtype = np.dtype(np.uint16) if zero else first.dtype
-    _write(out, header, frames, reader, content, zero_dn=zero, dtype=dtype, overwrite=overwrite, progress=progress)
-    return Imported(len(matched.laser), len(matched.lamp), (*content.verdict(), *_unmatched(matched)))
+    writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
+    try:
+        with writer:
+            for number, row in enumerate(frames):
+                laser_on = row.light == "laser"
+                image, _ = reader.image(row.file, laser_on=laser_on)
+                content.look(image, laser_on=laser_on, name=Path(row.file).name)
+                if row.background is not None:
+                    image = without_background(image, reader.background(row.background), zero_dn=zero)
+                if laser_on:
+                    content.look_for_stripe(image)
+                # An unknown exposure or time is stored as 0; the provenance says so.
+                known = np.nan_to_num([row.exposure_ms, row.time_s]).tolist()
+                writer.append(Frame(image.astype(dtype, copy=False), row.stage_mm, laser_on, *known, row.pose))
+                progress(number + 1, len(frames))
+            content.refuse_black()
+    except BaseException:
+        # Unlike a recording an import can be made again: half of one is of no use.
+        part_path(out).unlink(missing_ok=True)
+        raise
+    warnings = content.warnings()
+    if unmatched := matched.unmatched:
+        few = ", ".join(unmatched[:3])
+        warnings.append(f"{len(unmatched)} images of the folder are left out, as nothing says what they are: {few}")
+    return Imported(len(matched.laser), len(matched.lamp), tuple(warnings))
 
 
-def _zero_dn(given: ImportDescription, frames: list[PlannedFrame], bits: int) -> int:
+def _zero_dn(given: ImportDescription, frames: list[Row], bits: int) -> int:
     """Grey value that stands for no difference; 0 where no background is subtracted."""
-    if all(frame.background is None for frame in frames):
+    if all(row.background is None for row in frames):
         return 0
     if given.header is not None:
         raise DescriptionError(
@@ -214,84 +216,44 @@ class _Reader:
 
     def __init__(self, given: ImportDescription, sensor: Sensor, folder: Path):
         self._given, self._sensor, self._folder = given, sensor, folder
-        self.dtype: np.dtype | None = None
-        self._kept: tuple[Path, np.ndarray] | None = None
+        self._dtype: np.dtype | None = None
+        self._kept: tuple[str, np.ndarray] | None = None
 
-    def image(self, path: Path, *, laser_on: bool) -> tuple[np.ndarray, int]:
+    def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
         """Grey image (H, W) and its bits; ImageError where it is not like the others."""
-        given, name = self._given, path.relative_to(self._folder).as_posix()
-        raw = read_image(path)
-        check_size(raw, self._sensor, name=name, first=self.dtype is None)
-        if self.dtype not in (None, raw.dtype):
-            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
+        given, camera = self._given, self._sensor.camera
+        raw = read_image(self._folder / name)
+        size, wanted = raw.shape[1::-1], (camera.width_px, camera.height_px)
+        if size != wanted:
+            before = "" if self._dtype is None else " and the images before it"
+            raise ImageError(
+                f"{name} has {size[0]} x {size[1]} pixels; expected {wanted[0]} x {wanted[1]} as the sensor "
+                f"'{self._sensor.name}' has{before}: {_SIZE_ADVICE[self._dtype is None, size == wanted[::-1]]}"
+            )
+        if self._dtype not in (None, raw.dtype):
+            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self._dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
         grey = one_channel(raw, channel, name=name)
         # A header has no bits, and grey values that a capture held fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
-        self.dtype = raw.dtype
+        self._dtype = raw.dtype
         return grey_values(grey, bits=bits, aligned=given.aligned, name=name), bits
 
-    def background(self, path: Path) -> np.ndarray:
+    def background(self, name: str) -> np.ndarray:
         """Grey image (H, W) without laser, in the laser's channel."""
-        if self._kept is None or self._kept[0] != path:
-            self._kept = path, self.image(path, laser_on=True)[0]
+        if self._kept is None or self._kept[0] != name:
+            self._kept = name, self.image(name, laser_on=True)[0]
         return self._kept[1]
 
 
-def _write(
-    out: Path,
-    header: CaptureHeader,
-    frames: list[PlannedFrame],
-    reader: _Reader,
-    content: Content,
-    *,
-    zero_dn: int,
-    dtype: np.dtype,
-    overwrite: bool,
-    progress: Callable[[int, int], None],
-) -> None:
-    writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
-    try:
-        with writer:
-            for number, frame in enumerate(frames):
-                image, _ = reader.image(frame.path, laser_on=frame.laser_on)
-                content.look(image, laser_on=frame.laser_on, name=frame.path.name)
-                if frame.background is not None:
-                    dark = reader.background(frame.background)
-                    image = without_background(image, dark, zero_dn=zero_dn)
-                if frame.laser_on:
-                    content.look_for_stripe(image)
-                exposure, time = (_UNKNOWN if value is None else value for value in (frame.exposure_ms, frame.time_s))
-                image = image.astype(dtype, copy=False)
-                writer.append(Frame(image, frame.stage_mm, frame.laser_on, exposure, time, frame.pose))
-                progress(number + 1, len(frames))
-            content.refuse_black()
-    except BaseException:
-        # Unlike a recording an import can be made again: half of one is of no use.
-        part_path(out).unlink(missing_ok=True)
-        raise
-
-
-def _remarks(given: ImportDescription, frames: list[PlannedFrame], folder: Path, *, bits: int, zero_dn: int) -> Table:
+def _remarks(given: ImportDescription, frames: list[Row], folder: Path, *, bits: int, zero_dn: int) -> Table:
     """Provenance of the capture."""
-    remarks: Table = {
-        "source": "imported images",
-        "uwlts": uwlts.__version__,
-        "folder": folder.resolve().name,
-        "bits": bits,
-        "stage": stage_remark(given),
-    }
+    remarks: Table = {"source": "imported images", "uwlts": uwlts.__version__, "folder": folder.resolve().name}
+    remarks |= {"bits": bits, "stage": stage_remark(given)}
     remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
     if zero_dn:
         remarks["background"] = f"subtracted from the laser images, {zero_dn} added"
-    for name, values in (("exposure", [f.exposure_ms for f in frames]), ("time", [f.time_s for f in frames])):
-        if None in values:
+    for name, values in (("exposure", [row.exposure_ms for row in frames]), ("time", [row.time_s for row in frames])):
+        if any(map(math.isnan, values)):
             remarks[name] = "not known of all images, stored as 0 where it is missing"
     return remarks
-
-
-def _unmatched(matched: Matched) -> list[str]:
-    if not matched.unmatched:
-        return []
-    few = ", ".join(matched.unmatched[:3])
-    return [f"{len(matched.unmatched)} images of the folder are left out, as nothing says what they are: {few}"]

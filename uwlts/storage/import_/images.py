@@ -24,19 +24,6 @@ _WARNING = b"[ WARN:"
 _AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*error: \([^)]*\) )|in function '\w+'$")
 
 
-def decode(content: bytes) -> tuple[np.ndarray | None, str]:
-    """Image as OpenCV decodes it unchanged, or None, and the message about damage or ""; may raise cv2.error."""
-    with _heard() as said:
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    return image, " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
-
-
-def pages(path: str) -> int:
-    """Number of images in a file."""
-    with _heard():
-        return cv2.imcount(path)
-
-
 @contextmanager
 def _heard() -> Iterator[list[str]]:
     """The lines about damage that are written to the standard error inside the ``with``, there after its end."""
@@ -59,15 +46,8 @@ def _heard() -> Iterator[list[str]]:
 
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
-_SIGNATURES = {
-    b"\x89PNG\r\n\x1a\n": "PNG",
-    b"II*\0": "TIFF",
-    b"MM\0*": "TIFF",
-    b"II+\0": "TIFF",
-    b"MM\0+": "TIFF",
-    b"BM": "BMP",
-    b"\xff\xd8\xff": "JPEG",
-}
+_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"BM": "BMP", b"\xff\xd8\xff": "JPEG"}
+_SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")
 # OpenCV's order of colours.
 _CHANNELS = {"blue": 0, "green": 1, "red": 2}
 
@@ -75,11 +55,8 @@ _CHANNELS = {"blue": 0, "green": 1, "red": 2}
 def read_image(path: Path) -> np.ndarray:
     """Image (H, W) or (H, W, 3) in blue, green, red, of uint8 or uint16, as stored: not turned by what EXIF says.
 
-    Raises
-    ------
-    ImageError
-        The file is missing, foreign, truncated, has an alpha channel, several pages, or other than whole numbers of 8
-        or 16 bit.
+    ImageError where the file is missing, foreign, truncated, has an alpha channel, several pages, or other than whole
+    numbers of 8 or 16 bit.
     """
     try:
         content = path.read_bytes()
@@ -90,13 +67,17 @@ def read_image(path: Path) -> np.ndarray:
         found = "it is empty" if not content else f"it begins with {content[:8]!r}"
         raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
     try:
-        image, damage = decode(content)
+        with _heard() as said:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ImageError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    damage = " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
     if image is None or damage:
         found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
         raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
-    if kind == "TIFF" and (count := pages(str(path))) > 1:
+    with _heard():
+        count = cv2.imcount(str(path)) if kind == "TIFF" else 1
+    if count > 1:
         raise ImageError(f"{path} holds {count} pages; expected one image per file: split it")
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path} holds values of {image.dtype}; expected whole numbers of 8 or 16 bit")

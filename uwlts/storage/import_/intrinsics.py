@@ -14,8 +14,6 @@ from uwlts.model.sensor import Distortion, Sensor
 # Names in use for the same thing; compared without case and underscores.
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
-_WIDTH, _HEIGHT = ("imagewidth", "width"), ("imageheight", "height")
-_MODEL = ("distortionmodel",)
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
 # Nominal data hold one focal length; a calibration of square pixels differs by less.
 _LARGEST_ASPECT = 0.01
@@ -36,11 +34,8 @@ class KnownCamera:
 def read_intrinsics(path: Path) -> KnownCamera:
     """Camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
 
-    Raises
-    ------
-    DescriptionError
-        The file is missing or damaged, has no camera matrix or distortion, or the camera is another than a pinhole with
-        k1, k2, p1, p2, k3.
+    DescriptionError where the file is missing or damaged, has no camera matrix or distortion, or the camera is another
+    than a pinhole with k1, k2, p1, p2, k3.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -49,7 +44,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
     of_opencv = text.lstrip().startswith(("%YAML", "<?xml", "{")) or "!!opencv-matrix" in text
     entries = _opencv(text, path) if of_opencv else _plain_yaml(text, path)
     known = {key.lower().replace("_", ""): value for key, value in entries.items()}
-    model = str(_first(known, _MODEL) or "").lower()
+    model = str(known.get("distortionmodel") or "").lower()
     if model not in _BROWN_CONRADY:
         raise DescriptionError(
             f"{path}: the distortion model is {model!r}; this program's camera is a pinhole with k1, k2, p1, p2, k3 "
@@ -69,17 +64,14 @@ def read_intrinsics(path: Path) -> KnownCamera:
 def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
     """The sensor with focal length, principal point and distortion of a known camera.
 
-    Raises
-    ------
-    DescriptionError
-        The camera has another image size, or its pixels are not square: a description has one focal length.
+    DescriptionError where the camera has another image size, or pixels that are not square: a description has one
+    focal length.
     """
     camera = sensor.camera
-    size = (camera.width_px, camera.height_px)
-    if known.size_px is not None and known.size_px != size:
+    if known.size_px is not None and known.size_px != (camera.width_px, camera.height_px):
         raise DescriptionError(
-            f"{source} is for images of {known.size_px[0]} x {known.size_px[1]} pixels, the sensor's are {size[0]} x "
-            f"{size[1]}: give the intrinsics of this camera at this size"
+            f"{source} is for images of {' x '.join(map(str, known.size_px))} pixels, the sensor's are "
+            f"{camera.width_px} x {camera.height_px}: give the intrinsics of this camera at this size"
         )
     focal = (known.fx_px + known.fy_px) / 2
     if abs(known.fx_px - known.fy_px) > _LARGEST_ASPECT * focal:
@@ -136,8 +128,7 @@ def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
 def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
     """Finite numbers (N,) of a matrix in any of its writings."""
     value = _first(known, names)
-    if isinstance(value, dict):
-        value = value.get("data")
+    value = value.get("data") if isinstance(value, dict) else value
     if value is None:
         raise DescriptionError(
             f"{path} has none of {', '.join(names)} (in any case, with or without underscores); it has "
@@ -162,16 +153,16 @@ def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
             "program's camera has k1, k2, p1, p2, k3, and no choice of these five equals it: calibrate with the plain "
             "model (plumb_bob)"
         )
-    names = ("k1", "k2", "p1", "p2", "k3")
-    return Distortion(**dict(zip(names, coefficients.tolist()[:5], strict=False)))
+    return Distortion(**dict(zip(("k1", "k2", "p1", "p2", "k3"), coefficients.tolist(), strict=False)))
 
 
 def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
-    width, height = _first(known, _WIDTH), _first(known, _HEIGHT)
-    if width is None or height is None:
+    size = _first(known, ("imagewidth", "width")), _first(known, ("imageheight", "height"))
+    if None in size:
         return None
     try:
-        width_px, height_px = np.array([width, height], dtype=np.float64).astype(int).tolist()
-        return width_px, height_px
+        width_px, height_px = np.array(size, dtype=np.float64).astype(int).tolist()
     except (TypeError, ValueError) as error:
-        raise DescriptionError(f"{path}: the image size is {width!r} x {height!r}; expected whole numbers") from error
+        found = " x ".join(map(repr, size))
+        raise DescriptionError(f"{path}: the image size is {found}; expected whole numbers") from error
+    return width_px, height_px
