@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated
 
 import h5py
@@ -41,18 +40,10 @@ _MARGIN_BYTES = 2**18
 class CaptureHeader(Description):
     """Description that holds for all frames of a capture.
 
-    Attributes
-    ----------
-    name, sensor, medium_name, medium
-        Of the capture, the sensor as described, and the medium it was in, by its name in that description.
-    stage_direction : (3,)
-        Nominal unit direction, in the OCS, in which the stage moves the sensor.
-    saturation_dn : int
-        Grey value at which pixels clip.
-    target, artefact : dict or None
-        Description of what was before the sensor (`parse_target`, `parse_artefact`); checked when it is used.
-    provenance : dict
-        What recorded the capture, and how; JSON.
+    ``medium_name`` is the medium's in the sensor's description, ``stage_direction`` the nominal unit direction in which
+    the stage moves the sensor, in the OCS, ``saturation_dn`` the grey value at which pixels clip. ``target`` and
+    ``artefact`` describe what was before the sensor (`parse_target`, `parse_artefact`); they are checked when they are
+    used. ``provenance`` says what recorded the capture, and how.
     """
 
     name: str
@@ -88,15 +79,18 @@ def _cut_to_used(path: Path) -> None:
     h5py.File(path, "r+", locking=False).close()
 
 
-class CaptureWriter:
+def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset) or dataset.ndim == 0:
+        raise CaptureError(f"{path} is damaged: it has no '{name}' for every frame")
+    return dataset
+
+
+class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
-    Raises
-    ------
-    OutputError
-        The file exists (give ``overwrite``), a part is left over (give ``resume`` or ``overwrite``), or storage fails.
-    CaptureError
-        ``resume`` of a part that is damaged or belongs to another recording.
+    OutputError where the file exists (give ``overwrite``), a part is left over (give ``resume`` or ``overwrite``), or
+    storage fails; CaptureError for ``resume`` of a part that is damaged or belongs to another recording.
     """
 
     def __init__(
@@ -108,18 +102,13 @@ class CaptureWriter:
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
-        try:
+        with self._storage():
             self._refuse_existing(overwrite=overwrite, resume=resume)
-            if resume and self._part.exists():
-                with self._left_over() as unfinished:
-                    self._begin(unfinished)
-            else:
-                self._begin(())
+            with self._left_over() if resume and self._part.exists() else nullcontext(()) as unfinished:
+                self._begin(unfinished)
             # Nothing is locked: whoever looks at a running recording must not stop it.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
-        except (OSError, RuntimeError) as error:
-            raise self._storage_failed(error) from error
 
     def _refuse_existing(self, *, overwrite: bool, resume: bool) -> None:
         if self.path.exists() and not self.path.is_file():
@@ -137,8 +126,8 @@ class CaptureWriter:
             unfinished = Capture(self._part)
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
-        same_header = unfinished.header.model_dump_json() == self.header.model_dump_json()
-        if not same_header or unfinished.dtype != self._dtype:
+        headers = unfinished.header.model_dump_json(), self.header.model_dump_json()
+        if headers[0] != headers[1] or unfinished.dtype != self._dtype:
             unfinished.close()
             raise CaptureError(f"{self._part} belongs to another recording; give --overwrite to start afresh")
         return unfinished
@@ -153,7 +142,21 @@ class CaptureWriter:
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
-                self._lay_out()
+                write_label(self._file, format=FORMAT, version=VERSION, header=self.header)
+                # The checksum finds damage that the compression would decode to a different picture.
+                self._file.create_dataset(
+                    "frames",
+                    (0, *self._shape),
+                    self._dtype,
+                    maxshape=(None, *self._shape),
+                    chunks=(1, *self._shape),
+                    fletcher32=True,
+                    **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+                )
+                for name, shape in _PER_FRAME.items():
+                    kind, chunks = bool if name == "laser_on" else float, (256, *shape)
+                    # No checksum: a kill while 256 rows are rewritten would then lose them all, not only the last one.
+                    self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
                 for frame in unfinished:
                     self._store(frame)
             _cut_to_used(fresh)
@@ -161,44 +164,16 @@ class CaptureWriter:
         finally:
             fresh.unlink(missing_ok=True)
 
-    def _lay_out(self) -> None:
-        write_label(self._file, format=FORMAT, version=VERSION, header=self.header)
-        # The checksum finds damage that the compression would decode to a different picture.
-        self._file.create_dataset(
-            "frames",
-            (0, *self._shape),
-            self._dtype,
-            maxshape=(None, *self._shape),
-            chunks=(1, *self._shape),
-            fletcher32=True,
-            **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
-        )
-        for name, shape in _PER_FRAME.items():
-            kind = bool if name == "laser_on" else float
-            # No checksum here: a kill while 256 rows are rewritten would then lose them all, not only the last one.
-            self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=(256, *shape))
-
     def __len__(self) -> int:
         """Number of complete frames written."""
-        return self._dataset("time_s").shape[0]
-
-    def _dataset(self, name: str) -> h5py.Dataset:
-        dataset = self._file[name]
-        if not isinstance(dataset, h5py.Dataset):
-            raise CaptureError(f"{self._part} is damaged: '{name}' is not a dataset")
-        return dataset
+        return len(_dataset(self._file, "time_s", self._part))
 
     def append(self, frame: Frame) -> None:
         """Store one frame; once this returns, the frame survives the end of the program.
 
-        Raises
-        ------
-        ImageError
-            The image has another size or type than the capture.
-        CaptureError
-            Stage position, exposure, time or pose is not finite, or the pose is not (4, 4).
-        OutputError
-            Storage fails; the frames before are kept.
+        ImageError where the image has another size or type than the capture; CaptureError where stage position,
+        exposure, time or pose is not finite, or the pose is not (4, 4); OutputError where storage fails, the frames
+        before being kept.
         """
         if frame.image.shape != self._shape or frame.image.dtype != self._dtype:
             raise ImageError(
@@ -211,10 +186,8 @@ class CaptureWriter:
             )
         if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
             raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
-        try:
+        with self._storage():
             self._store(frame)
-        except (OSError, RuntimeError) as error:
-            raise self._storage_failed(error) from error
 
     def _store(self, frame: Frame) -> None:
         self._claim_space()
@@ -223,7 +196,7 @@ class CaptureWriter:
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
         for name, value in values.items():
-            dataset = self._dataset(name)
+            dataset = _dataset(self._file, name, self._part)
             dataset.resize(count + 1, axis=0)
             dataset[count] = value
             dataset.flush()
@@ -240,38 +213,35 @@ class CaptureWriter:
             while size < wanted:
                 size += file.write(bytes(wanted - size))
 
-    def _storage_failed(self, error: OSError | RuntimeError) -> OutputError:
-        number = getattr(error, "errno", None)
-        reason = os.strerror(number) if number else " ".join(str(error).split())
-        kept = f"; complete frames are kept in {self._part.name}" if os.path.exists(self._part) else ""
-        return OutputError(f"cannot write {self.path}: {reason}{kept}")
-
-    def __enter__(self) -> "CaptureWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    @contextmanager
+    def _storage(self) -> Iterator[None]:
+        """A context in which failures of the storage become OutputErrors."""
         try:
+            yield
+        except (OSError, RuntimeError) as error:
+            number = getattr(error, "errno", None)
+            reason = os.strerror(number) if number else " ".join(str(error).split())
+            kept = f"; complete frames are kept in {self._part.name}" if os.path.exists(self._part) else ""
+            raise OutputError(f"cannot write {self.path}: {reason}{kept}") from error
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._storage():
             self._file.close()
             if kind is None:
                 _cut_to_used(self._part)
                 os.replace(self._part, self.path)
-        except (OSError, RuntimeError) as error:
-            raise self._storage_failed(error) from error
 
 
 def _what_is_wrong(error: Exception) -> str:
     """HDF5's message about a file that it cannot open; the two most usual ones in plain English."""
-    found = re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error))
-    if found:
+    if found := re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error)):
         return f"{int(found[1]):,} of its {int(found[2]):,} bytes are there; copy it again"
     if "file signature not found" in str(error):
         return "it is no HDF5 file"
     return f"HDF5 says: {error}"
 
 
-class Capture:
+class Capture(AbstractContextManager["Capture"]):
     """A capture opened for reading: per-frame arrays in memory, images read on demand.
 
     A recording that is still going on can be read too; it has the frames that were complete when it was opened.
@@ -338,9 +308,7 @@ class Capture:
 
     def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """A dataset with one row of a shape per frame; CaptureError where it is something else."""
-        dataset = self.file.get(name)
-        if not isinstance(dataset, h5py.Dataset) or dataset.ndim == 0:
-            raise CaptureError(f"{self.path} is damaged: it has no '{name}' for every frame")
+        dataset = _dataset(self.file, name, self.path)
         if dataset.shape[1:] != shape or dataset.dtype.kind != kind:
             raise CaptureError(
                 f"{self.path} contradicts itself: '{name}' is {dataset.dtype} of {dataset.shape[1:]} per frame, "
@@ -369,15 +337,9 @@ class Capture:
         """A frame with everything known about it; raises CaptureError where its data are damaged."""
         index = index + self._count if index < 0 else index
         image = self.image(index)
+        columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
         pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
-        return Frame(
-            image=image,
-            stage_mm=float(self.stage_mm[index]),
-            laser_on=bool(self.laser_on[index]),
-            exposure_ms=float(self.exposure_ms[index]),
-            time_s=float(self.time_s[index]),
-            pose=pose,
-        )
+        return Frame(image, *(column[index].item() for column in columns), pose=pose)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
         """Index and image of all frames, or only of those with the laser on or off."""
@@ -391,9 +353,6 @@ class Capture:
     def close(self) -> None:
         """Close the file."""
         self.file.close()
-
-    def __enter__(self) -> "Capture":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -336,5 +336,5 @@ def _read_hdf5(path: Path) -> PointCloud:
     if missing:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
     known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
-    per_point = (arrays[name] for name in _PER_POINT)
-    return PointCloud(*per_point, arrays.get("deviation_mm"), known, header.metadata)
+    per_point = {name: arrays[name] for name in _KINDS if name in arrays}
+    return PointCloud(**per_point, uncertainty=known, metadata=header.metadata)

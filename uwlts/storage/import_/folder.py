@@ -180,8 +180,9 @@ def import_images(
                 if laser_on:
                     content.look_for_stripe(image)
                 # An unknown exposure or time is stored as 0; the provenance says so.
-                known = np.nan_to_num([row.exposure_ms, row.time_s]).tolist()
-                writer.append(Frame(image.astype(dtype, copy=False), row.stage_mm, laser_on, *known, row.pose))
+                exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s]).tolist()
+                image = image.astype(dtype, copy=False)
+                writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
             content.refuse_black()
     except BaseException:
