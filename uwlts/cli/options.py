@@ -1,10 +1,9 @@
 """The ``uwlts`` command line itself, and what its commands share."""
 
-import pkgutil
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -22,12 +21,8 @@ Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=""
 Coefficients = Annotated[
     tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
 ]
-if TYPE_CHECKING:
-    Method = str
-else:
-    # The names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
-    _METHODS = Path(uwlts.__file__).parent / "stripe" / "methods"
-    Method = Literal[tuple(sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)])))]
+# The names of uwlts.stripe.methods, which is not imported for a command's help.
+Method = Literal["centre-of-mass", "profile-fit", "quadratic", "zero-crossing"]
 
 
 def stripe_options(

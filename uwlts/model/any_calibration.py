@@ -1,12 +1,11 @@
 """Calibrations of any kind: reading, digest, and whether one fits a recording."""
 
 import hashlib
-from typing import Protocol
 
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import CaptureHeader
 
 AnyCalibration = Calibration | PolynomialCalibration
 
@@ -16,31 +15,13 @@ AnyCalibration = Calibration | PolynomialCalibration
 _LARGEST_INDEX_CHANGE = 1e-3
 
 
-class RecordingDescription(Protocol):
-    """What has to be known of a recording to choose its calibration; the header of a capture is one."""
-
-    @property
-    def sensor(self) -> Sensor: ...
-
-    @property
-    def medium(self) -> Medium: ...
-
-    @property
-    def medium_name(self) -> str: ...
-
-
 def calibration_digest(calibration: AnyCalibration) -> str:
     """Short digest that identifies a calibration, as the clouds made with it name it."""
     return hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
 
 
-def check_fits(header: RecordingDescription, calibration: AnyCalibration, *, source: str) -> None:
-    """Refuse a calibration that cannot belong to a recording, by the recording's description.
-
-    Parameters
-    ----------
-    header : as a capture's header
-    source : name of the recording for messages
+def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> None:
+    """Refuse a calibration that cannot belong to a recording, by its header; ``source`` is its name for messages.
 
     Raises CalibrationError: image size or stripe orientation differ; the recording was made in water and the
     calibration has no window; or the calibration is one by polynomials and the recording was made in another medium, or
@@ -48,15 +29,14 @@ def check_fits(header: RecordingDescription, calibration: AnyCalibration, *, sou
     """
     camera = header.sensor.camera
     model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera
-    if (camera.width_px, camera.height_px) != (model.width_px, model.height_px):
+    size, wanted = (camera.width_px, camera.height_px), (model.width_px, model.height_px)
+    if size != wanted:
+        advice = "calibrate with images of this size, or use the calibration of the camera that took these"
+        if size[::-1] == wanted:
+            advice = "the images are turned by a quarter turn, turn them back"
         raise CalibrationError(
-            f"{source} has images of {camera.width_px} x {camera.height_px} pixels, the calibration is for "
-            f"{model.width_px} x {model.height_px}"
-            + (
-                ": the images are turned by a quarter turn, turn them back"
-                if (camera.height_px, camera.width_px) == (model.width_px, model.height_px)
-                else ": calibrate with images of this size, or use the calibration of the camera that took these"
-            )
+            f"{source} has images of {size[0]} x {size[1]} pixels, the calibration is for {wanted[0]} x {wanted[1]}: "
+            f"{advice}"
         )
     if camera.stripe_along != calibration.stripe_along:
         raise CalibrationError(
@@ -77,7 +57,7 @@ def check_fits(header: RecordingDescription, calibration: AnyCalibration, *, sou
         )
 
 
-def _check_same_refraction(header: RecordingDescription, calibration: PolynomialCalibration, *, source: str) -> None:
+def _check_same_refraction(header: CaptureHeader, calibration: PolynomialCalibration, *, source: str) -> None:
     own = calibration.medium
     index, own_index = calibration.index_of(header.medium), calibration.index_of(own)
     if header.medium.kind != own.kind or abs(index - own_index) > _LARGEST_INDEX_CHANGE:
@@ -87,6 +67,7 @@ def _check_same_refraction(header: RecordingDescription, calibration: Polynomial
             "were made in only; calibrate again in this one"
         )
     if header.sensor.camera.window.mounted != calibration.window_mounted:
-        with_window, without = "with the camera's window", "without the camera's window"
-        here, there = (with_window, without) if not calibration.window_mounted else (without, with_window)
+        here, there = "with the camera's window", "without the camera's window"
+        if calibration.window_mounted:
+            here, there = there, here
         raise CalibrationError(f"{source} was made {here}, the polynomials {there}: calibrate again")

@@ -1,6 +1,7 @@
 """Descriptions of artefacts with their calibrated sizes, distinguished by `kind`."""
 
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,13 +30,10 @@ class SphereStandard(Description):
 
     @model_validator(mode="after")
     def _one_spacing_between_neighbours(self) -> "SphereStandard":
-        if len(self.spacings_mm) != len(self.diameters_mm) - 1:
-            raise ValueError(
-                f"{len(self.diameters_mm)} spheres have {len(self.diameters_mm) - 1} spacings between consecutive "
-                f"ones; {len(self.spacings_mm)} are given"
-            )
-        pairs = zip(self.spacings_mm, self.diameters_mm, self.diameters_mm[1:], strict=False)
-        for spacing, first, second in pairs:
+        count, given = len(self.diameters_mm), len(self.spacings_mm)
+        if given != count - 1:
+            raise ValueError(f"{count} spheres have {count - 1} spacings between consecutive ones; {given} are given")
+        for spacing, (first, second) in zip(self.spacings_mm, pairwise(self.diameters_mm), strict=True):
             if spacing < (first + second) / 2:
                 raise ValueError(f"spheres of {first} and {second} mm cannot stand {spacing} mm apart: they overlap")
         return self

@@ -66,15 +66,9 @@ class CameraModel(Description):
     def described(cls, camera: Camera, *, magnified: float = 1.0) -> "CameraModel":
         """A camera as described; with a focal length ``magnified`` by refraction the distortion is not known: zero."""
         f, (cx, cy) = camera.focal_length_px() * magnified, camera.principal_point()
-        return cls(
-            width_px=camera.width_px,
-            height_px=camera.height_px,
-            fx_px=f,
-            fy_px=f,
-            cx_px=cx,
-            cy_px=cy,
-            distortion=camera.distortion if magnified == 1.0 else Distortion(),
-        )
+        size = {"width_px": camera.width_px, "height_px": camera.height_px}
+        distortion = camera.distortion if magnified == 1.0 else Distortion()
+        return cls(**size, fx_px=f, fy_px=f, cx_px=cx, cy_px=cy, distortion=distortion)
 
     def matrix(self) -> np.ndarray:
         """Camera matrix K (3, 3)."""
@@ -223,11 +217,10 @@ class Calibration(Description):
 
     def stage_direction_of(self, described: Vector) -> Vector:
         """Unit direction in the OCS of a stage that is described so, or as going back, as calibrated where it was."""
-        found = self.stage_of(described)
-        if found is None:
+        if (found := self.stage_of(described)) is None:
             return described
-        stage, forth = found
-        return stage.direction if forth else (-stage.direction[0], -stage.direction[1], -stage.direction[2])
+        (x, y, z), forth = found[0].direction, found[1]
+        return (x, y, z) if forth else (-x, -y, -z)
 
     def stage_of(self, described: Vector) -> tuple[KnownStage, bool] | None:
         """The stage that was calibrated along a direction of the OCS, and whether it goes that way or back."""

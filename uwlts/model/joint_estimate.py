@@ -63,17 +63,12 @@ class NominalSheet(_Stored):
 
 
 class JointEstimate(_Stored):
-    """All parameters that were estimated together.
+    """All P parameters that were estimated together, by iterated least squares, and the evidence.
 
-    Attributes
-    ----------
-    parameters : (P,)
-    values, std, std_before : (P,); in the parameters' units; ``std_before`` is None where nothing was known before.
-    covariance : (P, P)
-    scatter_px : standard deviation of every kind of residual
-    shared_variance : of every kind, variance of a mean of many residuals over that of as many independent ones
-    rounds : of the least squares
-    stopped : why it ended
+    ``values``, ``std`` and ``std_before`` are (P,) in the parameters' units, ``covariance`` (P, P); ``std_before`` is
+    None where nothing was known before. ``scatter_px`` is the standard deviation of every kind of residual,
+    ``shared_variance`` the variance of a mean of many residuals of a kind over that of as many independent ones.
+    ``rounds`` and ``stopped`` give the number of iterations and why they ended.
     """
 
     parameters: tuple[ParameterInFile, ...]
@@ -94,9 +89,7 @@ class JointEstimate(_Stored):
     @model_validator(mode="after")
     def _sized(self) -> "JointEstimate":
         count = len(self.parameters)
-        if any(len(each) != count for each in (self.values, self.std, self.std_before, self.covariance)) or any(
-            len(row) != count for row in self.covariance
-        ):
+        if {count} != {*map(len, (self.values, self.std, self.std_before, self.covariance, *self.covariance))}:
             raise ValueError(f"not all of it is of its {count} parameters")
         if any(row[place] < 0 for place, row in enumerate(self.covariance)):
             raise ValueError("a variance is negative")

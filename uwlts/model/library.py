@@ -7,9 +7,10 @@ A description may name a ``base`` of its own kind and give only what differs fro
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.model.sensor import Description, Sensor, Table
@@ -38,10 +39,8 @@ def find(name_or_path: str | Path, folder: str = "") -> Path:
         return path
     shipped = library_folder() / folder / f"{name_or_path}.toml"
     if not shipped.is_file():
-        known = ", ".join(names(folder))
-        raise DescriptionError(
-            f"nothing is called '{name_or_path}'; known are {known}, or give the path of a .toml file"
-        )
+        known = f"known are {', '.join(names(folder))}, or give the path of a .toml file"
+        raise DescriptionError(f"nothing is called '{name_or_path}'; {known}")
     return shipped
 
 
@@ -80,17 +79,14 @@ def validated(model: type[AnyDescription], table: object, source: str | Path) ->
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        lines = [_explained(problem) for problem in error.errors()]
-        raise DescriptionError(f"{source} is not a valid {_words(model)}:\n" + "\n".join(lines)) from error
+        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
+        lines = [f"{source} is not a valid {words}:", *map(_explained, error.errors())]
+        raise DescriptionError("\n".join(lines)) from error
     except Error as error:
         raise type(error)(f"{source}: {error}") from error
 
 
-def _words(model: type[Description]) -> str:
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
-
-
-def _explained(problem: Any) -> str:
+def _explained(problem: ErrorDetails) -> str:
     key = ".".join(str(part) for part in problem["loc"]) or "(whole description)"
     if problem["type"] == "extra_forbidden":
         return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Annotated, Any
+from typing import Annotated, get_args
 
 import numpy as np
 from pydantic import PlainSerializer, PlainValidator
@@ -134,11 +134,7 @@ class StepHeight:
 SingleParameter = LensParameter | WindowParameter | SheetParameter | StageParameter | TargetParameter
 ParameterKey = SingleParameter | MediumIndex | StepHeight
 
-_SINGLE: dict[str, SingleParameter] = {
-    key.text: key
-    for kind in (LensParameter, WindowParameter, SheetParameter, StageParameter, TargetParameter)
-    for key in kind
-}
+_SINGLE: dict[str, SingleParameter] = {key.text: key for kind in get_args(SingleParameter) for key in kind}
 
 
 def parameter_of(text: str) -> ParameterKey:
@@ -152,12 +148,10 @@ def parameter_of(text: str) -> ParameterKey:
     raise ValueError(f"there is no parameter {text!r}")
 
 
-def _decoded(value: Any) -> ParameterKey:
-    if isinstance(value, ParameterKey):
-        return value
-    if not isinstance(value, str):
+def _decoded(value: object) -> ParameterKey:
+    if not isinstance(value, ParameterKey | str):
         raise ValueError(f"a parameter is given by its text, not by {value!r}")
-    return parameter_of(value)
+    return parameter_of(value) if isinstance(value, str) else value
 
 
 ParameterInFile = Annotated[ParameterKey, PlainValidator(_decoded), PlainSerializer(lambda key: key.text)]

@@ -7,6 +7,7 @@ software computes uses this module. Everything is float64 NumPy.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Self
 
@@ -29,16 +30,6 @@ ParticleSlope = Annotated[float, Field(gt=3, lt=5)]
 BackscatterShare = Annotated[float, Field(ge=1e-4, le=0.1)]
 
 
-@dataclass(frozen=True)
-class PhaseKeys:
-    """Parameters that a medium's description holds beside the name of its phase function."""
-
-    asymmetry: float
-    particle_index: float
-    particle_slope: float
-    backscatter_share: float | None
-
-
 class PhaseFunction(ABC):
     """A phase function; ``name`` is what descriptions call it, ``sentence`` what the documentation says of it."""
 
@@ -46,8 +37,8 @@ class PhaseFunction(ABC):
     sentence: ClassVar[str]
 
     @classmethod
-    def of_keys(cls, keys: PhaseKeys) -> Self:
-        """The function of a description that only names it; one without parameters of its own ignores the keys."""
+    def of_keys(cls, keys: Mapping[str, float]) -> Self:
+        """The function of a description that only names it, by those of the medium's keys that are its parameters."""
         return cls()
 
     @abstractmethod
@@ -82,9 +73,9 @@ class HenyeyGreenstein(PhaseFunction):
     asymmetry: Asymmetry = 0.924
 
     @classmethod
-    def of_keys(cls, keys: PhaseKeys) -> Self:
+    def of_keys(cls, keys: Mapping[str, float]) -> Self:
         """By the medium's ``asymmetry``."""
-        return cls(keys.asymmetry)
+        return cls(keys["asymmetry"])
 
     def per_sr(self, angle: np.ndarray) -> np.ndarray:
         """(1 - g^2) / (4 pi (1 + g^2 - 2 g cos)^1.5), Henyey and Greenstein 1941, Eq. 2.
@@ -122,11 +113,11 @@ class FournierForand(PhaseFunction):
     slope: ParticleSlope = 3.5835
 
     @classmethod
-    def of_keys(cls, keys: PhaseKeys) -> Self:
+    def of_keys(cls, keys: Mapping[str, float]) -> Self:
         """By the medium's ``backscatter_share`` if given, else its ``particle_index`` and ``particle_slope``."""
-        if keys.backscatter_share is not None:
-            return cls.of_backscatter(keys.backscatter_share)
-        return cls(keys.particle_index, keys.particle_slope)
+        if "backscatter_share" in keys:
+            return cls.of_backscatter(keys["backscatter_share"])
+        return cls(keys["particle_index"], keys["particle_slope"])
 
     @classmethod
     def of_backscatter(cls, share: float) -> Self:
@@ -140,12 +131,9 @@ class FournierForand(PhaseFunction):
         low, high = 3.02, 4.2
         while high - low > 1e-12:
             middle = (low + high) / 2
-            low, high = (middle, high) if cls._on_line(middle).backscatter_share() < share else (low, middle)
-        return cls._on_line(low)
-
-    @classmethod
-    def _on_line(cls, slope: float) -> Self:
-        return cls(1.01 + 0.1542 * (slope - 3), slope)
+            less = cls(1.01 + 0.1542 * (middle - 3), middle).backscatter_share() < share
+            low, high = (middle, high) if less else (low, middle)
+        return cls(1.01 + 0.1542 * (low - 3), low)
 
     def backscatter_share(self) -> float:
         """Share scattered by more than 90 deg: Mobley, Sundman and Boss 2002, Eq. 7 (recalled)."""

@@ -50,12 +50,8 @@ def camera_from_object(sensor: Sensor) -> np.ndarray:
     """``T_camera_object`` (4, 4): maps the object coordinate system (OCS) to the camera frame.
 
     The OCS follows the thesis: X normal to the sheet, Z along the laser's axis away from the sensor, Y = Z x X along
-    the stripe; its origin is where the camera's axis meets the sheet (the stand-off).
-
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis in front of the window.
+    the stripe; its origin is where the camera's axis meets the sheet (the stand-off). DesignError where that is not in
+    front of the window.
     """
     pose = laser_pose(sensor)
     crossing = pose.normal[2]
@@ -95,21 +91,15 @@ def _half_width_mm(
 def view_of_sheet(sensor: Sensor, medium: Medium) -> View:
     """Line length and depth range of the nominal sensor in a medium, with lens distortion and tilts left out.
 
-    Raises
-    ------
-    DesignError
-        The sheet nowhere crosses the view within ten stand-offs.
+    DesignError where the sheet does not cross the view within ten stand-offs.
     """
-    camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
+    camera, wavelength, pose = sensor.camera, sensor.laser.wavelength_nm, laser_pose(sensor)
     index = medium.refractive_index(wavelength)
-    window = camera.window
-    outer = window.distance_mm + window.thickness_mm
-    pose = laser_pose(sensor)
+    outer = camera.window.distance_mm + camera.window.thickness_mm
     standoff = camera_from_object(sensor)[2, 3] - outer
+    across, along, axis = camera.width_px, camera.height_px, 0
     if camera.stripe_along == "width":
-        across, along, axis = camera.height_px, camera.width_px, 1
-    else:
-        across, along, axis = camera.width_px, camera.height_px, 0
+        across, along, axis = along, across, 1
     depth = np.linspace(0.0, 10 * standoff, 20001)
     sheet = (pose.normal @ pose.origin_mm - pose.normal[2] * (depth + outer)) / pose.normal[axis]
     seen = np.abs(sheet) <= _half_width_mm(camera, index, wavelength, across, depth)
@@ -120,19 +110,15 @@ def view_of_sheet(sensor: Sensor, medium: Medium) -> View:
 
 
 def check_design(sensor: Sensor, medium: Medium) -> View:
-    """Refuse a sensor that cannot work in the medium, with the reason and numbers; returns its view otherwise.
+    """View of a sensor in the medium; DesignError with the reason and numbers where it cannot work there.
 
-    Raises
-    ------
-    DesignError
-        A window smaller than the cone that passes it, a laser origin inside or behind its window, or a sheet that
-        misses the measuring volume.
+    That is with a window smaller than the cone or fan that passes it, or a sheet that misses the measuring volume.
     """
     camera, laser = sensor.camera, sensor.laser
     window = camera.window
     if window.mounted:
-        diagonal, at_window = math.hypot(camera.width_px, camera.height_px), np.zeros(1)
-        half = _half_width_mm(camera, 1.0, laser.wavelength_nm, diagonal, at_window)[0]
+        diagonal = math.hypot(camera.width_px, camera.height_px)
+        half = _half_width_mm(camera, 1.0, laser.wavelength_nm, diagonal, np.zeros(1))[0]
         needed = 2 * half + camera.focal_length_mm / camera.f_number
         if needed > window.aperture_diameter_mm:
             raise DesignError(

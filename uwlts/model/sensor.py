@@ -77,9 +77,8 @@ class Window(Description):
 
     def index(self, wavelength_nm: float) -> float:
         """Refractive index of the glass relative to air."""
-        if isinstance(self.glass, str):
-            return media.glass_index(self.glass, wavelength_nm=wavelength_nm)
-        return self.glass
+        name = self.glass
+        return media.glass_index(name, wavelength_nm=wavelength_nm) if isinstance(name, str) else name
 
     def absorption_per_mm(self) -> float:
         """Absorption of the glass in 1/mm: the given value, else the named glass's at 635 nm, else none."""
@@ -179,21 +178,23 @@ class Laser(Description):
     def _profile_within_the_fan(self) -> "Laser":
         if isinstance(self.fan_profile, str):
             return self
-        if len(self.fan_profile) < 2:
-            raise ValueError(
-                f"fan_profile has {len(self.fan_profile)} pairs of angle in deg and relative power: give at least two"
-            )
+        if (count := len(self.fan_profile)) < 2:
+            raise ValueError(f"fan_profile has {count} pairs of angle in deg and relative power: give at least two")
         angles, powers = zip(*self.fan_profile, strict=True)
         if any(b <= a for a, b in pairwise(angles)):
             raise ValueError(f"the angles of fan_profile must increase, found {angles} deg")
         if min(powers) < 0 or max(powers) == 0:
             raise ValueError(f"the powers of fan_profile must not be negative nor all zero, found {powers}")
-        if max(-angles[0], angles[-1]) > self.fan_angle_deg / 2:
+        half = self.fan_angle_deg / 2
+        if max(-angles[0], angles[-1]) > half:
             raise ValueError(
-                f"fan_profile reaches from {angles[0]:g} to {angles[-1]:g} deg, but the fan only from "
-                f"{-self.fan_angle_deg / 2:g} to {self.fan_angle_deg / 2:g} deg: widen fan_angle_deg or cut the profile"
+                f"fan_profile reaches from {angles[0]:g} to {angles[-1]:g} deg, but the fan only from {-half:g} to "
+                f"{half:g} deg: widen fan_angle_deg or cut the profile"
             )
         return self
+
+
+AnyPhase = str | phase_functions.DescribedPhase | None
 
 
 class Medium(Description):
@@ -219,7 +220,7 @@ class Medium(Description):
     turbidity: Annotated[float, Field(ge=0, le=3)] | None = None
     absorption_per_m: NotNegative | None = None
     scattering_per_m: NotNegative | None = None
-    phase: str | phase_functions.DescribedPhase | None = None
+    phase: AnyPhase = None
     asymmetry: phase_functions.Asymmetry = 0.924
     particle_index: phase_functions.ParticleIndex = 1.10
     particle_slope: phase_functions.ParticleSlope = 3.5835
@@ -228,15 +229,13 @@ class Medium(Description):
     @field_validator("water")
     @classmethod
     def _known_water(cls, value: str | None) -> str | None:
-        if value is not None and value not in waters.water_names():
-            raise ValueError(f"unknown water; known are {', '.join(waters.water_names())}")
+        if value is not None and value not in waters.WATERS:
+            raise ValueError(f"unknown water; known are {', '.join(waters.WATERS)}")
         return value
 
     @field_validator("phase")
     @classmethod
-    def _known_phase(
-        cls, value: str | phase_functions.DescribedPhase | None
-    ) -> str | phase_functions.DescribedPhase | None:
+    def _known_phase(cls, value: AnyPhase) -> AnyPhase:
         if isinstance(value, str):
             phase_functions.phase_function_kind(value)
         elif value is not None:
@@ -317,7 +316,7 @@ class Medium(Description):
     def _particles(self, wavelength_nm: float) -> waters.Particles:
         if self.turbidity is not None:
             return waters.particles_at(self.turbidity, wavelength_nm=wavelength_nm)
-        return waters.particles_of(self.water or "pure", wavelength_nm=wavelength_nm)
+        return waters.named_water(self.water or "pure").particles(wavelength_nm)
 
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
@@ -329,9 +328,8 @@ class Medium(Description):
             name = "petzold"
         else:
             name = "molecular" if self.water is None else waters.named_water(self.water).phase
-        keys = phase_functions.PhaseKeys(
-            self.asymmetry, self.particle_index, self.particle_slope, self.backscatter_share
-        )
+        parameters = {"asymmetry", "particle_index", "particle_slope", "backscatter_share"}
+        keys = self.model_dump(include=parameters, exclude_none=True)
         return phase_functions.phase_function_kind(name).of_keys(keys)
 
     def extinction_per_mm(self, wavelength_nm: float) -> float:
@@ -499,3 +497,23 @@ class Sensor(Description):
                     "a sensor is rendered at one wavelength: give all lasers the same"
                 )
         return self
+
+
+class CaptureHeader(Description):
+    """Description that holds for all frames of a capture.
+
+    ``medium_name`` is the medium's in the sensor's description, ``stage_direction`` the nominal unit direction in which
+    the stage moves the sensor, in the OCS, ``saturation_dn`` the grey value at which pixels clip. ``target`` and
+    ``artefact`` describe what was before the sensor (`parse_target`, `parse_artefact`); they are checked when they are
+    used. ``provenance`` says what recorded the capture, and how.
+    """
+
+    name: str
+    sensor: Sensor
+    medium_name: str
+    medium: Medium
+    stage_direction: UnitVector
+    saturation_dn: Annotated[int, Field(gt=0)]
+    target: Table | None = None
+    artefact: Table | None = None
+    provenance: Table = {}

@@ -27,6 +27,7 @@ from uwlts.model.media import check_range, read_table, water_absorption_per_m, w
 _STATION_NM = 530.0
 _ABSORPTION_SLOPE_PER_NM = 0.014
 _SCATTERING_EXPONENT = 1.0
+_SOURCE = "the absorption and scattering of natural waters"
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,9 @@ class Particles:
 
 @dataclass(frozen=True)
 class NaturalWater:
-    """A named water.
+    """A named water: what it adds to pure water at a wavelength in nm (RangeError outside 400-700 nm unless pure).
 
-    ``particles`` gives what it adds to pure water at a wavelength in nm; ``phase`` names the phase function of its
-    particles, one of `uwlts.model.phase_functions.KINDS`.
+    ``phase`` names the phase function of its particles, one of `uwlts.model.phase_functions.KINDS`.
     """
 
     sentence: str
@@ -55,7 +55,7 @@ class NaturalWater:
 
 def _station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: float) -> Particles:
     """Beyond the sea water of a station, carried from 530 nm to another wavelength."""
-    _check_wavelength(wavelength_nm)
+    check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, _SOURCE)
     absorption = absorption_per_m - water_absorption_per_m(wavelength_nm=_STATION_NM)
     scattering = scattering_per_m - water_scattering_per_m(wavelength_nm=_STATION_NM, salinity_g_kg=35.0)
     return Particles(
@@ -70,7 +70,7 @@ def _jerlov(column: int, wavelength_nm: float) -> Particles:
     What is linear is the difference from pure water, as its absorption climbs steeply between 575 and 600 nm. The
     molecules' part taken off the scattering is the authors' own (their Eq. 8, after Haltrin 1999).
     """
-    _check_wavelength(wavelength_nm)
+    check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, _SOURCE)
     wavelength, absorption = read_table("jerlov_absorption.csv")[[0, column]]
     scattering = read_table("jerlov_scattering.csv")[column]
     pure = np.array([water_absorption_per_m(wavelength_nm=w) for w in wavelength])
@@ -79,10 +79,6 @@ def _jerlov(column: int, wavelength_nm: float) -> Particles:
         float(np.interp(wavelength_nm, wavelength, absorption - pure)),
         float(np.interp(wavelength_nm, wavelength, scattering - molecules)),
     )
-
-
-def _check_wavelength(wavelength_nm: float) -> None:
-    check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, "the absorption and scattering of natural waters")
 
 
 WATERS = {
@@ -103,21 +99,11 @@ WATERS = {
 """All named waters: Petzold's by absorption and scattering in 1/m with sea water, Jerlov's by the tables' columns."""
 
 
-def water_names() -> tuple[str, ...]:
-    """Names of the known waters, from pure to the most turbid of either family."""
-    return tuple(WATERS)
-
-
 def named_water(name: str) -> NaturalWater:
     """The water of a name; DescriptionError with the known names."""
     if name not in WATERS:
         raise DescriptionError(f"unknown water '{name}'; known are {', '.join(WATERS)}")
     return WATERS[name]
-
-
-def particles_of(water: str, *, wavelength_nm: float) -> Particles:
-    """Particles of a named water; DescriptionError where it is unknown, RangeError outside 400-700 nm unless pure."""
-    return named_water(water).particles(wavelength_nm)
 
 
 def particles_at(turbidity: float, *, wavelength_nm: float) -> Particles:
@@ -127,12 +113,10 @@ def particles_at(turbidity: float, *, wavelength_nm: float) -> Particles:
     where the turbidity is outside 0..3, or the wavelength outside 400-700 nm.
     """
     check_range("turbidity", turbidity, 0.0, 3.0, "the scale from pure water to a harbour's")
+    clear, coastal, harbour = (WATERS[name].particles(wavelength_nm) for name in ("clear", "coastal", "harbour"))
     if turbidity <= 1:
-        clear = particles_of("clear", wavelength_nm=wavelength_nm)
         return Particles(turbidity * clear.absorption_per_m, turbidity * clear.scattering_per_m)
-    below, above = ("clear", "coastal") if turbidity < 2 else ("coastal", "harbour")
-    share = turbidity - (1 if turbidity < 2 else 2)
-    low, high = (particles_of(name, wavelength_nm=wavelength_nm) for name in (below, above))
+    low, high, share = (clear, coastal, turbidity - 1) if turbidity < 2 else (coastal, harbour, turbidity - 2)
     return Particles(
         low.absorption_per_m ** (1 - share) * high.absorption_per_m**share,
         low.scattering_per_m ** (1 - share) * high.scattering_per_m**share,

@@ -7,27 +7,24 @@ from typing import assert_never
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.storage.files import read_json, read_model, written_aside
+from uwlts.storage.files import read_json, read_model, write_model, written_aside
 
-FORMAT, VERSION = "uwlts-calibration", 1
-POLYNOMIALS_FORMAT, POLYNOMIALS_VERSION = "uwlts-polynomials", 1
+FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
 
 
 def write_calibration(path: str | Path, calibration: AnyCalibration, *, overwrite: bool = False) -> None:
     """Write a calibration of any kind as JSON, completely or not at all; OutputError if that fails."""
-    content = calibration.model_dump(mode="json")
     match calibration:
         case Calibration():
-            text = json.dumps({"format": FORMAT, "version": VERSION} | content, indent=2)
+            write_model(path, calibration, format=FORMAT, version=VERSION, overwrite=overwrite)
         case PolynomialCalibration():
             # One key a line: indented, the thousands of coefficients would take a line each.
-            content = {"format": POLYNOMIALS_FORMAT, "version": POLYNOMIALS_VERSION} | content
+            content = {"format": POLYNOMIALS_FORMAT, "version": VERSION} | calibration.model_dump(mode="json")
             lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
-            text = f"{{\n{lines}\n}}"
+            with written_aside(path, overwrite=overwrite) as aside:
+                aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
         case _:
             assert_never(calibration)
-    with written_aside(path, overwrite=overwrite) as aside:
-        aside.write_text(text + "\n", encoding="utf-8")
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -37,8 +34,8 @@ def read_calibration(path: str | Path) -> Calibration:
 
 def read_polynomials(path: str | Path) -> PolynomialCalibration:
     """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    called, format = "polynomial calibration", POLYNOMIALS_FORMAT
-    return read_model(path, PolynomialCalibration, format=format, version=POLYNOMIALS_VERSION, called=called)
+    known_by = {"format": POLYNOMIALS_FORMAT, "called": "polynomial calibration"}
+    return read_model(path, PolynomialCalibration, version=VERSION, **known_by)
 
 
 def load_calibration(path: str | Path) -> AnyCalibration:

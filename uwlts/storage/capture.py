@@ -15,16 +15,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import h5py
 import hdf5plugin
 import numpy as np
-from pydantic import Field
 
 from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.joint_estimate import CaptureSource
-from uwlts.model.sensor import Description, Medium, Sensor, Table, UnitVector
+from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.storage.files import sha256_of
 from uwlts.storage.hdf5_file import UnfinishedFile, has_writer, read_label, write_label
 
@@ -35,26 +33,6 @@ _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (),
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 # Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
 _MARGIN_BYTES = 2**18
-
-
-class CaptureHeader(Description):
-    """Description that holds for all frames of a capture.
-
-    ``medium_name`` is the medium's in the sensor's description, ``stage_direction`` the nominal unit direction in which
-    the stage moves the sensor, in the OCS, ``saturation_dn`` the grey value at which pixels clip. ``target`` and
-    ``artefact`` describe what was before the sensor (`parse_target`, `parse_artefact`); they are checked when they are
-    used. ``provenance`` says what recorded the capture, and how.
-    """
-
-    name: str
-    sensor: Sensor
-    medium_name: str
-    medium: Medium
-    stage_direction: UnitVector
-    saturation_dn: Annotated[int, Field(gt=0)]
-    target: Table | None = None
-    artefact: Table | None = None
-    provenance: Table = {}
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 import tomli_w
 
 from uwlts.model.errors import OutputError, SetupError
-from uwlts.storage.capture import Capture, Frame
+from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud, write_cloud
 from uwlts.storage.files import refuse_unsuitable, written_aside
 from uwlts.storage.import_.description import NAME
@@ -83,14 +83,8 @@ def export_capture(
     """Write a capture's frames as images of its own depth, without loss, into a new folder; whole or not at all.
 
     Beside them stand frames.csv (file, light, stage_mm, exposure_ms, time_s, and the pose's elements if any frame has
-    one), header.json and import.toml.
-
-    Raises
-    ------
-    OutputError
-        The folder exists, its parent is missing, or storage fails.
-    CaptureError
-        A frame's data are damaged.
+    one), header.json and import.toml. OutputError where the folder exists, its parent is missing, or storage fails;
+    CaptureError where a frame's data are damaged.
     """
     if folder.exists():
         raise OutputError(f"{folder} exists already; give the name of a new folder")
@@ -101,16 +95,19 @@ def export_capture(
         aside.mkdir()
         rows = []
         for index, frame in enumerate(capture):
-            name = f"{index:05d}-{'laser' if frame.laser_on else 'lamp'}.{image_format}"
+            light = "laser" if frame.laser_on else "lamp"
+            name = f"{index:05d}-{light}.{image_format}"
             _, encoded = cv2.imencode(f".{image_format}", frame.image)
             (aside / name).write_bytes(encoded.tobytes())
-            rows.append(_row(name, frame))
+            pose = [] if frame.pose is None else frame.pose.ravel().tolist()
+            rows.append([name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *pose])
             progress(index + 1, len(capture))
+        # Only captures with a pose have its columns, which stand last.
+        width = max(map(len, rows), default=len(_COLUMNS))
         with open(aside / TABLE, "w", newline="", encoding="utf-8") as file:
-            # Only captures with a pose have its columns, which stand last.
-            table = csv.DictWriter(file, max(rows, key=len, default=_COLUMNS), restval="", lineterminator="\n")
-            table.writeheader()
-            table.writerows(rows)
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow((*_COLUMNS, *POSE_COLUMNS)[:width])
+            table.writerows([*row, *[""] * (width - len(row))] for row in rows)
         (aside / HEADER).write_text(capture.header.model_dump_json(indent=2) + "\n", encoding="utf-8")
         description = {"header": HEADER, "table": TABLE, "repeated": True}
         (aside / NAME).write_text(tomli_w.dumps(description), encoding="utf-8")
@@ -119,13 +116,6 @@ def export_capture(
         raise OutputError(f"cannot write {folder}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
-
-
-def _row(name: str, frame: Frame) -> dict[str, str | float]:
-    light = "laser" if frame.laser_on else "lamp"
-    pose = [] if frame.pose is None else frame.pose.ravel().tolist()
-    values = (name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *pose)
-    return dict(zip((*_COLUMNS, *POSE_COLUMNS)[: len(values)], values, strict=True))
 
 
 CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")
@@ -147,13 +137,8 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
       (0 where unknown); ``amplitude`` holds it as it is, ``frame``, ``line`` and ``deviation_mm`` the rest.
     - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate.
 
-    Raises
-    ------
-    OutputError
-        The suffix is none of these, the file exists, the cloud is empty, too wide for LAZ, or lacks intensities that
-        E57 cannot leave out; storage fails.
-    SetupError
-        The library of the format is not installed.
+    OutputError where the suffix is none of these, the file exists, the cloud is empty, too wide for LAZ, or lacks
+    intensities that E57 cannot leave out, or storage fails; SetupError where the format's library is not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in CLOUD_FORMATS:
@@ -161,26 +146,23 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
     refuse_unsuitable(path, overwrite=overwrite)
     if len(cloud) == 0:
         raise OutputError("the cloud has no points: there is nothing to export")
-    match suffix:
-        case ".ply" | ".h5":
-            write_cloud(path, cloud, overwrite=overwrite)
-        case ".xyz":
-            _write_xyz(cloud, path, overwrite=overwrite)
-        case ".laz":
-            _write_laz(cloud, path, overwrite=overwrite)
-        case _:
-            _write_e57(cloud, path, overwrite=overwrite)
+    if suffix in (".ply", ".h5"):
+        write_cloud(path, cloud, overwrite=overwrite)
+        return
+    with written_aside(path, overwrite=overwrite) as aside:
+        if suffix == ".xyz":
+            rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
+            with open(aside, "w", encoding="utf-8") as file:
+                # CloudCompare takes the names from a first line that begins so.
+                file.write("//X Y Z Intensity\n")
+                file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
+        elif suffix == ".laz":
+            aside.write_bytes(_laz(cloud))
+        else:
+            _write_e57(cloud, aside, path)
 
 
-def _write_xyz(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
-    with written_aside(path, overwrite=overwrite) as aside, open(aside, "w", encoding="utf-8") as file:
-        # CloudCompare takes the names from a first line that begins so.
-        file.write("//X Y Z Intensity\n")
-        rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
-        file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
-
-
-def _write_laz(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
+def _laz(cloud: PointCloud) -> bytes:
     laspy = _library("laspy", "LAZ")
     _library("lazrs", "LAZ")
     points = 1e-3 * cloud.points_mm
@@ -202,14 +184,13 @@ def _write_laz(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
     table.intensity = np.rint(np.nan_to_num(cloud.intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
     for name, values in extra.items():
         table[name] = values
-    # The compressor has errors of its own where storage fails.
+    # In memory: the compressor has errors of its own where storage fails.
     content = BytesIO()
     table.write(content, do_compress=True)
-    with written_aside(path, overwrite=overwrite) as aside:
-        aside.write_bytes(content.getvalue())
+    return content.getvalue()
 
 
-def _write_e57(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
+def _write_e57(cloud: PointCloud, aside: Path, path: Path) -> None:
     pye57 = _library("pye57", "E57")
     unknown = np.isnan(cloud.intensity)
     if unknown.any() and not unknown.all():
@@ -222,13 +203,12 @@ def _write_e57(cloud: PointCloud, path: Path, *, overwrite: bool) -> None:
     data: dict[str, np.ndarray] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
     if not unknown.any():
         data["intensity"] = cloud.intensity
-    with written_aside(path, overwrite=overwrite) as aside:
-        try:
-            file = pye57.E57(str(aside), mode="w")
-            file.write_scan_raw(data, name=path.stem)
-            file.close()
-        except pye57.libe57.E57Exception as error:
-            raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from error
+    try:
+        file = pye57.E57(str(aside), mode="w")
+        file.write_scan_raw(data, name=path.stem)
+        file.close()
+    except pye57.libe57.E57Exception as error:
+        raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from error
 
 
 def _library(name: Literal["laspy", "lazrs", "pye57"], format: str) -> ModuleType:

@@ -105,13 +105,13 @@ def read_json(path: str | Path, *, called: str) -> Table:
     except OSError as error:
         raise CaptureError(f"cannot read the {called} {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path} is not {_article(called)}, or is truncated: {error}") from error
+        raise CaptureError(f"{path} is not {_a(called)}, or is truncated: {error}") from error
     if not isinstance(content, dict):
-        raise CaptureError(f'{path} is JSON but not {_article(called)}: expected an object with a "format"')
+        raise CaptureError(f'{path} is JSON but not {_a(called)}: expected an object with a "format"')
     return content
 
 
-def _article(called: str) -> str:
+def _a(called: str) -> str:
     return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
 
 
@@ -121,7 +121,7 @@ def read_model(
     """Content of a JSON file of the program; CaptureError where it is missing, foreign, newer or damaged."""
     content = read_json(path, called=called)
     if content.pop("format", None) != format:
-        raise CaptureError(f'{path} is JSON but not {_article(called)}: expected "format": "{format}"')
+        raise CaptureError(f'{path} is JSON but not {_a(called)}: expected "format": "{format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
     try:

@@ -8,6 +8,7 @@ for ever.
 import io
 import json
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -95,12 +96,10 @@ class UnfinishedFile(h5py.File):
     """
 
     def __init__(self, path: str | Path):
-        self._view = _AsIfClosed(path)
-        try:
+        with ExitStack() as opened:
+            self._view = opened.enter_context(_AsIfClosed(path))
             super().__init__(self._view, "r")
-        except BaseException:
-            self._view.close()
-            raise
+            opened.pop_all()
 
     def close(self) -> None:
         """Close the file."""

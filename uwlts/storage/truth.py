@@ -1,6 +1,6 @@
 """The ground-truth file that lies beside a rendered capture; nothing but the comparison with truth reads it."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 
@@ -61,9 +61,8 @@ def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrit
     # HDF5's latest format has checksums over all that the file says of itself.
     with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
         write_label(file, format=FORMAT, version=VERSION, header=header)
-        for field in fields(truth):
-            values = getattr(truth, field.name)
-            file.create_dataset(field.name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
+        for name, values in vars(truth).items():
+            file.create_dataset(name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
 
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
@@ -73,11 +72,18 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
-            arrays = {field.name: _array(file, field.name, path) for field in fields(Truth)}
+            truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS})
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
-    truth = Truth(**arrays)
-    _require_consistent(truth, path)
+    lines = truth.status.shape
+    shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}
+    if shapes != {name: lines if _DIMENSIONS[name] == 2 else (*lines, 3) for name in shapes}:
+        raise CaptureError(f"{path} contradicts itself: its arrays have the shapes {shapes}")
+    if not np.isin(truth.status, list(TruthStatus)).all():
+        raise CaptureError(f"{path} holds unknown statuses; known are {[int(status) for status in TruthStatus]}")
+    visible = truth.status == TruthStatus.VISIBLE
+    if not all(np.isfinite(values[visible]).all() for values in (truth.centre_px, truth.point_mm, truth.normal)):
+        raise CaptureError(f"{path} says that a stripe is visible where centre, point or normal are not finite")
     return header, truth
 
 
@@ -87,16 +93,3 @@ def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kinds or dataset.ndim != _DIMENSIONS[name]:
         raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {_DIMENSIONS[name]} dimensions")
     return dataset[...]
-
-
-def _require_consistent(truth: Truth, path: str | Path) -> None:
-    lines = truth.status.shape
-    shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}
-    expected = {name: lines if _DIMENSIONS[name] == 2 else (*lines, 3) for name in shapes}
-    if shapes != expected:
-        raise CaptureError(f"{path} contradicts itself: its arrays have the shapes {shapes}")
-    if not np.isin(truth.status, list(TruthStatus)).all():
-        raise CaptureError(f"{path} holds unknown statuses; known are {[int(status) for status in TruthStatus]}")
-    visible = truth.status == TruthStatus.VISIBLE
-    if not all(np.isfinite(values[visible]).all() for values in (truth.centre_px, truth.point_mm, truth.normal)):
-        raise CaptureError(f"{path} says that a stripe is visible where centre, point or normal are not finite")

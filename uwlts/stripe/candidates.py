@@ -17,7 +17,7 @@ import numpy as np
 
 _NOISE_SAMPLES = 1024
 
-_MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
+MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
 """Median of the larger of two smaller-of-two of unit Gaussian noise: each stays below x with 1 - (1 - P(x))^2."""
 
 
@@ -69,21 +69,8 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
         # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.
         below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
         median += (0.5 * sample.size - below) / equal - 0.5
-    return max(median, 0.0) / _unit_contrast(block)
-
-
-def coarse_threshold(noise: float, *, block: int, floor: float) -> float:
-    """Contrast from which a block deserves a closer look, grey levels.
-
-    4 standard deviations, so that a stripe of 6 is hardly ever missed, over the median of the background.
-    """
-    return max(floor, noise * (4.0 - _MEDIAN_SURROUNDINGS))
-
-
-@lru_cache
-def _unit_contrast(block: int) -> float:
-    """Median contrast of a block of unit Gaussian noise: the largest of n minus the surroundings."""
-    return NormalDist().inv_cdf(0.5 ** (1.0 / block)) - _MEDIAN_SURROUNDINGS
+    # Median contrast of a block of unit Gaussian noise: the largest of n minus the surroundings.
+    return max(median, 0.0) / (NormalDist().inv_cdf(0.5 ** (1.0 / block)) - MEDIAN_SURROUNDINGS)
 
 
 def first_true(mask: np.ndarray) -> np.ndarray:

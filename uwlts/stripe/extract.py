@@ -10,24 +10,10 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
-from uwlts.stripe.candidates import (
-    block_contrast,
-    block_extremes,
-    coarse_threshold,
-    first_true,
-    last_true,
-    noise_from_contrast,
-)
+from uwlts.stripe import candidates
+from uwlts.stripe.candidates import block_contrast, block_extremes, first_true, last_true
 from uwlts.stripe.methods import place_centre
-from uwlts.stripe.peak_window import (
-    FLANK,
-    FWHM_PER_SIGMA,
-    PeakWindow,
-    measure_windows,
-    noise_gain,
-    off_centre,
-    peak_row,
-)
+from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow, measure_windows, noise_gain, peak_row
 from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeStatus
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
@@ -89,8 +75,18 @@ def extract_stripe(
     """
     half, block = options.half_window_px, options.half_window_px // 2
     _check_image(image, name="image")
-    _check_length(image, stripe_along=stripe_along, least=4 * half)
-    clip = _saturation_of(image, saturation)
+    if stripe_along not in ("height", "width"):
+        raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
+    if max(image.shape) > _LONGEST_SIDE:
+        raise ImageError(f"the image is {image.shape}; each side may have at most {_LONGEST_SIDE} pixels: crop it")
+    if (length := image.shape[1 if stripe_along == "height" else 0]) < 4 * half:
+        raise ImageError(
+            f"the image's lines have {length} pixels; the search needs {4 * half}: lower half_window_px or check "
+            "stripe_along"
+        )
+    if saturation is not None and not 0 < saturation < math.inf:
+        raise ImageError(f"saturation is {saturation!r}; expected the positive grey value at which pixels clip")
+    clip = _LARGEST[image.dtype] if saturation is None else saturation
 
     signal = image if background is None else _subtract_background(image, background)
     if (count := options.smoothing_lines) > 1:
@@ -101,7 +97,7 @@ def extract_stripe(
     # Two blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
     board = np.zeros((high.shape[0] + 4, high.shape[1]), high.dtype)
     contrast = block_contrast(high, low, out=board[2:-2])
-    found = _search(profiles, board, noise_from_contrast(contrast, block), options)
+    found = _search(profiles, board, candidates.noise_from_contrast(contrast, block), options)
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -116,7 +112,7 @@ def extract_stripe(
 
 @dataclass(frozen=True)
 class _Lines:
-    """Results of L lines, filled while the search goes on."""
+    """Results (L,) of L lines, filled while the search goes on."""
 
     centre: np.ndarray
     amplitude: np.ndarray
@@ -128,6 +124,12 @@ class _Lines:
     def empty(cls, count: int) -> _Lines:
         amplitude, width, height = np.full((3, count), np.nan, np.float32)
         return cls(np.full(count, np.nan), amplitude, width, np.full(count, _NO_STRIPE), height)
+
+    def enter(self, lines: np.ndarray, peak: PeakWindow, method: str) -> None:
+        centre, self.amplitude[lines] = place_centre(method, peak)
+        self.centre[lines] = peak.start + centre.astype(np.float64)
+        self.width[lines] = peak.sigma * FWHM_PER_SIGMA
+        self.height[lines] = peak.height
 
     def discard(self, lines: np.ndarray, status: np.uint8) -> None:
         self.status[lines] = status
@@ -143,7 +145,8 @@ def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: Stri
     """
     block = options.half_window_px // 2
     found = _Lines.empty(board.shape[1])
-    coarse = coarse_threshold(noise, block=block, floor=options.threshold_floor)
+    # 4 standard deviations over the median of the background, so that a stripe of 6 is hardly ever missed.
+    coarse = max(options.threshold_floor, noise * (4.0 - candidates.MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
     share = options.ambiguous_ratio * _COARSE_SLACK
     lines = np.arange(board.shape[1])
@@ -176,7 +179,8 @@ def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: Stri
             status[rival] = _AMBIGUOUS
         status = np.where(new, verdict, status)
         found.status[lines] = status
-        _measure(found, lines, peak, new & (verdict == _OK), options)
+        if (which := new & (verdict == _OK)).any():
+            found.enter(lines[which], peak if which.all() else peak.keep(which), options.method)
 
         # The window has been searched for rivals already; of what is no stripe only the block itself is done with.
         place = chosen * board.shape[1] + lines
@@ -250,7 +254,10 @@ def _centred_windows(
         whole=options.peak is PeakRule.STRONGEST,
     )
     peak = measured(lines, place)
-    offset, needed = off_centre(peak)
+    # The window follows a peak of which a half-height crossing or a flank lies outside it.
+    to_end = 0.5 * (peak.window.shape[0] - 1)
+    offset = peak.middle - to_end
+    needed = (np.abs(offset) + peak.reach > to_end - FLANK + 0.5) | ~peak.closed
     needed &= peak.height >= fine
     if needed.any():
         shifted = place[needed] + np.rint(offset[needed]).astype(np.intp)
@@ -276,19 +283,6 @@ def _judge(peak: PeakWindow, count: int, fine: float, options: StripeOptions) ->
         verdict[outside & ~peak.closed & (highest > 1) & (highest < count - 2)] = _BORDER
     verdict[peak.height < fine] = _NO_STRIPE
     return verdict
-
-
-def _measure(found: _Lines, lines: np.ndarray, peak: PeakWindow, which: np.ndarray, options: StripeOptions) -> None:
-    """Enter centre, amplitude and width of the chosen peaks."""
-    if not which.any():
-        return
-    if not which.all():
-        lines, peak = lines[which], peak.keep(which)
-    centre, amplitude = place_centre(options.method, peak)
-    found.centre[lines] = peak.start + centre.astype(np.float64)
-    found.amplitude[lines] = amplitude
-    found.width[lines] = peak.sigma * FWHM_PER_SIGMA
-    found.height[lines] = peak.height
 
 
 def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: float) -> np.ndarray:
@@ -326,29 +320,6 @@ def _check_image(image: np.ndarray, *, name: str) -> None:
     if image.dtype == np.float32 and not np.isfinite(image).all():
         count = image.size - np.count_nonzero(np.isfinite(image))
         raise ImageError(f"the {name} has {count} pixels that are not finite; repair or mask them before")
-
-
-def _check_length(image: np.ndarray, *, stripe_along: str, least: int) -> None:
-    """ImageError for an unknown orientation, lines shorter than the search needs and images OpenCV cannot address."""
-    if stripe_along not in ("height", "width"):
-        raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
-    if max(image.shape) > _LONGEST_SIDE:
-        raise ImageError(f"the image is {image.shape}; each side may have at most {_LONGEST_SIDE} pixels: crop it")
-    length = image.shape[1] if stripe_along == "height" else image.shape[0]
-    if length < least:
-        raise ImageError(
-            f"the image's lines have {length} pixels; the search needs {least}: lower half_window_px or check "
-            "stripe_along"
-        )
-
-
-def _saturation_of(image: np.ndarray, saturation: float | None) -> float:
-    """Grey value at which pixels clip: as given, else the type's largest (none for float32)."""
-    if saturation is None:
-        return _LARGEST[image.dtype]
-    if not math.isfinite(saturation) or saturation <= 0:
-        raise ImageError(f"saturation is {saturation!r}; expected the positive grey value at which pixels clip")
-    return float(saturation)
 
 
 def _subtract_background(image: np.ndarray, background: np.ndarray) -> np.ndarray:

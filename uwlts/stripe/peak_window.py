@@ -30,30 +30,15 @@ _FLANK_FROM = np.array([[1 - FLANK], [-1]], np.float32)
 
 @dataclass(frozen=True)
 class PeakWindow:
-    """Peaks in M windows of W pixels. Positions count from the window's first pixel.
+    """Peaks in M windows of W pixels. Positions count from the window's first pixel; px and grey levels.
 
-    Attributes
-    ----------
-    start : (M,) int
-        Position of the window's first pixel on its line.
-    window : (W, M) array of the image's type
-        Grey levels; beyond the image border the border pixel repeats.
-    smooth : (W, M) float32
-        The window after the low-pass.
-    middle : (M,) float32
-        Midpoint of the half-height crossings.
-    sigma : (M,) float32
-        Half-height width over 2.355, the sigma of a Gaussian, px, with the low-pass taken out (variances add).
-    reach : (M,) float32
-        Whole number: distance from `middle` to the first background pixel, px.
-    base, slope : (M,) float32
-        Background at `middle`, grey levels, and its slope, grey levels per px, from the flanks beyond `reach`.
-    height : (M,) float32
-        Peak of `smooth` above `base`, or above the lowest surroundings where not `closed`.
-    closed : (M,) bool
-        Both half-height crossings lie in the window.
-    crowded : (M,) bool
-        Outside the half-height crossings something reaches the given share of the peak again.
+    ``start`` (M,) int is the first pixel's position on its line, ``window`` (W, M) the pixels in the image's type, with
+    the border pixel repeated beyond the border, ``smooth`` (W, M) float32 the window after the low-pass. All others are
+    (M,): ``middle`` of the half-height crossings; ``sigma``, the half-height width over 2.355 with the low-pass taken
+    out (variances add); ``reach``, the whole number of pixels from ``middle`` to the first background pixel; background
+    ``base`` at ``middle`` and its ``slope`` per px, from the flanks beyond ``reach``; ``height`` of the peak of
+    ``smooth`` above ``base``, or above the lowest surroundings where not ``closed``: both half-height crossings lie in
+    the window; ``crowded`` where something outside the crossings reaches the given share of the peak again.
     """
 
     start: np.ndarray
@@ -93,29 +78,18 @@ def measure_windows(
     share: float,
     whole: bool,
 ) -> PeakWindow:
-    """Measure what stands at or near the `block` pixels that begin at `place`.
+    """Measure what stands at or near the `block` pixels that begin at `place` (M,) on `lines` (M,) of profiles (N, L).
 
-    Parameters
-    ----------
-    profiles : (N, L) array
-        Grey levels, position along the line first.
-    lines, place : (M,) int
-        Line and first pixel of each place.
-    half, block : int
-        The window is the block and `half` pixels on either side; it may run over the image border. The peak is sought
-        in the block and half a block on either side.
-    smoothing : float
-        Sigma of the low-pass, px.
-    share : float
-        Share of the peak's height from which a second peak makes the window crowded.
-    whole : bool
-        Look for a second peak in the whole window, else only as far as the pixels used reach.
+    The window is the block and `half` pixels on either side; it may run over the image border. The peak is sought in
+    the block and half a block on either side. `smoothing` is the sigma of the low-pass, px. A second peak of `share` of
+    the first one's height makes the window crowded; it is looked for in the `whole` window, else only as far as the
+    pixels used reach.
     """
     size = 2 * half + block
     start = place - half
     window = _cut(profiles, lines, start, size)
     smooth = cv2.sepFilter2D(window, cv2.CV_32F, _ONE, _kernel(smoothing), borderType=cv2.BORDER_REPLICATE)
-    columns = np.arange(lines.size)
+    columns, row = np.arange(lines.size), np.arange(size)[:, None]
 
     peak = smooth[_sought(half, block)].max(axis=0)
     before, after = smooth[:block].min(axis=0), smooth[-block:].min(axis=0)
@@ -133,7 +107,8 @@ def measure_windows(
     several = np.flatnonzero(crowded)
     crowd = smooth.take(several, axis=1)
     if several.size:
-        edges[:, several] = _around(high.take(several, axis=1), peak_row(crowd, half=half, block=block))
+        below, at = ~high.take(several, axis=1), peak_row(crowd, half=half, block=block)
+        edges[:, several] = last_true(below & (row < at)), first_true(below & (row > at))
     closed = (edges[0] >= 0) & (edges[1] < size)
     x_left, x_right = _crossings(smooth, columns, edges, level)
     middle = 0.5 * (x_left + x_right)
@@ -145,23 +120,13 @@ def measure_windows(
     before, after = _flanks(smooth, columns, near - _INWARD_F * reach + _FLANK_FROM)
     if several.size:
         extent = size if whole else (reach + (FLANK - 1))[several]
-        floor = (ground + share * (peak - ground))[several]
-        crowded[several] = _second_peak(crowd >= floor, edges[:, several], near[several], extent)
+        outside = (row <= edges[0, several]) | (row >= edges[1, several])
+        again = crowd >= (ground + share * (peak - ground))[several]
+        crowded[several] = (again & outside & (np.abs(row - near[several]) <= extent)).any(axis=0)
     slope = (after - before) / (2.0 * reach + (FLANK - 2))
     base = 0.5 * (before + after) + slope * (middle - near)
-    return PeakWindow(
-        start=start,
-        window=window,
-        smooth=smooth,
-        middle=middle,
-        sigma=sigma,
-        reach=reach,
-        base=base,
-        slope=slope,
-        height=peak - np.where(closed, base, ground),
-        closed=closed,
-        crowded=crowded,
-    )
+    height = peak - np.where(closed, base, ground)
+    return PeakWindow(start, window, smooth, middle, sigma, reach, base, slope, height, closed, crowded)
 
 
 def peak_row(smooth: np.ndarray, *, half: int, block: int) -> np.ndarray:
@@ -169,17 +134,6 @@ def peak_row(smooth: np.ndarray, *, half: int, block: int) -> np.ndarray:
     rows = _sought(half, block)
     sought = smooth[rows]
     return rows.start + first_true(sought == sought.max(axis=0))
-
-
-def off_centre(peak_window: PeakWindow) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (M,) in px of the peak's middle from its window's, and which windows have to follow it (M,).
-
-    These are the ones in which a half-height crossing or a flank lies outside the window.
-    """
-    to_end = 0.5 * (peak_window.window.shape[0] - 1)
-    offset = peak_window.middle - to_end
-    needed = np.abs(offset) + peak_window.reach > to_end - FLANK + 0.5
-    return offset, needed | ~peak_window.closed
 
 
 def _sought(half: int, block: int) -> slice:
@@ -213,18 +167,6 @@ def noise_gain(sigma: float) -> float:
     return float(np.sqrt(np.sum(_kernel(sigma) ** 2)))
 
 
-def _around(high: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(M,) int each: the rows nearest to `at` on either side where the (W, M) mask is not set."""
-    row = np.arange(high.shape[0])[:, None]
-    return last_true(~high & (row < at)), first_true(~high & (row > at))
-
-
-def _second_peak(high: np.ndarray, edges: np.ndarray, near: np.ndarray, extent: np.ndarray | int) -> np.ndarray:
-    """(M,) bool: something in the (W, M) mask within `extent` of `near` but not between the (2, M) `edges`."""
-    row = np.arange(high.shape[0])[:, None]
-    return (high & ((row <= edges[0]) | (row >= edges[1])) & (np.abs(row - near) <= extent)).any(axis=0)
-
-
 def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level: np.ndarray) -> np.ndarray:
     """(2, M) float32: where the straight lines from two rows below `level` to their inner neighbours meet it.
 
@@ -251,7 +193,7 @@ def _flanks(smooth: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.nd
 
 
 def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, highest: int) -> list[np.ndarray]:
-    """M0 ... Mk of the profile above `peak.base` under the Gaussian weight at `centre`; see `methods.zero_crossing`."""
+    """M0 ... Mk of the profile above `peak.base` under the Gaussian weight at `centre`; see `zero_crossing`."""
     # Rows beyond the weight of every window, less than 0.003 there, are left out.
     size = peak.window.shape[0]
     reach = 3.5 * float(sigma.max())

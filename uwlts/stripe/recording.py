@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import CaptureError, ImageError
-from uwlts.model.sensor import Sensor
+from uwlts.model.sensor import CaptureHeader
 from uwlts.stripe.extract import extract_stripe
 from uwlts.stripe.result import StripeOptions, StripeStatus
 
@@ -27,14 +27,6 @@ _CLEARLY = 3
 seen on a fifth of as many, at its steep places."""
 
 
-class _Header(Protocol):
-    @property
-    def sensor(self) -> Sensor: ...
-
-    @property
-    def saturation_dn(self) -> int: ...
-
-
 class LaserImages(Protocol):
     """A sequence of images, numbered, of which those taken with the laser on can be read; a capture is one."""
 
@@ -42,7 +34,7 @@ class LaserImages(Protocol):
     def path(self) -> Path: ...
 
     @property
-    def header(self) -> _Header: ...
+    def header(self) -> CaptureHeader: ...
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]: ...
 
@@ -55,12 +47,9 @@ class FoundStripes:
 
     Attributes
     ----------
-    frame, line : (N,) int
-        Image and profile line of each centre.
-    centre_px, amplitude, width_px : (N,)
-        Place on the line, height in grey levels and full width at half maximum.
-    lines_by_status : dict
-        What became of the profile lines of all images.
+    frame, line : (N,) int; image and profile line of each centre
+    centre_px, amplitude, width_px : (N,); place on the line, height in grey levels and full width at half maximum
+    lines_by_status : numbers of the profile lines of all images by the names of `StripeStatus`
     """
 
     frame: np.ndarray
@@ -72,8 +61,8 @@ class FoundStripes:
 
     def __getitem__(self, some: np.ndarray) -> "FoundStripes":
         """Those that an index array or mask chooses."""
-        chosen = (self.frame[some], self.line[some], self.centre_px[some], self.amplitude[some], self.width_px[some])
-        return FoundStripes(*chosen, self.lines_by_status)
+        columns = self.frame, self.line, self.centre_px, self.amplitude, self.width_px
+        return FoundStripes(*(column[some] for column in columns), lines_by_status=self.lines_by_status)
 
 
 def find_stripes(
@@ -148,13 +137,17 @@ def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: i
             white += 1
         else:
             across += runs_across(image, stripe_along=stripe_along)
+
+    def so_many(some: int) -> str:
+        return "all are" if some == count else f"{some} of {count} are"
+
     if black > count / 2:
         return (
-            f"{_so_many(black, count)} black, no pixel reaches {100 * BLACK:g} % of full scale: is the laser on, the "
+            f"{so_many(black)} black, no pixel reaches {100 * BLACK:g} % of full scale: is the laser on, the "
             "exposure long enough, the lens open?"
         )
     if white > count / 2:
-        return f"{_so_many(white, count)} white, saturated over more than half of their pixels: expose shorter"
+        return f"{so_many(white)} white, saturated over more than half of their pixels: expose shorter"
     if across:
         return (
             f"in {across} of {count} one runs across: the images are turned by a quarter turn, or the sensor's "
@@ -164,10 +157,6 @@ def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: i
         "no bright line stands out of their background: are they laser images, is the exposure long enough, the "
         "object in view?"
     )
-
-
-def _so_many(some: int, count: int) -> str:
-    return "all are" if some == count else f"{some} of {count} are"
 
 
 def _lines_with_stripe(image: np.ndarray, along: str) -> int:

@@ -101,7 +101,7 @@ TABLE_3 = {
 def test_every_row_of_a_types_scattering_follows_the_authors_model(name):
     small, large = TABLE_3[name]
     wavelengths = np.array(NODES_NM, float)
-    found = np.array([waters.particles_of(f"jerlov-{name}", wavelength_nm=w).scattering_per_m for w in wavelengths])
+    found = np.array([waters.named_water(f"jerlov-{name}").particles(w).scattering_per_m for w in wavelengths])
     # Eq. 8 less the molecules. The amount is met to 2.4 % in the worst case, 1C. The wavelengths' rounding to three
     # digits, 0.5 % at 1.06 /m, is what a misread digit would stand out of.
     model = small * 1.513 * (400 / wavelengths) ** 1.7 + large * 0.3411 * (400 / wavelengths) ** 0.3
@@ -128,7 +128,7 @@ def test_jerlov_types_agree_with_measurements_as_far_as_is_known(name):
     assert 1 / 2.9 < b / MEASURED[name][1] < 2.9
 
 
-@pytest.mark.parametrize("water", waters.water_names())
+@pytest.mark.parametrize("water", waters.WATERS)
 def test_every_water_absorbs_and_scatters_over_the_whole_range(water):
     wavelengths = np.linspace(400, 700, 121)
     for kind in ({"kind": "fresh"}, {"kind": "sea", "salinity_g_kg": 35.0}):
@@ -226,7 +226,7 @@ def test_media_stored_before_there_were_named_waters_mean_the_same(stored):
 @settings(deadline=None)
 @given(
     which=st.one_of(
-        st.fixed_dictionaries({"water": st.sampled_from(waters.water_names())}),
+        st.fixed_dictionaries({"water": st.sampled_from(list(waters.WATERS))}),
         st.fixed_dictionaries({"turbidity": st.floats(0, 3)}),
     ),
     share=st.none() | st.floats(1e-4, 0.1),
@@ -260,15 +260,15 @@ def test_what_does_not_go_together_is_refused(wrong, message):
 
 
 @pytest.mark.parametrize("wavelength", [399.9, 700.1, math.nan, math.inf])
-@pytest.mark.parametrize("water", [name for name in waters.water_names() if name != "pure"])
+@pytest.mark.parametrize("water", [name for name in waters.WATERS if name != "pure"])
 def test_waters_are_refused_outside_their_wavelengths(water, wavelength):
     with pytest.raises(RangeError, match="wavelength_nm"):
-        waters.particles_of(water, wavelength_nm=wavelength)
+        waters.named_water(water).particles(wavelength)
 
 
 def test_names_and_turbidities_are_checked_where_they_are_used():
     with pytest.raises(DescriptionError, match="harbour"):
-        waters.particles_of("muddy", wavelength_nm=635.0)
+        waters.named_water("muddy").particles(635.0)
     for turbidity in (-1e-9, 3.001, math.nan):
         with pytest.raises(RangeError, match="turbidity"):
             waters.particles_at(turbidity, wavelength_nm=635.0)
