@@ -14,7 +14,7 @@ from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
-from uwlts.stripe.recording import has_stripe
+from uwlts.stripe.recording import shown_stripe
 from uwlts.targets import Target, parse_target
 
 Progress = Callable[[str, int, int], None]
@@ -150,7 +150,7 @@ def no_stripe_in(captures: Sequence[Capture]) -> str:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
     along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
     lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
-    if any(has_stripe(image, stripe_along=along) for image in lit):
+    if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
         return f"the {where} with a stripe were taken at other stage positions than those at which the target was found"
     reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
     return f"no stripe in any of the {count} {where}: {reason}"

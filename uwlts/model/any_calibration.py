@@ -67,7 +67,6 @@ def _check_same_refraction(header: CaptureHeader, calibration: PolynomialCalibra
             "were made in only; calibrate again in this one"
         )
     if header.sensor.camera.window.mounted != calibration.window_mounted:
-        here, there = "with the camera's window", "without the camera's window"
-        if calibration.window_mounted:
-            here, there = there, here
-        raise CalibrationError(f"{source} was made {here}, the polynomials {there}: calibrate again")
+        here, there = ("without", "with") if calibration.window_mounted else ("with", "without")
+        there = f"{there} the camera's window: calibrate again"
+        raise CalibrationError(f"{source} was made {here} the camera's window, the polynomials {there}")

@@ -1,5 +1,6 @@
 """The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
 
+from itertools import product
 from typing import Annotated, Literal
 
 import numpy as np
@@ -97,16 +98,12 @@ class WindowModel(Description):
     @classmethod
     def described(cls, window: Window, wavelength_nm: float, *, refractions: Literal[1, 2] = 2) -> "WindowModel":
         """A window as described, for light of a wavelength: a pane of glass, or one interface."""
-        normal = tuple(window.normal().tolist())
+        x, y, z = window.normal().tolist()
+        model = cls(refractions=refractions, distance_mm=window.distance_mm, normal=(x, y, z))
         if refractions == 1:
-            return cls(refractions=1, distance_mm=window.distance_mm, normal=normal)
-        return cls(
-            refractions=2,
-            distance_mm=window.distance_mm,
-            normal=normal,
-            thickness_mm=window.thickness_mm,
-            glass_index=window.index(wavelength_nm),
-        )
+            return model
+        glass = {"thickness_mm": window.thickness_mm, "glass_index": window.index(wavelength_nm)}
+        return model.model_copy(update=glass)
 
 
 class FanModel(Description):
@@ -224,10 +221,9 @@ class Calibration(Description):
 
     def stage_of(self, described: Vector) -> tuple[KnownStage, bool] | None:
         """The stage that was calibrated along a direction of the OCS, and whether it goes that way or back."""
-        for stage in self.stages:
-            for forth in (True, False):
-                if np.allclose(stage.described, np.array(described) * (1 if forth else -1)):
-                    return stage, forth
+        for stage, forth in product(self.stages, (True, False)):
+            if np.allclose(stage.described, np.array(described) * (1 if forth else -1)):
+                return stage, forth
         return None
 
     def object_transform(self) -> np.ndarray:

@@ -9,8 +9,6 @@ from uwlts.model.calibration import Residuals
 from uwlts.model.sensor import Description, Medium, Positive, Table
 
 Pair = tuple[float, float]
-
-
 Rows = tuple[tuple[float, ...], ...]
 
 
@@ -60,11 +58,9 @@ class PolynomialCalibration(Description):
         if not 0 < count <= lines - self.first_line:
             raise ValueError(f"{count} lines from line {self.first_line} on do not lie in an image of {lines} lines")
         for name in ("depth_coefficients", "along_coefficients"):
-            rows = getattr(self, name)
-            if len(rows) != count or {len(row) for row in rows} != {self.degree + 1}:
-                raise ValueError(
-                    f"{name} must have {count} rows of {self.degree + 1} numbers, as domains_px and degree"
-                )
+            if [*map(len, getattr(self, name))] != [self.degree + 1] * count:
+                expected = f"{count} rows of {self.degree + 1} numbers"
+                raise ValueError(f"{name} must have {expected}, as domains_px and degree")
         for name in ("position_range_px", "depth_range_mm"):
             low, high = getattr(self, name)
             if not low < high:

@@ -24,16 +24,10 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     """Give the body a temporary file to write; move it to `path` when the body ends without an exception.
 
     The temporary file lies empty in the folder of `path` (a rename is atomic only within one file system) and keeps
-    the suffix, by which some libraries choose the format. It is removed whatever exception leaves the body,
-    KeyboardInterrupt included, and an existing file at `path` is untouched until the new one is complete. Without
-    ``overwrite`` an existing file is refused, before the body runs and again at the end. A symbolic link is followed,
-    so that the file it names is replaced and not the link.
-
-    Raises
-    ------
-    OutputError
-        The folder is missing or not writable, the file exists, `path` is a folder or a device, the disk is full: any
-        OSError of the body or of the renaming.
+    the suffix, by which some libraries choose the format. It is removed whatever exception leaves the body, and an
+    existing file at `path` is untouched until the new one is complete. Without ``overwrite`` an existing file is
+    refused, before the body runs and again at the end. A symbolic link is followed. OutputError where the folder is
+    missing or not writable, the file exists, `path` is a folder or a device, or the disk is full: for any OSError.
     """
     target = Path(os.path.realpath(path))
     refuse_unsuitable(target, overwrite=overwrite)

@@ -43,8 +43,7 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
         raise CaptureError(f"{path} is damaged: its version is {number!r}, expected a whole number from 1")
     if number > version:
         raise CaptureError(f"{path} has version {number}; this program reads up to {version}: update it")
-    header = _text(file, "header")
-    if header is None:
+    if (header := _text(file, "header")) is None:
         raise CaptureError(f"{path} is damaged: its header is missing")
     try:
         return validated(model, json.loads(header), f"the header of {path}")
@@ -89,10 +88,9 @@ def has_writer(path: str | Path) -> bool:
 class UnfinishedFile(h5py.File):
     """The file of a writer that was killed, or is still at work, as it was last flushed; errors as of ``h5py.File``.
 
-    HDF5's own way, its single-writer-multiple-reader mode, tries to read a damaged place a hundred times and doubles
-    the pause each time: on a damaged file it hangs for good, and h5py cannot lower the number. What keeps the file from
-    being opened like any other are two entries of its superblock, the mark of the writer and the end of the used space.
-    Here they are shown to HDF5 as they would be in a closed file; the file itself is not changed.
+    HDF5's single-writer-multiple-reader mode hangs on a damaged file: it tries a hundred times and doubles the pause
+    each time. What keeps the file from being opened like any other are two entries of its superblock, the mark of the
+    writer and the end of the used space. HDF5 is shown them as in a closed file; the file itself is not changed.
     """
 
     def __init__(self, path: str | Path):

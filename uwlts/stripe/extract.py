@@ -300,11 +300,9 @@ def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: floa
     breaks = np.empty(len(found) + 1, bool)
     breaks[1:-1] = (np.diff(found) > _SHORT_GAP + 1) | (np.abs(np.diff(centre[found])) > jump_px)
     breaks[0], breaks[-1] = found[0] > _SHORT_GAP, len(good) - 1 - found[-1] > _SHORT_GAP
-    near = np.zeros(len(found), bool)
-    for away in range(min(lines, len(found))):
-        near[: len(found) - away] |= breaks[1 + away :]
-        near[away:] |= breaks[: len(found) - away]
-    return found[near]
+    before = np.concatenate([[0], np.cumsum(breaks)])
+    place = np.arange(len(found))
+    return found[before[np.minimum(place + lines + 1, len(breaks))] > before[np.maximum(place - lines + 1, 0)]]
 
 
 def _check_image(image: np.ndarray, *, name: str) -> None:

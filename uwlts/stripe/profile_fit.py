@@ -70,7 +70,9 @@ def profile_fit(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.nd
     widest = log_sigma + math.log(_WIDENING)
     for step in range(_STEPS):
         variance = np.exp(2.0 * log_sigma)
-        model = _gaussians(powers[:3], log_height, centre, variance)
+        # The logarithm of the Gaussian is a parabola in x.
+        slope = centre / variance
+        model = cv2.exp(powers[:3].T @ np.stack([log_height - 0.5 * slope * centre, slope, -0.5 / variance]))
         left = signal - model
         squared = model * model
         if step == _FIRST_STEPS:
@@ -107,12 +109,6 @@ def _contrast(left: np.ndarray, squared: np.ndarray, *, floor: float) -> float:
     """
     total = float(((left * left - floor**2) / squared).sum(dtype=float)) + _PRIOR_PIXELS * _USUAL_CONTRAST**2
     return math.sqrt(max(total, 0.0) / (squared.size + _PRIOR_PIXELS))
-
-
-def _gaussians(powers: np.ndarray, log_height: np.ndarray, centre: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(X, M) float32: the model at the places x whose ``powers`` 0 to 2 (3, X) are given; ``variance`` is s^2."""
-    slope = centre / variance
-    return cv2.exp(powers.T @ np.stack([log_height - 0.5 * slope * centre, slope, -0.5 / variance]))
 
 
 def _about(centre: np.ndarray, sums: np.ndarray) -> list[np.ndarray]:

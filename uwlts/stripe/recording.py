@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 import numpy as np
@@ -110,20 +110,13 @@ def white_share(image: np.ndarray, full_dn: float) -> float:
     return float(np.mean(image >= full_dn))
 
 
-def has_stripe(image: np.ndarray, *, stripe_along: str) -> bool:
-    """Whether an image (H, W) shows a stripe, or several."""
-    lines = _lines_with_stripe(image, stripe_along)
-    return lines >= FEWEST_LINES and not _more_across(image, stripe_along, lines)
-
-
-def runs_across(image: np.ndarray, *, stripe_along: str) -> bool:
-    """Whether a stripe runs along the other side of the image (H, W)."""
-    return _more_across(image, stripe_along, _lines_with_stripe(image, stripe_along))
-
-
-def _more_across(image: np.ndarray, stripe_along: str, lines: int) -> bool:
+def shown_stripe(image: np.ndarray, *, stripe_along: str) -> Literal["along", "across"] | None:
+    """Direction in which an image (H, W) shows a stripe, or several: along the side that is given, or the other one."""
+    along = _lines_with_stripe(image, stripe_along)
     across = _lines_with_stripe(image, "height" if stripe_along == "width" else "width")
-    return across >= FEWEST_LINES and across > _CLEARLY * lines
+    if across >= FEWEST_LINES and across > _CLEARLY * along:
+        return "across"
+    return "along" if along >= FEWEST_LINES else None
 
 
 def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: int) -> str:
@@ -136,7 +129,7 @@ def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: i
         elif white_share(image, full_dn) > WHITE:
             white += 1
         else:
-            across += runs_across(image, stripe_along=stripe_along)
+            across += shown_stripe(image, stripe_along=stripe_along) == "across"
 
     def so_many(some: int) -> str:
         return "all are" if some == count else f"{some} of {count} are"

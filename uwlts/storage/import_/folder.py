@@ -21,7 +21,7 @@ from uwlts.storage.import_.description import (
 )
 from uwlts.storage.import_.images import bits_of, grey_values, one_channel, read_image, without_background
 from uwlts.storage.import_.matching import Row, match, planned_frames, read_rows, stage_remark
-from uwlts.stripe.recording import BLACK, WHITE, has_stripe, is_black, runs_across, white_share
+from uwlts.stripe.recording import BLACK, WHITE, is_black, shown_stripe, white_share
 
 _SIZE_ADVICE = {
     (True, True): "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
@@ -63,10 +63,9 @@ class _Content:
 
     def look_for_stripe(self, image: np.ndarray) -> None:
         """Take a laser image (H, W) into account, from which its background is subtracted if there is one."""
-        if has_stripe(image, stripe_along=self.stripe_along):
-            self.with_stripe += 1
-        else:
-            self.sideways += runs_across(image, stripe_along=self.stripe_along)
+        direction = shown_stripe(image, stripe_along=self.stripe_along)
+        self.with_stripe += direction == "along"
+        self.sideways += direction == "across"
 
     def refuse_black(self) -> None:
         """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
@@ -200,16 +199,12 @@ def _zero_dn(given: ImportDescription, frames: list[Row], bits: int) -> int:
     """Grey value that stands for no difference; 0 where no background is subtracted."""
     if all(row.background is None for row in frames):
         return 0
+    if given.header is None and bits < 16:
+        return 2**bits
+    reason = "16 bits leave no room for its sign: give the bits that the camera used, or leave the background out"
     if given.header is not None:
-        raise DescriptionError(
-            "a background is to be subtracted, but the header is that of a finished capture: leave out one of the two"
-        )
-    if bits == 16:
-        raise DescriptionError(
-            "a background is to be subtracted, but 16 bits leave no room for its sign: give the bits that the camera "
-            "used, or leave the background out"
-        )
-    return 2**bits
+        reason = "the header is that of a finished capture: leave out one of the two"
+    raise DescriptionError(f"a background is to be subtracted, but {reason}")
 
 
 class _Reader:
