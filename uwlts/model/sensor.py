@@ -258,13 +258,10 @@ class Medium(Description):
 
     def refractive_index(self, wavelength_nm: float) -> float:
         """Refractive index relative to air; RangeError outside the formula's range."""
-        if self.index is not None:
-            return self.index
-        if self.kind == "air":
-            return 1.0
-        return media.water_index(
-            wavelength_nm=wavelength_nm, temperature_c=self.temperature_c, salinity_g_kg=self.salinity_g_kg
-        )
+        if self.index is not None or self.kind == "air":
+            return self.index or 1.0
+        state = {"temperature_c": self.temperature_c, "salinity_g_kg": self.salinity_g_kg}
+        return media.water_index(wavelength_nm=wavelength_nm, **state)
 
     def index_per_kelvin(self, wavelength_nm: float) -> float:
         """Change of the index with temperature; 0 where it is given."""
@@ -321,13 +318,10 @@ class Medium(Description):
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
             return self.phase.phase_function()
-        if self.phase is not None:
-            name = self.phase
-        elif self.turbidity is not None:
-            # The scale runs over Petzold's stations.
-            name = "petzold"
-        else:
-            name = "molecular" if self.water is None else waters.named_water(self.water).phase
+        # The scale of turbidity runs over Petzold's stations.
+        name = self.phase or ("molecular" if self.turbidity is None else "petzold")
+        if self.phase is None and self.water is not None:
+            name = waters.named_water(self.water).phase
         parameters = {"asymmetry", "particle_index", "particle_slope", "backscatter_share"}
         keys = self.model_dump(include=parameters, exclude_none=True)
         return phase_functions.phase_function_kind(name).of_keys(keys)

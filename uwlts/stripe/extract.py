@@ -88,7 +88,16 @@ def extract_stripe(
         raise ImageError(f"saturation is {saturation!r}; expected the positive grey value at which pixels clip")
     clip = _LARGEST[image.dtype] if saturation is None else saturation
 
-    signal = image if background is None else _subtract_background(image, background)
+    signal = image
+    if background is not None:
+        _check_image(background, name="background")
+        if background.shape != image.shape or background.dtype != image.dtype:
+            raise ImageError(
+                f"the background is {background.shape} {background.dtype} but the image {image.shape} {image.dtype}; "
+                "take both with the same camera settings"
+            )
+        # The sign is kept.
+        signal = cv2.subtract(image, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
     if (count := options.smoothing_lines) > 1:
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
@@ -318,17 +327,6 @@ def _check_image(image: np.ndarray, *, name: str) -> None:
     if image.dtype == np.float32 and not np.isfinite(image).all():
         count = image.size - np.count_nonzero(np.isfinite(image))
         raise ImageError(f"the {name} has {count} pixels that are not finite; repair or mask them before")
-
-
-def _subtract_background(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Image minus background with its sign kept: int16 for two uint8 images, otherwise float32."""
-    _check_image(background, name="background")
-    if background.shape != image.shape or background.dtype != image.dtype:
-        raise ImageError(
-            f"the background is {background.shape} {background.dtype} but the image {image.shape} {image.dtype}; "
-            "take both with the same camera settings"
-        )
-    return cv2.subtract(image, background, dtype=cv2.CV_16S if image.dtype == np.uint8 else cv2.CV_32F)
 
 
 def _as_profiles(image: np.ndarray, *, stripe_along: str) -> np.ndarray:

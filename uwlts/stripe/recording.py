@@ -76,13 +76,11 @@ def find_stripes(
     ``progress`` is called after each image with the number of images done and the number in all. CaptureError where
     the recording holds no laser image, or none of them shows a stripe.
     """
-    header = capture.header
+    along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     found: list[tuple[np.ndarray, ...]] = []
     statuses = np.zeros(len(StripeStatus), int)
     for number, image in capture.frames(laser_on=True):
-        stripe = extract_stripe(
-            image, stripe_along=header.sensor.camera.stripe_along, options=options, saturation=header.saturation_dn
-        )
+        stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
@@ -95,7 +93,7 @@ def find_stripes(
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
         lit = (image for _, image in capture.frames(laser_on=True))
-        reason = why_no_stripe(lit, stripe_along=header.sensor.camera.stripe_along, full_dn=header.saturation_dn)
+        reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
     return FoundStripes(*map(np.concatenate, zip(*found, strict=True)), lines_by_status=by_status)
 
