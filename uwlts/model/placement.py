@@ -26,7 +26,7 @@ def laser_pose(sensor: Sensor) -> LaserPose:
     to the laser's axis, then turned by the roll about the axis.
     """
     laser = sensor.laser
-    towards = np.array([1.0, 0.0, 0.0]) if sensor.camera.stripe_along == "height" else np.array([0.0, -1.0, 0.0])
+    towards = np.array((1.0, 0.0, 0.0) if sensor.camera.stripe_along == "height" else (0.0, -1.0, 0.0))
     if laser.baseline_mm is not None and laser.triangulation_angle_deg is not None:
         angle = math.radians(laser.triangulation_angle_deg)
         origin = laser.baseline_mm * towards

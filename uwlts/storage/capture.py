@@ -23,7 +23,7 @@ import numpy as np
 from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import CaptureHeader, Table
-from uwlts.storage.files import sha256_of
+from uwlts.storage.files import refuse_unsuitable, sha256_of
 from uwlts.storage.hdf5_file import UnfinishedFile, has_writer, read_label, write_label
 
 FORMAT = "uwlts-capture"
@@ -81,22 +81,16 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage():
-            self._refuse_existing(overwrite=overwrite, resume=resume)
+            refuse_unsuitable(self.path, overwrite=overwrite)
+            if self._part.exists() and not (resume or overwrite):
+                raise OutputError(
+                    f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite"
+                )
             with self._left_over() if resume and self._part.exists() else nullcontext(()) as unfinished:
                 self._begin(unfinished)
             # Nothing is locked: whoever looks at a running recording must not stop it.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
-
-    def _refuse_existing(self, *, overwrite: bool, resume: bool) -> None:
-        if self.path.exists() and not self.path.is_file():
-            raise OutputError(f"{self.path} exists and is not a regular file; give another name")
-        if self.path.exists() and not overwrite:
-            raise OutputError(f"{self.path} exists already; give another name, or --overwrite to replace it")
-        if not self.path.parent.is_dir():
-            raise OutputError(f"the folder {self.path.parent} does not exist; create it first")
-        if self._part.exists() and not (resume or overwrite):
-            raise OutputError(f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite")
 
     def _left_over(self) -> "Capture":
         """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
