@@ -1,6 +1,7 @@
 """Evaluation of point clouds against artefacts with calibrated sizes and against ground truth."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,14 @@ def evaluate(
         raise EvaluationError(
             "nothing to judge by: the capture names no artefact (give --artefact) and there is no truth file (--truth)"
         )
-    compared, fitted = (None, None) if truth is None else _against_truth(cloud, truth)
+    compared = fitted = None
+    if truth is not None:
+        true = {"point_mm": truth.point_mm, "normal": truth.normal, "status": truth.status}
+        against = partial(compare_with_truth, frame=cloud.frame, line=cloud.line, **true, tolerance_mm=TOLERANCE_MM)
+        compared = against(cloud.points_mm)
+        # Takes out the difference of the coordinate systems.
+        motion = best_fit_motion(compared, cloud.points_mm)
+        fitted = against(cloud.points_mm @ motion[:3, :3].T + motion[:3, 3])
     found = None if artefact is None else evaluate_cloud(cloud, artefact)
     figures: tuple[Figure, ...] = ()
     deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm
@@ -163,18 +171,6 @@ def evaluate(
         deviation = found.deviation_mm
     name = source or str(cloud.metadata.get("capture", ""))
     return Evaluation(name, replace(cloud, deviation_mm=deviation), found, figures, compared, fitted)
-
-
-def _against_truth(cloud: PointCloud, truth: Truth) -> tuple[TruthComparison, TruthComparison]:
-    """Comparison as measured, and after the rigid motion that takes out the difference of the coordinate systems."""
-
-    def compared(points: np.ndarray) -> TruthComparison:
-        true = {"point_mm": truth.point_mm, "normal": truth.normal, "status": truth.status}
-        return compare_with_truth(points, cloud.frame, cloud.line, **true, tolerance_mm=TOLERANCE_MM)
-
-    plain = compared(cloud.points_mm)
-    motion = best_fit_motion(plain, cloud.points_mm)
-    return plain, compared(cloud.points_mm @ motion[:3, :3].T + motion[:3, 3])
 
 
 def write_evaluation(path: str | Path, evaluation: Evaluation, *, overwrite: bool = False) -> None:

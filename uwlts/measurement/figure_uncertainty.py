@@ -1,7 +1,6 @@
 """Uncertainty of an artefact's figures, including the correlations between the points."""
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +8,6 @@ from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.metrology.evaluation import ArtefactEvaluation, FigureUncertainty, spread_mm
 from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import SphereEvaluation
-from uwlts.model.artefacts import Artefact
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
 
 # The standard deviation of so many is right to 27 % and to 10 %.
@@ -22,44 +20,32 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
 
     Figures are calculated again with each pattern of the calibration added to the points; the squares of their changes
     add up (GUM, section 5.1, with independent inputs). For the noise they are calculated with noise drawn anew
-    (GUM Supplement 1). Spheres are not searched for again.
-
-    Raises
-    ------
-    EvaluationError
-        As `evaluate_cloud`.
+    (GUM Supplement 1). Spheres are not searched for again. EvaluationError as `evaluate_cloud`.
     """
     if (uncertainty := cloud.uncertainty) is None:
         return {}
-
-    plain, draws = evaluation.figures_mm, _DRAWS
-    if isinstance(evaluation, SphereEvaluation):
-        figures_mm, draws = MovedSpheres(cloud.points_mm, evaluation).figures_mm, _QUICK_DRAWS
-    else:
-        figures_mm = partial(_evaluated, cloud, evaluation.artefact)
+    plain = evaluation.figures_mm
+    spheres = MovedSpheres(cloud.points_mm, evaluation) if isinstance(evaluation, SphereEvaluation) else None
 
     def changed(by: np.ndarray) -> np.ndarray:
-        figures = figures_mm(by)
+        if spheres is not None:
+            figures = spheres.figures_mm(by)
+        else:
+            figures = evaluate_cloud(replace(cloud, points_mm=cloud.points_mm + by), evaluation.artefact).figures_mm
         return np.array([figures[name] - value for name, value in plain.items()])
 
     systematic = [changed(pattern) for pattern in uncertainty.patterns_mm]
     rng, along = np.random.default_rng(_SEED), noise_mm(uncertainty)
     images, image = np.unique(cloud.frame, return_inverse=True)
-
-    def noise() -> np.ndarray:
+    drawn = []
+    for _ in range(_DRAWS if spheres is None else _QUICK_DRAWS):
         position = rng.standard_normal((len(images), 1))[image] * uncertainty.position_mm
-        return rng.standard_normal((len(cloud), 1)) * along + position
-
-    drawn = [changed(noise()) for _ in range(draws)]
+        drawn.append(changed(rng.standard_normal((len(cloud), 1)) * along + position))
     by_calibration = np.sqrt(np.sum(np.square(systematic), axis=0))
     by_noise = np.std(drawn, axis=0, ddof=1)
     return {
         name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
     }
-
-
-def _evaluated(cloud: PointCloud, artefact: Artefact, moves: np.ndarray) -> dict[str, float]:
-    return evaluate_cloud(replace(cloud, points_mm=cloud.points_mm + moves), artefact).figures_mm
 
 
 def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
@@ -73,36 +59,28 @@ def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
     return covariance[rows, largest] / np.sqrt(covariance[rows, largest, largest])[:, None]
 
 
-@dataclass(frozen=True, eq=False)
 class _MovedFit:
-    """A sphere's fit: its points (K,) in the cloud, centre, outward unit vectors (K, 3), residuals (K,), and a step.
+    """Fit of a sphere of free or known radius to the ``used`` (K,) of points (N, 3), which follows their moves.
 
-    ``solve`` (4 or 3, K) times changes of the residuals is how centre and, where it is free, radius follow them. Moves
-    are so small against the radius that the outward vectors stay.
+    Centre and, where it is free, radius follow changes of the residuals linearly. Moves are so small against the radius
+    that the outward unit vectors stay.
     """
 
-    used: np.ndarray
-    centre_mm: np.ndarray
-    outward: np.ndarray
-    residuals_mm: np.ndarray
-    solve: np.ndarray
-
-    @classmethod
-    def of(cls, points: np.ndarray, used: np.ndarray, radius_mm: float | None) -> "_MovedFit":
-        fit = fit_sphere(points[used], radius_mm)
-        outward = points[used] - fit.centre_mm
-        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        by_parameters = outward if radius_mm is not None else np.column_stack([outward, np.ones(len(used))])
-        solve = np.linalg.solve(by_parameters.T @ by_parameters, by_parameters.T)
-        return cls(used, fit.centre_mm, outward, fit.residuals_mm, solve)
+    def __init__(self, points: np.ndarray, used: np.ndarray, radius_mm: float | None):
+        self._used, self._fit = used, fit_sphere(points[used], radius_mm)
+        outward = points[used] - self._fit.centre_mm
+        self._outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        free = np.ones((len(used), 1 if radius_mm is None else 0))
+        by_parameters = np.hstack([self._outward, free])
+        self._solve = np.linalg.solve(by_parameters.T @ by_parameters, by_parameters.T)
 
     def moved(self, moves: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
         """Centre (3,), change of the radius (0 where it is known) and residuals (K,) after moves (N, 3)."""
-        change = np.einsum("ni,ni->n", self.outward, moves[self.used])
-        step = self.solve @ change
-        by_radius = float(step[3]) if len(step) > 3 else 0.0
-        residuals = self.residuals_mm + change - self.outward @ step[:3] - by_radius
-        return self.centre_mm + step[:3], by_radius, residuals
+        change = np.einsum("ni,ni->n", self._outward, moves[self._used])
+        step = self._solve @ change
+        by_radius = float(step[3:].sum())
+        residuals = self._fit.residuals_mm + change - self._outward @ step[:3] - by_radius
+        return self._fit.centre_mm + step[:3], by_radius, residuals
 
 
 class MovedSpheres:
@@ -116,8 +94,8 @@ class MovedSpheres:
         radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
         off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
         members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
-        self._free = [_MovedFit.of(points, own, None) for own in members]
-        self._known = [_MovedFit.of(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+        self._free = [_MovedFit(points, own, None) for own in members]
+        self._known = [_MovedFit(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
 
     def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
         """The evaluation's figures after moves (N, 3) of all points."""

@@ -77,16 +77,23 @@ def point_uncertainty(
     """
     header = capture.header
     sensor = header.sensor
-    if _made_from(calibration, capture):
+    scans = {scan.sha256 for scan in calibration.origin().scan_captures if scan.file == capture.path.name}
+    if scans and sha256_of(capture.path) in scans:
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
     known = stored_estimate(calibration, sensor, header.medium)
     across = 1 if calibration.stripe_along == "width" else 0
     pixels = np.stack((line, centre_px) if across else (centre_px, line), axis=1).astype(np.float64)
-    noise = stripe_noise_px(frame, line, centre_px) * _shared_by_neighbours(calibration)
+    # Neighbours err together, so that they show only a part of the noise.
+    shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
+    noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
     pose = capture.pose[:, :3, :3]
     posed = np.isfinite(capture.pose).all(axis=(1, 2))[:, None, None]
     into_scene = np.where(posed, pose, np.eye(3)) @ calibration.object_transform()[:3, :3].T
-    root = _root(known.covariance)
+    # Times its transpose this is the covariance.
+    scale = np.sqrt(np.diag(known.covariance))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(known.covariance / np.outer(scale, scale))
+    root = scale[:, None] * vectors[:, values > 0] * np.sqrt(values[values > 0])
     stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
@@ -111,17 +118,6 @@ def point_uncertainty(
     )
 
 
-def _made_from(calibration: Calibration, capture: Capture) -> bool:
-    """Whether a capture is one of the scans that a calibration was made from."""
-    named = {scan.sha256 for scan in calibration.origin().scan_captures if scan.file == capture.path.name}
-    return bool(named) and sha256_of(capture.path) in named
-
-
-def _shared_by_neighbours(calibration: Calibration) -> float:
-    """Factor of the noise over what neighbours show, as these err together."""
-    return float(np.sqrt(require_joint(calibration).shared_variance.get(STRIPE, 1.0)))
-
-
 def _derivatives(
     known: StoredEstimate, pixels: np.ndarray, column: int, root: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -133,15 +129,6 @@ def _derivatives(
         [known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) for axis in range(3)]
     )
     return points.by_rays[column].T, np.einsum("anp,pr->rna", by_global, root, optimize=True)
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    """A matrix (P, R) whose product with its transpose is the covariance."""
-    scale = np.sqrt(np.diag(covariance))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 0
-    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
 
 
 def _patterns(moved: np.ndarray) -> np.ndarray:

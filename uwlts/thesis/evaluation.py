@@ -63,14 +63,13 @@ def evaluate_campaign(
         if trials in (0, kept.trials):
             return kept
         scans = _sphere_scans(folder, _by_rays(calibrations(folder)[PROPOSED, "water"]))
-        intervals, trials = _monte_carlo(folder, scans, trials, workers, progress)
+        intervals = _monte_carlo(folder, scans, trials, workers, progress)
         return kept.model_copy(update={"monte_carlo": intervals, "trials": trials}).keep(path)
-    calibrated = calibrations(folder, progress=lambda done, total: progress("calibrations", done, total))
+    calibrated = calibrations(folder, progress=partial(progress, "calibrations"))
     measurements = _measured(folder, calibrated, workers, progress)
     proposed, two = (_by_rays(calibrated[method, "water"]) for method in (PROPOSED, TWO))
     scans = _sphere_scans(folder, proposed)
     choices, profiles = window_choices(folder, proposed, scans)
-    intervals, trials = _monte_carlo(folder, scans, trials, workers, progress)
     return CampaignResults(
         measurements=measurements,
         window={choice.images: choice for choice in choices},
@@ -81,7 +80,7 @@ def evaluate_campaign(
         },
         budget=_budget(folder, measurements, proposed, scans),
         line_profiles={side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
-        monte_carlo=intervals,
+        monte_carlo=_monte_carlo(folder, scans, trials, workers, progress),
         trials=trials,
     ).keep(path)
 
@@ -131,13 +130,11 @@ def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
     known = np.flatnonzero(np.isfinite(calibration.domains()[:, 0]))
     for name, share in _SHOWN_LINES.items():
         row = int(known[round(share * (len(known) - 1))])
-        low, high = calibration.domains()[row]
-        centres = np.linspace(low, high, 60)
-        number = calibration.first_line + row
-        points = reconstruct_by_polynomials(
-            calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.array([1.0, 0.0, 0.0])
-        ).points_mm
-        y_mm, z_mm = np.round(points[:, 1:], 4).T.tolist()
+        centres, number = np.linspace(*calibration.domains()[row], 60), calibration.first_line + row
+        found = reconstruct_by_polynomials(
+            calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.eye(3)[0]
+        )
+        y_mm, z_mm = np.round(found.points_mm[:, 1:], 4).T.tolist()
         lines[name] = PolynomialLine(number, np.round(centres, 3).tolist(), y_mm, z_mm)
     rms = calibration.figures("depth")["rms_mm"]
     if not isinstance(rms, int | float):
@@ -153,51 +150,37 @@ def _budget(
     with Capture(folder.steps()[0]) as capture:
         medium = capture.header.medium
     wanted = ("spheres", "water", PROPOSED, THESIS)
-    spheres = [m for m in measurements if (m.thing, m.medium, m.method, m.processing) == wanted]
-    return spacing_budget(
-        calibration,
-        scans,
-        medium,
-        deviation_mm=max((m.figures_mm["STD"] for m in spheres if "STD" in m.figures_mm), default=0.0),
-    )
+    spheres = [m.figures_mm for m in measurements if (m.thing, m.medium, m.method, m.processing) == wanted]
+    deviation_mm = max((figures["STD"] for figures in spheres if "STD" in figures), default=0.0)
+    return spacing_budget(calibration, scans, medium, deviation_mm=deviation_mm)
 
 
 def _monte_carlo(
     folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: Progress
-) -> tuple[list[SpacingInterval], int]:
-    """Intervals of every scan of spheres, and the number of trials they rest on."""
+) -> list[SpacingInterval]:
+    """Intervals of every scan of spheres."""
     if trials == 0 or not scans:
-        return [], trials
+        return []
     options = CalibrationOptions(refractions=1)
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(folder.target("air")))]
         steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
         evidence, medium = gather(air, steps, options=options), steps[0].header.medium
-    found = propagate(
-        evidence,
-        scans,
-        medium,
-        _knowledge(folder),
-        options=options,
-        trials=trials,
-        workers=workers,
-        progress=lambda done, total: progress("Monte Carlo", done, total),
-    )
+    # Imperfections of the inputs, from the plan that lies beside the campaigns; none without one.
+    plan = folder.path.parent / "plan.json"
+    try:
+        knowledge = dict(json.loads(plan.read_text(encoding="utf-8"))["campaign"]["imperfections"])
+    except FileNotFoundError:
+        knowledge = {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CaptureError(f"{plan} does not hold the campaign's imperfections: {error}") from error
+    shown = partial(progress, "Monte Carlo")
     return [
         SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())
-        for each in found
-    ], trials
-
-
-def _knowledge(folder: CampaignFolder) -> dict[str, float]:
-    """Imperfections of the inputs, from the plan that lies beside the campaigns; none without one."""
-    path = folder.path.parent / "plan.json"
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8"))["campaign"]["imperfections"])
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CaptureError(f"{path} does not hold the campaign's imperfections: {error}") from error
+        for each in propagate(
+            evidence, scans, medium, knowledge, options=options, trials=trials, workers=workers, progress=shown
+        )
+    ]
 
 
 def _line_profile(folder: CampaignFolder, side: str) -> LineProfile | None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from itertools import count, groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,14 +43,8 @@ def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
     """The joint calibration from a campaign, kept with the others; the time to solve it in s.
 
     Targets, steps, and the scans of spheres in water: these were made in another water than the calibration, whose
-    index follows from their roundness. Their sizes are not used.
-
-    Raises
-    ------
-    CaptureError
-        A recording is missing or damaged.
-    CalibrationError
-        The recordings do not determine a calibration, or contradict each other.
+    index follows from their roundness. Their sizes are not used. CaptureError where a recording is missing or damaged,
+    CalibrationError where they do not determine a calibration, or contradict each other.
     """
     options = CalibrationOptions(poses="stage", same_water=False, sizes_known=False)
     with ExitStack() as stack:
@@ -75,23 +70,14 @@ def compare_campaigns(
     """Errors of every scan of spheres and planes by the three calibrations, with the joint one's uncertainties.
 
     Those of each campaign are kept in its folder, and read from there unless ``again`` is set or a recording is newer.
-    ``progress(done, total)`` counts scans.
-
-    Raises
-    ------
-    CaptureError, CalibrationError, EvaluationError
-        A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
-    SetupError
-        A process that works on a campaign was ended from outside.
+    ``progress(done, total)`` counts scans. CaptureError, CalibrationError or EvaluationError where a recording is
+    missing or damaged, does not determine a calibration, or does not show its artefact; SetupError where a process that
+    works on a campaign was ended from outside.
     """
-    total, done = sum(len(_compared(folder)) for folder in folders), 0
-
-    def on_message(_: None) -> None:
-        nonlocal done
-        done += 1
-        progress(done, total)
-
-    return work_through(partial(_compare, again), folders, workers=workers, on_message=on_message)
+    total, numbers = sum(len(_compared(folder)) for folder in folders), count(1)
+    return work_through(
+        partial(_compare, again), folders, workers=workers, on_message=lambda _: progress(next(numbers), total)
+    )
 
 
 def _compared(folder: CampaignFolder) -> list[ScanFile]:
@@ -174,17 +160,34 @@ def _medium_summary(results: Sequence[JointResults], medium: str) -> MediumSumma
     )
 
 
+class _Row(NamedTuple):
+    """Mean and largest size of a quantity's errors by one calibration, mm, and that mean over the joint one's."""
+
+    quantity: str
+    method: str
+    mean: float
+    largest: float
+    times: float
+    number: int
+
+
+def _rows(part: MediumSummary) -> list[_Row]:
+    rows = []
+    for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
+        sizes = {method: np.abs(errors) for method, errors in errors_mm.items()}
+        for method, size in sizes.items():
+            times = size.mean() / sizes["joint"].mean()
+            rows.append(_Row(quantity, _WORDS[method], size.mean(), size.max(), times, len(size)))
+    return rows
+
+
 def summary_lines(summary: JointSummary) -> list[str]:
     """The summary as sentences."""
     lines = []
     for medium, part in (("water", summary.water), ("air", summary.air)):
-        for name, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
-            means = ", ".join(
-                f"{_WORDS[method]} {np.mean(np.abs(errors)):.4f} mm (largest {np.max(np.abs(errors)):.4f})"
-                for method, errors in errors_mm.items()
-            )
-            if means:
-                lines.append(f"{medium}, error of the {name}, mean of the absolute values: {means}")
+        for name, rows in groupby(_rows(part), lambda row: row.quantity):
+            means = ", ".join(f"{row.method} {row.mean:.4f} mm (largest {row.largest:.4f})" for row in rows)
+            lines.append(f"{medium}, error of the {name}, mean of the absolute values: {means}")
         if part.coverage_95 is not None:
             lines.append(f"{medium}, truth within the stated 95 % intervals: {100 * part.coverage_95:.0f} %")
         if over := part.plane_std_over_speckle_limit:
@@ -200,50 +203,18 @@ _BESIDE: dict[Method, float] = {"one_refraction": -0.2, "two_refractions": 0.0, 
 def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, overwrite: bool = False) -> JointSummary:
     """Write report.html and summary.json into a folder, each whole or not at all; OutputError where that fails."""
     summary = joint_summary(results)
+    media = [
+        (medium, part, _rows(part), svg_of(_errors_figure(results, medium))) for medium, part in summary.media().items()
+    ]
+    software = f"uwlts {uwlts.__version__}"
+    text = render_page("uwlts.thesis", "joint.html.j2", software=software, summary=summary, media=media)
     with (
         written_aside(folder / "report.html", overwrite=overwrite) as page,
         written_aside(folder / "summary.json", overwrite=overwrite) as aside,
     ):
-        page.write_text(joint_page(results, summary), encoding="utf-8")
+        page.write_text(text, encoding="utf-8")
         aside.write_text(json_text(summary, indent=1), encoding="utf-8")
     return summary
-
-
-def joint_page(results: Sequence[JointResults], summary: JointSummary) -> str:
-    """The page as text, from the results of `compare_campaigns` and their `joint_summary`."""
-    return render_page(
-        "uwlts.thesis",
-        "joint.html.j2",
-        software=f"uwlts {uwlts.__version__}",
-        summary=summary,
-        media=[
-            (medium, part, _rows(part), svg_of(_errors_figure(results, medium)))
-            for medium, part in summary.media().items()
-        ],
-    )
-
-
-class _Row(NamedTuple):
-    """Mean and largest error of a quantity by one calibration, and the mean over the joint one's."""
-
-    quantity: str
-    method: str
-    mean: float
-    largest: float
-    times: float
-    number: int
-
-
-def _rows(part: MediumSummary) -> list[_Row]:
-    rows = []
-    for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
-        sizes = {method: np.abs(errors) for method, errors in errors_mm.items()}
-        rows += [
-            _Row(quantity, words, size.mean(), size.max(), size.mean() / sizes["joint"].mean(), len(size))
-            for method, words in _WORDS.items()
-            if (size := sizes.get(method)) is not None
-        ]
-    return rows
 
 
 def _errors_figure(results: Sequence[JointResults], medium: str) -> Figure:

@@ -68,19 +68,9 @@ def propagate(
 ) -> list[Propagated]:
     """Propagate what is known of the inputs to the sphere spacing of every scan.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        Of a calibration with step images.
-    scans : sequence of SphereScan
-    medium : Medium
-        In which step and spheres were recorded.
-    knowledge : mapping
-        Standard deviations and half widths by the names of the campaign's imperfections; what is missing counts as 0.
-    trials : int
-        At least 20.
-    workers : int, optional
-        Trials made at a time; as many as there are processors unless given.
+    ``evidence`` is of a calibration with step images, ``medium`` the one in which step and spheres were recorded.
+    ``knowledge`` holds standard deviations and half widths by the names of the campaign's imperfections; those that are
+    missing count as 0. So many ``workers`` make trials at a time, as many as there are processors unless given.
 
     Raises
     ------
@@ -100,14 +90,8 @@ def propagate(
         ]
         evidence = replace(evidence, air=replace(evidence.air, images=images))
         options = replace(options, correct_circles=False)
-    draw = _Draw(evidence, start, medium, knowledge, wavelength_nm=start.calibration.wavelength_nm)
-    numbers = count(1)
-    made = work_through(
-        partial(_trial, draw, scans, options, start, seed),
-        range(trials),
-        workers=workers,
-        on_message=lambda _: progress(next(numbers), trials),
-    )
+    trial, numbers = partial(_trial, _Draw(evidence, start, medium, knowledge), scans, options, seed), count(1)
+    made = work_through(trial, range(trials), workers=workers, on_message=lambda _: progress(next(numbers), trials))
     spacing = np.array([errors for errors in made if errors is not None])
     if trials - len(spacing) > trials // 10:
         raise CalibrationError(f"{trials - len(spacing)} of {trials} trials give no calibration or no spheres")
@@ -121,57 +105,33 @@ def _trial(
     draw: "_Draw",
     scans: Sequence[SphereScan],
     options: CalibrationOptions,
-    start: CalibrationResult,
     seed: int,
     number: int,
     send: Callable[[None], None],
 ) -> list[float] | None:
     """Sphere spacing errors of one trial; None where its inputs give no calibration or no spheres."""
     send(None)
+    rng = np.random.default_rng([seed, number])
     try:
-        return _errors(draw, scans, options, start, np.random.default_rng([seed, number]))
+        calibration = solve(draw.evidence(rng), options=options, start=draw.start.camera).calibration
+        index = draw.index(rng)
+        lead, angles = draw.scan(rng)
+        errors = []
+        for scan in scans:
+            pixels, direction = draw.stripe(scan.pixels, rng), _turned(scan.stage_direction, angles)
+            drawn = replace(scan, pixels=pixels, stage_mm=scan.stage_mm * (1 + lead), stage_direction=direction)
+            errors.append(spacing_error(calibration, drawn, medium_index=index))
+        return errors
     except (CalibrationError, EvaluationError):
         return None
-
-
-def _errors(
-    draw: "_Draw",
-    scans: Sequence[SphereScan],
-    options: CalibrationOptions,
-    start: CalibrationResult,
-    rng: np.random.Generator,
-) -> list[float]:
-    perturbed = draw.evidence(rng)
-    calibration = solve(perturbed, options=options, start=start.camera).calibration
-    index = draw.index(rng)
-    lead, direction = draw.scan(rng)
-    errors = []
-    for scan in scans:
-        drawn = replace(
-            scan,
-            pixels=draw.stripe(scan.pixels, rng),
-            stage_mm=scan.stage_mm * (1 + lead),
-            stage_direction=_turned(scan.stage_direction, direction),
-        )
-        errors.append(spacing_error(calibration, drawn, medium_index=index))
-    return errors
 
 
 class _Draw:
     """Draws inputs about those observed."""
 
-    def __init__(
-        self,
-        evidence: Evidence,
-        start: CalibrationResult,
-        medium: Medium,
-        knowledge: Mapping[str, float],
-        *,
-        wavelength_nm: float,
-    ):
-        self._evidence, self._medium, self._wavelength = evidence, medium, wavelength_nm
+    def __init__(self, evidence: Evidence, start: CalibrationResult, medium: Medium, knowledge: Mapping[str, float]):
+        self.start, self._evidence, self._medium = start, evidence, medium
         self._known = {name: float(value) for name, value in knowledge.items()}
-        self._circle_px = start.camera.sigma_px
         self._across = 1 if start.calibration.stripe_along == "width" else 0
         self._stripe_px = _stripe_noise_px(start, self._across)
         # Entrance pupil in the target's frame, of every image.
@@ -184,9 +144,9 @@ class _Draw:
         """The calibration's evidence with all of its inputs drawn."""
         air, steps = self._air(self._evidence.air, rng), self._steps(rng)
         window = self._evidence.window
-        tilt = self._std("window_tilt_std_deg") * rng.standard_normal(2)
+        x, y = (self._std("window_tilt_std_deg") * rng.standard_normal(2)).tolist()
         if window is not None:
-            tilts = {"tilt_x_deg": window.tilt_x_deg + float(tilt[0]), "tilt_y_deg": window.tilt_y_deg + float(tilt[1])}
+            tilts = {"tilt_x_deg": window.tilt_x_deg + x, "tilt_y_deg": window.tilt_y_deg + y}
             window = window.model_copy(update=tilts)
         return replace(self._evidence, air=air, steps=steps, window=window)
 
@@ -200,48 +160,37 @@ class _Draw:
         farthest = max(float(np.linalg.norm(image.points_mm, axis=1).max()) for image in air.images)
         middle = np.mean([image.stage_mm for image in air.images])
         images = []
+        circle_mm = self._std("circle_centre_std_mm")
         for image, pupil in zip(air.images, self._pupils, strict=True):
-            printed = np.array(
-                [
-                    shifts.setdefault(
-                        tuple(point), self._std("circle_centre_std_mm") * np.append(rng.standard_normal(2), 0.0)
-                    )
-                    for point in image.points_mm.tolist()
-                ]
-            )
+            places = map(tuple, image.points_mm.tolist())
+            drawn = (circle_mm * np.append(rng.standard_normal(2), 0.0) for _ in image.points_mm)
+            printed = np.array([shifts.setdefault(place, shift) for place, shift in zip(places, drawn, strict=True)])
             # A target that is not square to the travel moves sideways on itself; what stands out from a bowed one
             # is seen where its ray meets the flat one.
             sideways = np.append(tilt, 0.0) * (image.stage_mm - middle)
             height = bow * (np.linalg.norm(image.points_mm, axis=1, keepdims=True) / farthest) ** 2
             out = height * (image.points_mm - pupil) / pupil[2] * (1.0, 1.0, 0.0)
             stage = image.stage_mm + lead * (image.stage_mm - middle)
-            images.append(
-                replace(
-                    image,
-                    points_mm=image.points_mm + printed + sideways + out,
-                    pixels=image.pixels + self._circle_px * rng.standard_normal(image.pixels.shape),
-                    stage_mm=stage + self._std("stage_position_std_mm") * rng.standard_normal(),
-                )
-            )
+            pixels = image.pixels + self.start.camera.sigma_px * rng.standard_normal(image.pixels.shape)
+            stage += self._std("stage_position_std_mm") * rng.standard_normal()
+            points = image.points_mm + printed + sideways + out
+            images.append(replace(image, points_mm=points, pixels=pixels, stage_mm=stage))
         return replace(air, images=images, stripes=[self.stripe(pixels, rng) for pixels in air.stripes])
 
     def _steps(self, rng: np.random.Generator) -> list[StepEvidence]:
         higher = self._std("step_height_half_width_mm") * rng.uniform(-1, 1)
         index = self.index(rng)
-        return [
-            replace(
-                step,
-                pixels=self.stripe(step.pixels, rng),
-                standard=step.standard.model_copy(update={"height_mm": step.standard.height_mm + higher}),
-                medium_index=index,
-            )
-            for step in self._evidence.steps
-        ]
+        steps = []
+        for step in self._evidence.steps:
+            standard = step.standard.model_copy(update={"height_mm": step.standard.height_mm + higher})
+            pixels = self.stripe(step.pixels, rng)
+            steps.append(replace(step, pixels=pixels, standard=standard, medium_index=index))
+        return steps
 
     def index(self, rng: np.random.Generator) -> float:
         """Index of the water at a temperature drawn."""
         warmer = self._std("temperature_half_width_c") * rng.uniform(-1, 1)
-        return self._medium.warmer_by(warmer).refractive_index(self._wavelength)
+        return self._medium.warmer_by(warmer).refractive_index(self.start.calibration.wavelength_nm)
 
     def scan(self, rng: np.random.Generator) -> tuple[float, np.ndarray]:
         """Relative error of the stage's lead, and by how much its travel is turned, in rad about two axes."""

@@ -25,19 +25,10 @@ from uwlts.thesis.results import WindowChoice, WindowProfile
 
 @dataclass(frozen=True, eq=False)
 class SphereScan:
-    """The stripe on two spheres in one scan.
+    """The stripe on two spheres in one scan: its ``pixels`` (N, 2), and the ``sphere`` (N,), 0 or 1, of each.
 
-    Attributes
-    ----------
-    placement : str
-    pixels : (N, 2)
-    stage_mm : (N,)
-    sphere : (N,) int
-        Sphere 0 or 1 on which each point lies.
-    stage_direction : (3,)
-    medium_index : float
-    spacing_mm : float
-        Calibrated distance of the centres.
+    ``stage_mm`` (N,) are positions of the stage along ``stage_direction`` (3,), ``spacing_mm`` is the calibrated
+    distance of the centres.
     """
 
     placement: str
@@ -48,20 +39,9 @@ class SphereScan:
     medium_index: float
     spacing_mm: float
 
-    def spacing_error(self, points: np.ndarray) -> float:
-        """Sphere spacing error of points (N, 3) of these stripes, mm."""
-        first, second = (fit_sphere(points[self.sphere == number]).centre_mm for number in (0, 1))
-        return float(np.linalg.norm(second - first)) - self.spacing_mm
-
 
 def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str) -> SphereScan:
-    """Find the stripes of a scan of two spheres and tell by a calibration on which sphere each point lies.
-
-    Raises
-    ------
-    EvaluationError
-        The scan does not show the spheres.
-    """
+    """Stripes of a scan of two spheres, assigned to these by a calibration; EvaluationError where it shows none."""
     standard = SphereStandard.model_validate(capture.header.artefact)
     stripes = find_stripes(capture)
     scan = reconstruct_stripes(capture, stripes, calibration)
@@ -108,8 +88,9 @@ def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: f
         medium_index=medium_index or scan.medium_index,
         stage_mm=scan.stage_mm,
         stage_direction=scan.stage_direction,
-    )
-    return scan.spacing_error(points.points_mm)
+    ).points_mm
+    first, second = (fit_sphere(points[scan.sphere == number]).centre_mm for number in (0, 1))
+    return float(np.linalg.norm(second - first)) - scan.spacing_mm
 
 
 def window_choices(
@@ -117,15 +98,16 @@ def window_choices(
 ) -> tuple[list[WindowChoice], list[WindowProfile]]:
     """Every step image alone, the three of each place, and all nine; and profiles of a step at several distances.
 
-    Raises
-    ------
-    CaptureError
-        A recording is missing or damaged.
-    CalibrationError
-        The calibration has no window.
+    CaptureError where a recording is missing or damaged, CalibrationError where the calibration has no window.
     """
     nominal = window_of(calibration)
-    images = _step_images(folder, calibration)
+    images: dict[str, list[StepImage]] = {}
+    for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
+        with Capture(path) as capture:
+            evidence, _ = step_evidence([capture])
+            camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
+        described = WindowModel.described(camera.window, laser.wavelength_nm, refractions=nominal.refractions)
+        images[place] = [label_step(calibration, described, step) for step in evidence]
     subsets = {f"{place} {number}": [image] for place in images for number, image in enumerate(images[place], start=1)}
     subsets |= images | {"all": [image for place in images for image in images[place]]}
     choices = []
@@ -147,18 +129,6 @@ def window_choices(
     return choices, profiles
 
 
-def _step_images(folder: CampaignFolder, calibration: Calibration) -> dict[str, list[StepImage]]:
-    """Step images by place, with their faces separated."""
-    found = {}
-    for place, path in zip(STEP_PLACES, folder.steps(), strict=True):
-        with Capture(path) as capture:
-            evidence, _ = step_evidence([capture])
-            sensor, refractions = capture.header.sensor, window_of(calibration).refractions
-            described = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
-        found[place] = [label_step(calibration, described, step) for step in evidence]
-    return found
-
-
 TEMPERATURE_HALF_WIDTH_C = 5.0
 _EXPANSION_PER_K = 22.2e-6
 """Of the standard: the thesis's 0.011 mm for 5 K over 99.18 mm, as aluminium expands."""
@@ -174,41 +144,28 @@ def spacing_budget(
 
     Index: the change of the spacing when the index changes by what 5 degC do, the calibration left as it is; mean over
     the scans. Resolution: a tenth of the change of Z per pixel at the stand-off. SSE: the standard deviation of the
-    scans' spacing errors, with their mean as the correction. ``deviation_mm`` enters as the thesis's PE.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    scans : sequence of SphereScan
-        At least two.
-    medium : Medium
-    deviation_mm : float
-        Largest standard deviation of the points about the spheres.
+    scans' spacing errors, of at least two, with their mean as the correction. ``deviation_mm``, the largest standard
+    deviation of the points about the spheres, enters as the thesis's PE.
     """
     errors = np.array([spacing_error(calibration, scan) for scan in scans])
-    correction = float(np.mean(np.abs(errors)))
-    ends = [
-        medium.warmer_by(sign * TEMPERATURE_HALF_WIDTH_C).refractive_index(calibration.wavelength_nm)
-        for sign in (1, -1)
-    ]
-    changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in ends]
-    by_index = float(np.mean(np.abs(np.diff(changes, axis=0)))) / 2
-    expansion = thermal_expansion_mm(
-        length_mm=scans[0].spacing_mm, alpha_per_k=_EXPANSION_PER_K, temperature_change_k=TEMPERATURE_HALF_WIDTH_C
+    warm, cold = (
+        medium.warmer_by(kelvin).refractive_index(calibration.wavelength_nm)
+        for kelvin in (TEMPERATURE_HALF_WIDTH_C, -TEMPERATURE_HALF_WIDTH_C)
     )
-    resolution = _SUBPIXEL * mm_per_px(calibration, scans[0].medium_index)
+    changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in (warm, cold)]
+    half_widths = {
+        "index": float(np.mean(np.abs(np.diff(changes, axis=0)))) / 2,
+        "expansion": thermal_expansion_mm(
+            length_mm=scans[0].spacing_mm, alpha_per_k=_EXPANSION_PER_K, temperature_change_k=TEMPERATURE_HALF_WIDTH_C
+        ),
+        "resolution": _SUBPIXEL * mm_per_px(calibration, scans[0].medium_index) / 2,
+    }
+    scatter, correction = float(np.std(errors, ddof=1)), float(np.mean(np.abs(errors)))
     budget = combine(
         [
-            Source(name="index", half_width=by_index, distribution="uniform"),
-            Source(name="expansion", half_width=expansion, distribution="uniform"),
-            Source(name="resolution", half_width=resolution / 2, distribution="uniform"),
+            *(Source(name=name, half_width=half, distribution="uniform") for name, half in half_widths.items()),
             Source(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),
-            Source(
-                name="SSE",
-                half_width=float(np.std(errors, ddof=1)),
-                degrees_of_freedom=len(errors) - 1,
-                correction=correction,
-            ),
+            Source(name="SSE", half_width=scatter, degrees_of_freedom=len(errors) - 1, correction=correction),
             Source(name="PE", half_width=deviation_mm),
         ]
     )

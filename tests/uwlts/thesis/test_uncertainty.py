@@ -180,7 +180,7 @@ class Fixed:
 def draw(knowledge, evidence=None, start=None):
     if evidence is None:
         evidence, start = clean()
-    return monte_carlo._Draw(evidence, start, WATER, knowledge, wavelength_nm=SENSOR.laser.wavelength_nm)
+    return monte_carlo._Draw(evidence, start, WATER, knowledge)
 
 
 def test_exact_views_without_uncertainty_do_not_scatter():
