@@ -11,64 +11,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.system.small_board import small_sensor, turned_board
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
 from twin.recording.studio import record_scene
-from twin.scene.description import Scene, load_scene
-from uwlts.model.library import load_sensor
+from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import extract_stripe
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNT = 6
-SENSOR = """
-base = "thesis"
-name = "small"
-[camera]
-width_px = 96
-height_px = 512
-pixel_size_um = 10.6
-[stage]
-travel_mm = 120.0
-resolution_mm = 0.01
-settling_s = 0.0
-[lamp]
-ambient_w_per_m2 = 0.05
-"""
-BOARD = f"""
-title = "Board"
-medium = "air"
-[motion]
-start_mm = -5.0
-step_mm = 2.0
-count = {COUNT}
-[artefact]
-kind = "plane"
-[[objects]]
-kind = "plate"
-width_mm = 200.0
-height_mm = 160.0
-rotation_deg = [0.0, 30.0, 0.0]
-"""
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("scan")
-    (place / "sensor.toml").write_text(SENSOR, encoding="utf-8")
-    (place / "board.toml").write_text(BOARD, encoding="utf-8")
-    return place
-
-
-@pytest.fixture(scope="module")
-def sensor(folder: Path) -> Sensor:
-    return load_sensor(folder / "sensor.toml")
-
-
-@pytest.fixture(scope="module")
-def board(folder: Path) -> Scene:
-    return load_scene(folder / "board.toml")
+MOTION = ("start_mm = -5.0", "step_mm = 2.0", f"count = {COUNT}")
+DESCRIPTIONS = {
+    "sensor": small_sensor("travel_mm = 120.0", "resolution_mm = 0.01", "settling_s = 0.0"),
+    "board": turned_board(*MOTION, more=("[artefact]", 'kind = "plane"')),
+}
 
 
 @pytest.fixture
@@ -220,7 +178,7 @@ def test_plans_that_cannot_be_done_are_refused_before_anything_moves(served, fol
 
 
 def test_another_camera_than_described_is_refused(served, folder, tmp_path):
-    (folder / "other.toml").write_text(SENSOR.replace("96", "128"), encoding="utf-8")
+    (folder / "other.toml").write_text(DESCRIPTIONS["sensor"].replace("96", "128"), encoding="utf-8")
     plan = written(folder, served, name="other-plan")
     plan.write_text(plan.read_text().replace("sensor.toml", "other.toml"), encoding="utf-8")
     done = run(plan, tmp_path / "scan.h5")

@@ -11,8 +11,6 @@ import pytest
 
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene, load_scene
-from uwlts.model.library import load_sensor
-from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,19 +46,7 @@ height_mm = 160.0
 position_mm = [5.0, 0.0, -20.0]
 reflectance = 0.8
 """
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("exposure")
-    (place / "sensor.toml").write_text(SENSOR, encoding="utf-8")
-    (place / "bar.toml").write_text(BAR, encoding="utf-8")
-    return place
-
-
-@pytest.fixture(scope="module")
-def sensor(folder: Path) -> Sensor:
-    return load_sensor(folder / "sensor.toml")
+DESCRIPTIONS = {"sensor": SENSOR, "bar": BAR}
 
 
 def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:

@@ -11,43 +11,21 @@ import numpy as np
 import pytest
 
 from tests.system.in_process import uwlts
+from tests.system.small_board import small_sensor, turned_board
 from twin.devices.bench import NAMES
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene, load_scene
-from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 
 STEP_MM = 2.0
-SENSOR = """
-base = "thesis"
-name = "small"
-[camera]
-width_px = 96
-height_px = 512
-pixel_size_um = 10.6
-[stage]
-travel_mm = 160.0
-resolution_mm = 0.01
-settling_s = 0.0
-[lamp]
-ambient_w_per_m2 = 0.05
-"""
-BOARD = """
-title = "Board"
-medium = "air"
-[motion]
-start_mm = -20.0
-step_mm = 2.0
-count = 21
-[[objects]]
-kind = "plate"
-width_mm = 200.0
-height_mm = 160.0
-rotation_deg = [0.0, 30.0, 0.0]
-"""
-# Half of the scan passes a narrow board: the stripe is rightly absent at first and at last.
-NARROW = BOARD.replace("width_mm = 200.0", "width_mm = 20.0")
+MOTION = ("start_mm = -20.0", "step_mm = 2.0", "count = 21")
+DESCRIPTIONS = {
+    "sensor": small_sensor("travel_mm = 160.0", "resolution_mm = 0.01", "settling_s = 0.0"),
+    "board": turned_board(*MOTION),
+    # Half of the scan passes a narrow board: the stripe is rightly absent at first and at last.
+    "narrow": turned_board(*MOTION, width_mm=20.0),
+}
 
 STAGE_FAULTS = {
     "stall": "stall: the stage has stood at",
@@ -62,24 +40,6 @@ STAGE_FAULTS = {
 """Faults that end a scan, and what the message names."""
 LOST_FRAMES = {"drop": 1, "cut": 2, "repeat": 1, "delay:4": 1}
 """Faults after which the image is asked for again, and how many of them come here."""
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("faults")
-    for name, text in (("sensor", SENSOR), ("board", BOARD), ("narrow", NARROW)):
-        (place / f"{name}.toml").write_text(text, encoding="utf-8")
-    return place
-
-
-@pytest.fixture(scope="module")
-def sensor(folder: Path) -> Sensor:
-    return load_sensor(folder / "sensor.toml")
-
-
-@pytest.fixture(scope="module")
-def board(folder: Path) -> Scene:
-    return load_scene(folder / "board.toml")
 
 
 @contextmanager

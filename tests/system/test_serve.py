@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.system.small_board import small_sensor, turned_board
 from twin.devices.bench import NAMES, Fault, Track, parse_fault
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
@@ -21,7 +22,6 @@ from uwlts.hardware.camera import Camera
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.errors import DescriptionError, DesignError, HardwareError, ImageError
-from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.stripe import extract_stripe
@@ -30,49 +30,8 @@ ROOT = Path(__file__).resolve().parents[2]
 WAIT_S = 20.0
 FEED = 900.0
 FAST = 50.0
-SENSOR = """
-base = "thesis"
-name = "small"
-[camera]
-width_px = 96
-height_px = 512
-pixel_size_um = 10.6
-[lamp]
-ambient_w_per_m2 = 0.05
-"""
-BOARD = """
-title = "Board"
-medium = "air"
-[motion]
-start_mm = -4.0
-step_mm = 4.0
-count = 3
-position_errors_mm = [0.0, 0.5, 0.0]
-[[objects]]
-kind = "plate"
-width_mm = 200.0
-height_mm = 160.0
-rotation_deg = [0.0, 30.0, 0.0]
-"""
-
-
-@pytest.fixture(scope="module")
-def described(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of the descriptions."""
-    folder = tmp_path_factory.mktemp("described")
-    (folder / "sensor.toml").write_text(SENSOR, encoding="utf-8")
-    (folder / "board.toml").write_text(BOARD, encoding="utf-8")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def sensor(described: Path) -> Sensor:
-    return load_sensor(described / "sensor.toml")
-
-
-@pytest.fixture(scope="module")
-def board(described: Path) -> Scene:
-    return load_scene(described / "board.toml")
+MOTION = ("start_mm = -4.0", "step_mm = 4.0", "count = 3", "position_errors_mm = [0.0, 0.5, 0.0]")
+DESCRIPTIONS = {"sensor": small_sensor(), "board": turned_board(*MOTION)}
 
 
 @pytest.fixture(scope="module")
@@ -252,9 +211,9 @@ def test_faults_are_read():
 
 
 @pytest.fixture
-def lamp_lit(described: Path) -> Scene:
+def lamp_lit(folder: Path) -> Scene:
     """The board under the lamp while the laser is off."""
-    board = load_scene(described / "board.toml")
+    board = load_scene(folder / "board.toml")
     return board.model_copy(update={"motion": board.motion.model_copy(update={"lights": ("lamp", "laser")})})
 
 
@@ -320,9 +279,9 @@ def test_a_camera_that_is_gone_says_so_and_what_keeps_it_from_frames_ends_the_se
 # The command
 
 
-def test_the_command_serves_until_it_is_interrupted(described: Path, served):
+def test_the_command_serves_until_it_is_interrupted(folder: Path, served):
     served.camera.disconnect()
-    arguments = ["serve", described / "board.toml", "--sensor", described / "sensor.toml", "--ideal", "--spp", 1]
+    arguments = ["serve", folder / "board.toml", "--sensor", folder / "sensor.toml", "--ideal", "--spp", 1]
     program = [sys.executable, "-m", "twin.cli", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
     command = subprocess.Popen(
         program, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -96,3 +96,29 @@ def step_views(sensor: Sensor, *, noise=Noise()):
 def gathered(sensor: Sensor, series, steps=()) -> Gathered:
     """What captures with these views would give; ``sensor`` is what the drawings say."""
     return Gathered(sensor, {"water": MEDIUM}, list(series), list(steps), [], {}, [])
+
+
+def assert_derivatives(evidence, parameters, global_values, local, *, within):
+    """Derivatives of the evidence's residuals are those by central differences, ``within`` the largest of each.
+
+    Where residuals vanish, their scale does not matter.
+    """
+    vector, count = np.concatenate([global_values, local]), len(global_values)
+    found = evidence.residuals(parameters, global_values, local)
+
+    def residuals(values):
+        parts = evidence.residuals(parameters, values[:count], values[count:])
+        return np.concatenate([part.values for part in parts])
+
+    analytic, row = np.zeros((sum(len(part.values) for part in found), len(vector))), 0
+    for part in found:
+        here = np.arange(row, row := row + len(part.values))
+        columns = np.r_[:count, count + part.local_columns]
+        analytic[np.ix_(here, columns)] = np.hstack([part.by_global, part.by_local])
+    for place, column in enumerate(analytic.T):
+        reach = 1e-6 * max(1.0, abs(vector[place]))
+        ahead, behind = vector.copy(), vector.copy()
+        ahead[place] += reach
+        behind[place] -= reach
+        numeric = (residuals(ahead) - residuals(behind)) / (2 * reach)
+        assert np.abs(column - numeric).max() <= within * np.abs(numeric).max() + 1e-6, place

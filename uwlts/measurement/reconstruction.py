@@ -125,14 +125,12 @@ def reconstruct_stripes(
     beside = np.zeros((len(sharp), 3)) if exact is None else _beside(capture, exact, stripes, index)
     points = _posed(found.points_mm + beside, capture, stripes.frame)
     good = np.flatnonzero(found.status == RayStatus.OK)
-    kept = stripes[good]
-    known = None
+    kept, known = stripes[good], None
     if with_uncertainty:
         if exact is None:
             raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
-        known = point_uncertainty(
-            capture, exact, kept.frame, kept.line, kept.centre_px, blur_px=blur[good], beside_mm=beside[good]
-        )
+        where = kept.frame, kept.line, kept.centre_px
+        known = point_uncertainty(capture, exact, *where, blur_px=blur[good], beside_mm=beside[good])
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return ScanCloud(
         points_mm=points[good],
@@ -178,13 +176,9 @@ def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, i
 
 def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:
     """Points of frames that carry a full pose ``T_scene_object`` are placed by it instead of by the stage."""
-    posed = np.isfinite(capture.pose).all(axis=(1, 2))
-    if not posed.any():
-        return points
     points = points.copy()
-    for number in np.flatnonzero(posed):
-        own = frame == number
+    for number in np.flatnonzero(np.isfinite(capture.pose).all(axis=(1, 2))):
+        own, pose = frame == number, capture.pose[number]
         at_stage = capture.stage_mm[number] * np.array(capture.header.stage_direction)
-        pose = capture.pose[number]
         points[own] = (points[own] - at_stage) @ pose[:3, :3].T + pose[:3, 3]
     return points

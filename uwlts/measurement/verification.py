@@ -59,11 +59,9 @@ class Verdict:
         """The verdict in one line."""
         text = f"{self.quantity}: {self.measured_mm:.4f} mm, calibrated {self.calibrated_mm:.4f} mm, "
         text += f"error {self.error_mm:+.4f} ± {self.expanded_mm:.4f} mm"
-        if self.normalised_error is not None:
-            text += f", E_n {self.normalised_error:.2f}"
-        if self.limit_mm is not None:
-            text += f", limit {self.limit_mm:g} mm"
-        return f"{text}: {'pass' if self.passed else 'FAIL'}"
+        agreement = "" if self.normalised_error is None else f", E_n {self.normalised_error:.2f}"
+        limit = "" if self.limit_mm is None else f", limit {self.limit_mm:g} mm"
+        return f"{text}{agreement}{limit}: {'pass' if self.passed else 'FAIL'}"
 
 
 @dataclass(frozen=True)
@@ -105,9 +103,8 @@ def verify(
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         if calibration.joint is None and limit_mm is None:
-            raise EvaluationError(
-                "the calibration holds no uncertainty to judge by: give --limit, or calibrate jointly"
-            )
+            advice = "give --limit, or calibrate jointly"
+            raise EvaluationError(f"the calibration holds no uncertainty to judge by: {advice}")
         if scan.header.artefact is None:
             raise EvaluationError(f"{scan.path.name} does not say what it shows: its header needs an artefact")
         artefact = parse_artefact(scan.header.artefact)

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 import uwlts
-from uwlts.measurement.evaluation_file import TruthComparisons
+from uwlts.measurement.evaluation import TruthComparisons
 from uwlts.model.errors import OutputError
 from uwlts.report import plot
 from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference, gather_campaign, load_reference

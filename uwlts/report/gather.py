@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, Strict, TypeAdapter, ValidationError
 
-from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
+from uwlts.measurement.evaluation import EvaluationRecord, read_evaluation
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CaptureError, problems_of

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwlts.measurement.evaluation_file import FORMAT as EVALUATION_FORMAT
-from uwlts.measurement.evaluation_file import EvaluationRecord, read_evaluation
+from uwlts.measurement.evaluation import FORMAT as EVALUATION_FORMAT
+from uwlts.measurement.evaluation import EvaluationRecord, read_evaluation
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CaptureError, DescriptionError
 from uwlts.model.library import load_sensor

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from uwlts.measurement.evaluation_file import TruthComparisons, TruthFigures
+from uwlts.measurement.evaluation import TruthComparisons, TruthFigures
 from uwlts.metrology.evaluation import Quantity
 from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
 from uwlts.report.tables import true_window_distance

@@ -130,7 +130,8 @@ def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
     known = np.flatnonzero(np.isfinite(calibration.domains()[:, 0]))
     for name, share in _SHOWN_LINES.items():
         row = int(known[round(share * (len(known) - 1))])
-        centres, number = np.linspace(*calibration.domains()[row], 60), calibration.first_line + row
+        low, high = calibration.domains()[row]
+        centres, number = np.linspace(low, high, 60), calibration.first_line + row
         found = reconstruct_by_polynomials(
             calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.eye(3)[0]
         )

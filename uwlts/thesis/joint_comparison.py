@@ -174,7 +174,7 @@ class _Row(NamedTuple):
 def _rows(part: MediumSummary) -> list[_Row]:
     rows = []
     for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
-        sizes = {method: np.abs(errors) for method, errors in errors_mm.items()}
+        sizes: dict[Method, np.ndarray] = {method: np.abs(errors) for method, errors in errors_mm.items()}
         for method, size in sizes.items():
             times = size.mean() / sizes["joint"].mean()
             rows.append(_Row(quantity, _WORDS[method], size.mean(), size.max(), times, len(size)))

@@ -39,6 +39,11 @@ class SphereScan:
     medium_index: float
     spacing_mm: float
 
+    def spacing_error(self, points: np.ndarray) -> float:
+        """Sphere spacing error of points (N, 3) of these stripes, mm."""
+        first, second = (fit_sphere(points[self.sphere == number]).centre_mm for number in (0, 1))
+        return float(np.linalg.norm(second - first)) - self.spacing_mm
+
 
 def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str) -> SphereScan:
     """Stripes of a scan of two spheres, assigned to these by a calibration; EvaluationError where it shows none."""
@@ -88,9 +93,8 @@ def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: f
         medium_index=medium_index or scan.medium_index,
         stage_mm=scan.stage_mm,
         stage_direction=scan.stage_direction,
-    ).points_mm
-    first, second = (fit_sphere(points[scan.sphere == number]).centre_mm for number in (0, 1))
-    return float(np.linalg.norm(second - first)) - scan.spacing_mm
+    )
+    return scan.spacing_error(points.points_mm)
 
 
 def window_choices(

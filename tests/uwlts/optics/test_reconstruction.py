@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.oracles import fermat
+from tests.uwlts.drawn_windows import faces_and_indices, indices, seeds, tilted, windows
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import RangeError
 from uwlts.model.library import load_sensor
@@ -21,9 +22,6 @@ from uwlts.optics.window import RayStatus, trace_window
 WATER = 1.3312
 FOCAL_PX = 2358.0
 
-tilts = st.floats(-20.0, 20.0)
-indices = st.floats(1.0, 1.8)
-seeds = st.integers(0, 2**32 - 1)
 distortions = st.builds(
     Distortion,
     k1=st.floats(-0.5, 0.5),
@@ -44,32 +42,6 @@ def camera(*, distortion: Distortion | None = None, focal_px: float = FOCAL_PX) 
         cy_px=507.9,
         distortion=distortion or Distortion(),
     )
-
-
-def normal_of(x_deg: float, y_deg: float) -> tuple[float, float, float]:
-    x, y = math.radians(x_deg), math.radians(y_deg)
-    return (math.cos(x) * math.sin(y), -math.sin(x), math.cos(x) * math.cos(y))
-
-
-windows = st.builds(
-    lambda x, y, distance, thickness, glass, refractions: WindowModel(
-        refractions=refractions, distance_mm=distance, normal=normal_of(x, y), thickness_mm=thickness, glass_index=glass
-    ),
-    tilts,
-    tilts,
-    st.floats(5.0, 200.0),
-    st.floats(1.0, 20.0),
-    indices,
-    st.sampled_from([1, 2]),
-)
-
-
-def faces_and_indices(window: WindowModel, medium_index: float) -> tuple[list[fermat.Face], list[float]]:
-    """The window as the oracle takes it."""
-    both = fermat.plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=np.array(window.normal))
-    if window.refractions == 1:
-        return both[:1], [1.0, medium_index]
-    return both, [1.0, window.glass_index, medium_index]
 
 
 def whole_image(count: int = 500, *, seed: int = 0) -> np.ndarray:
@@ -311,7 +283,9 @@ def test_failures_of_lens_and_window_keep_their_status_among_good_points():
     assert np.isnan(found.points_camera_mm[1]).all() and np.isfinite(found.points_camera_mm[[0, 2]]).all()
 
     wide = camera(focal_px=300.0)
-    steep = WindowModel(refractions=2, distance_mm=60.0, normal=normal_of(0.0, 40.0), thickness_mm=6, glass_index=1.52)
+    steep = WindowModel(
+        refractions=2, distance_mm=60.0, normal=tuple(tilted(0.0, 40.0)), thickness_mm=6, glass_index=1.52
+    )
     calibration = nominal("width").model_copy(
         update={"camera": wide, "window": steep, "sheet": SheetModel(normal=steep.normal, offset_mm=500.0)}
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import WATER, built_sensor
-from tests.uwlts.joint_views import Noise, gathered, lit_points, step_views, target_series
+from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence, TargetEvidence
@@ -168,25 +168,7 @@ def test_every_derivative_is_what_differences_say(view, kind):
     found = evidence.residuals(parameters, global_values, local)
     assert sum(len(part.values) for part in found) >= 30
     assert max(np.abs(part.values).max() for part in found) < 1e-8
-    vector = np.concatenate([global_values, local])
-
-    def residuals(values):
-        parts = evidence.residuals(parameters, values[: len(global_values)], values[len(global_values) :])
-        return np.concatenate([part.values for part in parts])
-
-    analytic = np.zeros((sum(len(part.values) for part in found), len(vector)))
-    rows = np.split(np.arange(len(analytic)), np.cumsum([len(part.values) for part in found])[:-1])
-    for place, part in zip(rows, found, strict=True):
-        analytic[np.ix_(place, np.r_[: len(global_values), len(global_values) + part.local_columns])] = np.hstack(
-            [part.by_global, part.by_local]
-        )
-    for place, column in enumerate(analytic.T):
-        reach = 1e-6 * max(1.0, abs(vector[place]))
-        ahead, behind = vector.copy(), vector.copy()
-        ahead[place] += reach
-        behind[place] -= reach
-        numeric = (residuals(ahead) - residuals(behind)) / (2 * reach)
-        assert np.abs(column - numeric).max() <= 1e-5 * np.abs(numeric).max() + 1e-6, place
+    assert_derivatives(evidence, parameters, global_values, local, within=1e-5)
 
 
 def _without_residuals(evidence, parts):
