@@ -5,127 +5,85 @@ import os
 import socket
 import stat
 import threading
-from collections.abc import Callable
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import (
-    BUFFERS,
-    MONO_BITS,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Delivered,
-    Region,
-    RequestedSettings,
-)
+from uwlts.hardware.camera import BUFFERS, MONO_BITS, Camera, CameraInfo, CameraSettings, Delivered, Region
 from uwlts.model.errors import HardwareError
 from uwlts.runtime.shared_library import load_aravis
 
 BUFFER_COMPLETE = 0
-
-_DOUBLES = [POINTER(c_double)] * 2
-_INTEGERS = [POINTER(c_int)] * 4
-# Result and arguments; a last argument for the error is added to all of them.
-_OF_CAMERA: dict[str, tuple[Any, list[Any]]] = {
-    "new": (c_void_p, [c_char_p]),
-    "get_sensor_size": (None, [c_void_p, *_INTEGERS[:2]]),
-    "get_vendor_name": (c_char_p, [c_void_p]),
-    "get_model_name": (c_char_p, [c_void_p]),
-    "get_device_serial_number": (c_char_p, [c_void_p]),
-    "set_acquisition_mode": (None, [c_void_p, c_int]),
-    "clear_triggers": (None, [c_void_p]),
-    "set_trigger": (None, [c_void_p, c_char_p]),
-    "software_trigger": (None, [c_void_p]),
-    "set_region": (None, [c_void_p, c_int, c_int, c_int, c_int]),
-    "get_region": (None, [c_void_p, *_INTEGERS]),
-    "is_feature_available": (c_int, [c_void_p, c_char_p]),
-    "is_exposure_auto_available": (c_int, [c_void_p]),
-    "is_gain_auto_available": (c_int, [c_void_p]),
-    "set_exposure_time_auto": (None, [c_void_p, c_int]),
-    "set_gain_auto": (None, [c_void_p, c_int]),
-    "dup_available_pixel_formats_as_strings": (POINTER(c_char_p), [c_void_p, POINTER(c_uint)]),
-    "get_pixel_format_as_string": (c_char_p, [c_void_p]),
-    "set_pixel_format_from_string": (None, [c_void_p, c_char_p]),
-    "create_stream": (c_void_p, [c_void_p, c_void_p, c_void_p]),
-    "get_payload": (c_uint, [c_void_p]),
-    "start_acquisition": (None, [c_void_p]),
-    "stop_acquisition": (None, [c_void_p]),
-}
-for _feature in ("exposure_time", "gain", "frame_rate"):
-    _OF_CAMERA |= {
-        f"is_{_feature}_available": (c_int, [c_void_p]),
-        f"get_{_feature}_bounds": (None, [c_void_p, *_DOUBLES]),
-        f"get_{_feature}": (c_double, [c_void_p]),
-        f"set_{_feature}": (None, [c_void_p, c_double]),
-    }
-_OTHERS: dict[str, tuple[Any, list[Any]]] = {
-    "arv_update_device_list": (None, []),
-    "arv_get_n_devices": (c_uint, []),
-    "arv_get_device_id": (c_char_p, [c_uint]),
-    "arv_get_device_serial_nbr": (c_char_p, [c_uint]),
-    "arv_get_device_address": (c_char_p, [c_uint]),
-    "arv_get_device_protocol": (c_char_p, [c_uint]),
-    "arv_camera_is_gv_device": (c_int, [c_void_p]),
-    "arv_camera_get_device": (c_void_p, [c_void_p]),
-    "arv_gv_device_is_controller": (c_int, [c_void_p]),
-    "arv_gv_stream_get_port": (c_uint16, [c_void_p]),
-    "arv_stream_push_buffer": (None, [c_void_p, c_void_p]),
-    "arv_stream_timeout_pop_buffer": (c_void_p, [c_void_p, c_uint64]),
-    "arv_buffer_new": (c_void_p, [c_size_t, c_void_p]),
-    "arv_buffer_get_status": (c_int, [c_void_p]),
-    "arv_buffer_get_data": (c_void_p, [c_void_p, POINTER(c_size_t)]),
-    "arv_buffer_get_frame_id": (c_uint64, [c_void_p]),
-    "arv_buffer_get_timestamp": (c_uint64, [c_void_p]),
-    "arv_buffer_get_image_width": (c_int, [c_void_p]),
-    "arv_buffer_get_image_height": (c_int, [c_void_p]),
-    "g_object_unref": (None, [c_void_p]),
-    "g_free": (None, [c_void_p]),
-}
 
 
 class _GError(ctypes.Structure):
     _fields_ = (("domain", ctypes.c_uint32), ("code", c_int), ("message", c_char_p))
 
 
-class AravisFunctions:
-    """The library's functions as attributes, ready to be called."""
+_INTEGER, _DOUBLE = POINTER(c_int), POINTER(c_double)
+# Result, names after arv_camera_, and the arguments after the camera and before the error, which all of them have.
+_OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
+    (None, "clear_triggers software_trigger start_acquisition stop_acquisition", []),
+    (None, "set_acquisition_mode set_exposure_time_auto set_gain_auto", [c_int]),
+    (None, "set_trigger set_pixel_format_from_string", [c_char_p]),
+    (None, "set_region", [c_int] * 4),
+    (None, "get_region", [_INTEGER] * 4),
+    (None, "get_sensor_size", [_INTEGER] * 2),
+    (c_char_p, "get_vendor_name get_model_name get_device_serial_number get_pixel_format_as_string", []),
+    (POINTER(c_char_p), "dup_available_pixel_formats_as_strings", [POINTER(c_uint)]),
+    (c_int, "is_feature_available", [c_char_p]),
+    (c_int, "is_exposure_auto_available is_gain_auto_available", []),
+    (c_int, "is_exposure_time_available is_frame_rate_available", []),
+    (None, "get_exposure_time_bounds get_gain_bounds get_frame_rate_bounds", [_DOUBLE] * 2),
+    (c_double, "get_exposure_time get_gain get_frame_rate", []),
+    (None, "set_exposure_time set_gain set_frame_rate", [c_double]),
+    (c_void_p, "create_stream", [c_void_p] * 2),
+    (c_uint, "get_payload", []),
+)
+# Result, whole names, and all arguments.
+_OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
+    (c_void_p, "arv_camera_new", [c_char_p, POINTER(POINTER(_GError))]),
+    (None, "arv_update_device_list", []),
+    (c_uint, "arv_get_n_devices", []),
+    (c_char_p, "arv_get_device_id arv_get_device_serial_nbr arv_get_device_address", [c_uint]),
+    (c_char_p, "arv_get_device_protocol", [c_uint]),
+    (c_int, "arv_camera_is_gv_device arv_gv_device_is_controller arv_buffer_get_status", [c_void_p]),
+    (c_void_p, "arv_camera_get_device", [c_void_p]),
+    (c_uint16, "arv_gv_stream_get_port", [c_void_p]),
+    (None, "arv_stream_push_buffer", [c_void_p, c_void_p]),
+    (c_void_p, "arv_stream_timeout_pop_buffer", [c_void_p, c_uint64]),
+    (c_void_p, "arv_buffer_new", [c_size_t, c_void_p]),
+    (c_void_p, "arv_buffer_get_data", [c_void_p, POINTER(c_size_t)]),
+    (c_uint64, "arv_buffer_get_frame_id arv_buffer_get_timestamp", [c_void_p]),
+    (c_int, "arv_buffer_get_image_width arv_buffer_get_image_height", [c_void_p]),
+    (None, "g_object_unref g_free g_error_free", [c_void_p]),
+)
 
-    def __init__(self, library: ctypes.CDLL):
-        self._functions: dict[str, Callable[..., Any]] = {}
-        table: dict[str, tuple[Any, list[Any]]] = dict(_OTHERS)
-        for name, (result, arguments) in _OF_CAMERA.items():
-            table[f"arv_camera_{name}"] = (result, [*arguments, POINTER(POINTER(_GError))])
-        for name, (result, arguments) in table.items():
+
+def _functions() -> SimpleNamespace:
+    """The library's functions with their types, for this module alone."""
+    library, functions = load_aravis(), SimpleNamespace()
+    of_camera = (
+        (result, f"arv_camera_{name}", [c_void_p, *arguments, POINTER(POINTER(_GError))])
+        for result, names, arguments in _OF_CAMERA
+        for name in names.split()
+    )
+    for result, names, arguments in (*of_camera, *_OTHERS):
+        for name in names.split():
             function = library[name]
             function.restype, function.argtypes = result, arguments
-            self._functions[name] = function
-        self._free_error = library["g_error_free"]
-        self._free_error.restype, self._free_error.argtypes = None, [c_void_p]
+            setattr(functions, name, function)
+    return functions
 
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        return self._functions[name]
 
-    def checked(self, name: str, *arguments: object) -> tuple[Any, str | None]:
-        """Call a function of a camera; its result, and the error message if there is one."""
-        error = POINTER(_GError)()
-        result = self._functions[name](*arguments, byref(error))
-        if not error:
-            return result, None
-        message = self.text(error.contents.message)
-        self._free_error(error)
-        return result, message
-
-    @staticmethod
-    def text(value: bytes | None) -> str:
-        """A C string as text; empty if there is none."""
-        return "" if value is None else value.decode(errors="replace")
+def _text(value: bytes | None) -> str:
+    return "" if value is None else value.decode(errors="replace")
 
 
 _ANSWER_S = 0.1
@@ -153,21 +111,13 @@ class FoundCamera:
 def list_aravis_cameras() -> list[FoundCamera]:
     """Ask for all cameras on the networks and USB ports of this machine; takes about a second.
 
-    Raises
-    ------
-    SetupError
-        Aravis is not installed.
+    SetupError where Aravis is not installed.
     """
-    functions = AravisFunctions(load_aravis())
+    functions = _functions()
     functions.arv_update_device_list()
-    parts = ("id", "serial_nbr", "address", "protocol")
-    found = _served_on_loopback()
-    for index in range(functions.arv_get_n_devices()):
-        identifier, serial, address, protocol = (
-            functions.text(getattr(functions, f"arv_get_device_{part}")(index)) for part in parts
-        )
-        found.append(FoundCamera(identifier, serial, address, protocol))
-    return found
+    asked = [getattr(functions, f"arv_get_device_{part}") for part in ("id", "serial_nbr", "address", "protocol")]
+    count = functions.arv_get_n_devices()
+    return _served_on_loopback() + [FoundCamera(*(_text(ask(k)) for ask in asked)) for k in range(count)]
 
 
 def _served_on_loopback() -> list[FoundCamera]:
@@ -196,20 +146,24 @@ class AravisCamera(Camera):
     def __init__(self, name: str, *, address: str | None = None):
         super().__init__(address or f"aravis:{name}")
         self._name = name
-        self._functions: AravisFunctions
+        self._functions: SimpleNamespace
         self._camera: int | None = None
         self._stream: int | None = None
         self._gone = False
 
     def _open(self) -> CameraInfo:
-        self._functions = AravisFunctions(load_aravis())
+        self._functions = functions = _functions()
         self._gone = False
-        self._camera = self._call("new", self._identifier(), of=None)
+        self._camera = self._call("new", self._identifier())
         try:
-            self._require_control()
+            # A GigE camera obeys one program at a time; Aravis opens it for reading where that is another one.
+            if functions.arv_camera_is_gv_device(self._camera):
+                device = functions.arv_camera_get_device(self._camera)
+                if not functions.arv_gv_device_is_controller(device):
+                    raise HardwareError(f"the camera {self.address} is used by another program: end that one first")
             width, height = self._numbers("get_sensor_size", 2)
             maker, model, serial = (
-                self._functions.text(self._call(f"get_{part}")) or "?"
+                _text(self._call(f"get_{part}")) or "?"
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
             bits = MONO_BITS.get(self._pixel_format(), 8)
@@ -220,7 +174,8 @@ class AravisCamera(Camera):
 
     def _identifier(self) -> bytes:
         """How Aravis calls the camera: an IP address as it is, for everything else there is a search."""
-        if _is_ip_address(self._name):
+        with suppress(ValueError):
+            ip_address(self._name)
             return self._name.encode()
         found = list_aravis_cameras()
         fitting = [each for each in found if self._name in ("", each.identifier, each.serial, each.address)]
@@ -233,14 +188,6 @@ class AravisCamera(Camera):
             )
         # An address is asked directly, which also reaches the loopback interface.
         return (fitting[0].address if fitting[0].protocol == "GigEVision" else fitting[0].identifier).encode()
-
-    def _require_control(self) -> None:
-        """A GigE camera obeys one program at a time; Aravis opens it for reading where that is another one."""
-        functions = self._functions
-        if functions.arv_camera_is_gv_device(self._camera):
-            device = functions.arv_camera_get_device(self._camera)
-            if not functions.arv_gv_device_is_controller(device):
-                raise HardwareError(f"the camera {self.address} is used by another program: end that one first")
 
     def _close(self) -> None:
         things = [thing for thing in (self._stream, self._camera) if thing is not None]
@@ -255,43 +202,46 @@ class AravisCamera(Camera):
         for thing in things:
             self._functions.g_object_unref(thing)
 
-    def _configure(self, requested: RequestedSettings) -> CameraSettings:
-        info = self.info
+    def _configure(self, wanted: CameraSettings) -> CameraSettings:
         self._call("set_acquisition_mode", 0)
         self._call("clear_triggers")
-        self._set_pixel_format(requested.bits)
-        region = requested.region or Region(0, 0, info.width_px, info.height_px)
+        count = c_uint()
+        names = self._call("dup_available_pixel_formats_as_strings", byref(count))
+        offered = [names[index].decode() for index in range(count.value)]
+        self._functions.g_free(names)
+        self._call("set_pixel_format_from_string", self._grey_format(wanted.bits, offered).encode())
+        region = wanted.region
         self._call("set_region", region.x_px, region.y_px, region.width_px, region.height_px)
-        for feature, value in (("exposure_time", requested.exposure_ms), ("gain", requested.gain_db)):
-            if value is not None:
-                self._set_number(feature, 1e3 * value if feature == "exposure_time" else value)
-        if requested.frame_rate_hz is not None:
-            self._set_number("frame_rate", requested.frame_rate_hz)
-        if requested.trigger != "free":
-            self._call("set_trigger", b"Software" if requested.trigger == "software" else b"Line0")
-        exposure_us, gain, rate = (self._get_number(feature) for feature in ("exposure_time", "gain", "frame_rate"))
+        exposure_us = None if wanted.exposure_ms is None else 1e3 * wanted.exposure_ms
+        self._set_number("exposure_time", exposure_us, automatic="exposure")
+        self._set_number("gain", wanted.gain_db, automatic="gain")
+        self._set_number("frame_rate", wanted.frame_rate_hz)
+        if wanted.trigger != "free":
+            self._call("set_trigger", b"Software" if wanted.trigger == "software" else b"Line0")
+        exposure_us, gain, rate = (
+            self._call(f"get_{feature}") if self._has(feature) else None
+            for feature in ("exposure_time", "gain", "frame_rate")
+        )
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
             region=Region(*self._numbers("get_region", 4)),
             bits=MONO_BITS[self._pixel_format()],
-            trigger=requested.trigger,
-            frame_rate_hz=rate if requested.trigger == "free" else None,
+            trigger=wanted.trigger,
+            frame_rate_hz=rate,
         )
 
-    def _set_number(self, feature: str, value: float) -> None:
+    def _set_number(self, feature: str, value: float | None, *, automatic: str | None = None) -> None:
+        if value is None:
+            return
         if not self._has(feature):
             raise HardwareError(f"the camera {self.address} has no setting for {feature.replace('_', ' ')}")
-        automatic = feature.replace("_time", "")
-        if feature != "frame_rate" and self._call(f"is_{automatic}_auto_available"):
+        if automatic and self._call(f"is_{automatic}_auto_available"):
             self._call(f"set_{feature}_auto", 0)
-        low, high = (ctypes.c_double() for _ in range(2))
-        self._call(f"get_{feature}_bounds", ctypes.byref(low), ctypes.byref(high))
+        low, high = c_double(), c_double()
+        self._call(f"get_{feature}_bounds", byref(low), byref(high))
         # Some cameras refuse what is out of range, others stop answering.
         self._call(f"set_{feature}", min(max(value, low.value), high.value))
-
-    def _get_number(self, feature: str) -> float | None:
-        return self._call(f"get_{feature}") if self._has(feature) else None
 
     def _has(self, feature: str) -> bool:
         # A gain that is called otherwise is not in dB.
@@ -299,16 +249,8 @@ class AravisCamera(Camera):
             return bool(self._call("is_feature_available", b"Gain"))
         return bool(self._call(f"is_{feature}_available"))
 
-    def _set_pixel_format(self, bits: int | None) -> None:
-        count = ctypes.c_uint()
-        names = self._call("dup_available_pixel_formats_as_strings", ctypes.byref(count))
-        offered = [names[index].decode() for index in range(count.value)]
-        self._functions.g_free(names)
-        wanted = self._grey_format(bits, self._pixel_format(), offered)
-        self._call("set_pixel_format_from_string", wanted.encode())
-
     def _pixel_format(self) -> str:
-        return self._functions.text(self._call("get_pixel_format_as_string"))
+        return _text(self._call("get_pixel_format_as_string"))
 
     def _start(self) -> None:
         functions = self._functions
@@ -345,15 +287,17 @@ class AravisCamera(Camera):
         functions = self._functions
         stamp_ns = functions.arv_buffer_get_timestamp(buffer)
         number, time_s = functions.arv_buffer_get_frame_id(buffer), 1e-9 * stamp_ns if stamp_ns else None
+        incomplete = Delivered(None, number, time_s)
         if functions.arv_buffer_get_status(buffer) != BUFFER_COMPLETE:
-            return Delivered(None, number, time_s)
-        size = ctypes.c_size_t()
-        start = functions.arv_buffer_get_data(buffer, ctypes.byref(size))
+            return incomplete
+        size = c_size_t()
+        start = functions.arv_buffer_get_data(buffer, byref(size))
         width, height = functions.arv_buffer_get_image_width(buffer), functions.arv_buffer_get_image_height(buffer)
         kind = np.dtype(np.uint8 if self.settings.bits == 8 else "<u2")
-        if size.value < width * height * kind.itemsize:
-            return Delivered(None, number, time_s)
-        pixels = (ctypes.c_ubyte * (width * height * kind.itemsize)).from_address(start)
+        needed = width * height * kind.itemsize
+        if size.value < needed:
+            return incomplete
+        pixels = (ctypes.c_ubyte * needed).from_address(start)
         image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
         return Delivered(image, number, time_s)
 
@@ -361,15 +305,17 @@ class AravisCamera(Camera):
         self._numbers("get_region", 4)
 
     def _numbers(self, name: str, count: int) -> list[int]:
-        numbers = [ctypes.c_int() for _ in range(count)]
-        self._call(name, *map(ctypes.byref, numbers))
+        numbers = [c_int() for _ in range(count)]
+        self._call(name, *map(byref, numbers))
         return [number.value for number in numbers]
 
-    def _call(self, name: str, *arguments: object, of: str | None = "camera") -> Any:
-        """Call ``arv_camera_NAME``; the library's complaint becomes a HardwareError."""
-        receiver = () if of is None else (self._camera,)
-        result, complaint = self._functions.checked(f"arv_camera_{name}", *receiver, *arguments)
-        if complaint is not None:
+    def _call(self, name: str, *arguments: object) -> Any:
+        """Call ``arv_camera_NAME``, for the camera once there is one; the library's error becomes a HardwareError."""
+        receiver, error = () if self._camera is None else (self._camera,), POINTER(_GError)()
+        result = getattr(self._functions, f"arv_camera_{name}")(*receiver, *arguments, byref(error))
+        if error:
+            complaint = _text(error.contents.message)
+            self._functions.g_error_free(error)
             self._gone = self._gone or "timeout" in complaint
             raise self._failed(f"'{name.replace('_', ' ')}'", complaint)
         return result
@@ -390,11 +336,3 @@ def _widen(port: int) -> None:
             with socket.socket(fileno=os.dup(number)) as same:
                 if same.family == socket.AF_INET and same.getsockname()[1] == port:
                     same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BYTES)
-
-
-def _is_ip_address(name: str) -> bool:
-    try:
-        ip_address(name)
-    except ValueError:
-        return False
-    return True

@@ -10,9 +10,10 @@ twice, come late, or leave out frames that were lost in transfer.
 
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal, Self
 
@@ -70,7 +71,7 @@ class FrameCheck:
         self._period_s = period_s
         self._last_id: int | None = None
         self._last_time_s: float | None = None
-        self._counts = dict.fromkeys(("ok", "short", "duplicated", "dropped", "late", "unanswered"), 0)
+        self._counts: Counter[str] = Counter()
 
     @property
     def counts(self) -> FrameCounts:
@@ -80,15 +81,15 @@ class FrameCheck:
     def judge(self, *, frame_id: int, time_s: float | None, complete: bool) -> FrameStatus:
         """Status of the next frame: its number, its time stamp in s (None: it has none), whether nothing is missing."""
         advance = 1 if self._last_id is None else _advance(self._last_id, frame_id)
-        same_time = time_s is not None and time_s == self._last_time_s
+        since_s = None if time_s is None or self._last_time_s is None else time_s - self._last_time_s
         self._counts["dropped"] += max(advance - 1, 0)
         if not complete:
             status = FrameStatus.SHORT
-        elif advance == 0 or same_time:
+        elif advance == 0 or since_s == 0:
             status = FrameStatus.DUPLICATED
         elif advance > 1:
             status = FrameStatus.DROPPED
-        elif advance < 0 or self._is_late(time_s):
+        elif advance < 0 or (self._period_s is not None and since_s is not None and since_s > 2 * self._period_s):
             status = FrameStatus.LATE
         else:
             status = FrameStatus.OK
@@ -99,19 +100,12 @@ class FrameCheck:
             self._last_id, self._last_time_s = frame_id, time_s
         return status
 
-    def _is_late(self, time_s: float | None) -> bool:
-        if self._period_s is None or time_s is None or self._last_time_s is None:
-            return False
-        return time_s - self._last_time_s > 2 * self._period_s
+    def begin_anew(self, counted: Literal["unanswered", "late"]) -> None:
+        """Count a trigger that was not answered, or a frame thrown away as nobody waited for it any more.
 
-    def missed(self) -> None:
-        """Take note that a trigger was not answered; the acquisition restarts, and the camera may count afresh."""
-        self._counts["unanswered"] += 1
-        self._last_id = self._last_time_s = None
-
-    def unasked(self) -> None:
-        """Take note of a frame that came when nobody waited for it any more, and was thrown away."""
-        self._counts["late"] += 1
+        The next frame is not compared with those before: the camera may count afresh.
+        """
+        self._counts[counted] += 1
         self._last_id = self._last_time_s = None
 
 
@@ -153,24 +147,15 @@ class CameraInfo:
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Settings in force; None where the camera has no such setting, or does not report it."""
+    """Settings in force, None where the camera has no such setting, or does not report it.
+
+    Settings that a driver is asked for, None leaving a setting as it is.
+    """
 
     exposure_ms: float | None
     gain_db: float | None
     region: Region
     bits: int
-    trigger: Trigger
-    frame_rate_hz: float | None
-
-
-@dataclass(frozen=True)
-class RequestedSettings:
-    """Settings asked for; None leaves a setting as it is, but the region becomes the whole image."""
-
-    exposure_ms: float | None
-    gain_db: float | None
-    region: Region | None
-    bits: int | None
     trigger: Trigger
     frame_rate_hz: float | None
 
@@ -267,17 +252,10 @@ class Camera(ABC):
     ) -> CameraSettings:
         """Set up the camera, and return what it really set, which may be rounded or limited.
 
-        Parameters
-        ----------
-        exposure_ms, gain_db, bits
-            Exposure in ms, gain in dB, bits of a grey value; None leaves what is set.
-        region
-            Part of the image sensor to read out; None for all of it.
-        trigger
-            "free": one frame after the other. "software": one for each call of ``trigger``. "line": one for each
-            pulse at the camera's trigger input.
-        frame_rate_hz
-            Frames per second of a free-running camera; None leaves what is set.
+        Exposure, gain, bits of a grey value, and frames per second of a free-running camera: None leaves what is set.
+        ``region`` is the part of the image sensor to read out; None for all of it. ``trigger`` is "free": one frame
+        after the other; "software": one for each call of ``trigger``; or "line": one for each pulse at the camera's
+        trigger input.
         """
         info = self.info
         if self._started:
@@ -287,10 +265,15 @@ class Camera(ABC):
                 raise HardwareError(f"{name} is {value}: it must be positive")
         if gain_db is not None and not np.isfinite(gain_db):
             raise HardwareError(f"gain_db is {gain_db}: it must be finite")
-        if region is not None:
-            _refuse_outside(region, info)
-        requested = RequestedSettings(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz)
-        self._settings = self._configure(requested)
+        region = region or Region(0, 0, info.width_px, info.height_px)
+        right, below = region.x_px + region.width_px, region.y_px + region.height_px
+        inside = min(region.x_px, region.y_px) >= 0 and min(region.width_px, region.height_px) > 0
+        if not inside or right > info.width_px or below > info.height_px:
+            raise HardwareError(f"{region} is not within the image sensor of {info.width_px} x {info.height_px} px")
+        if bits is None:
+            bits = info.bits if self._settings is None else self._settings.bits
+        settings = self._configure(CameraSettings(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz))
+        self._settings = settings if trigger == "free" else replace(settings, frame_rate_hz=None)
         return self._settings
 
     def start(self, *, faults: Literal["raise", "skip"] = "raise") -> None:
@@ -302,8 +285,7 @@ class Camera(ABC):
         settings = self.settings
         if self._started:
             raise HardwareError(f"the camera {self.address} is running already")
-        rate_hz = settings.frame_rate_hz if settings.trigger == "free" else None
-        self._check = FrameCheck(period_s=None if rate_hz is None else 1 / rate_hz)
+        self._check = FrameCheck(period_s=1 / settings.frame_rate_hz if settings.frame_rate_hz else None)
         self._skip = faults == "skip"
         self._start()
         self._started = True
@@ -322,58 +304,49 @@ class Camera(ABC):
                 f"the camera {self.address} is configured for trigger '{self.settings.trigger}', not 'software'"
             )
         while self._next(0.0) is not None:
-            self._check.unasked()
+            self._check.begin_anew("late")
         self._trigger()
 
     def grab(self, timeout_s: float) -> GrabbedFrame:
         """Wait for the next frame, at most so many seconds.
 
-        Raises
-        ------
-        HardwareError
-            No frame came in time, the camera is gone, or the frame has a fault (see ``start``). After a trigger that
-            was not answered in time the acquisition is restarted, so that its frame cannot be taken for the answer
-            to a later one.
+        HardwareError where no frame came in time, the camera is gone, or the frame has a fault (see ``start``). After a
+        trigger that was not answered in time the acquisition is restarted, so that its frame cannot be taken for the
+        answer to a later one.
         """
         self._require_running()
         deadline = time.monotonic() + timeout_s
         while True:
-            delivered = self._wait(deadline)
-            if delivered is None:
-                raise self._no_frame(timeout_s)
-            status = self._check.judge(
-                frame_id=delivered.frame_id, time_s=delivered.time_s, complete=delivered.image is not None
-            )
-            usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
-            if delivered.image is not None and usable:
-                return self._grabbed(delivered.image, delivered, status)
-            if not self._skip:
-                raise HardwareError(f"frame {delivered.frame_id} of the camera {self.address} is {_MEANING[status]}")
-
-    def _wait(self, deadline: float) -> Delivered | None:
-        while True:
             left_s = max(deadline - time.monotonic(), 0.0)
-            delivered = self._next(min(left_s, _WAIT_S))
-            if delivered is not None or left_s <= _WAIT_S:
-                return delivered
+            frame = self._next(min(left_s, _WAIT_S))
+            if frame is None:
+                if left_s > _WAIT_S:
+                    continue
+                raise self._no_frame(timeout_s)
+            status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.image is not None)
+            usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
+            if frame.image is not None and usable:
+                return self._grabbed(frame.image, frame, status)
+            if not self._skip:
+                raise HardwareError(f"frame {frame.frame_id} of the camera {self.address} is {_MEANING[status]}")
 
-    def _grabbed(self, image: np.ndarray, delivered: Delivered, status: FrameStatus) -> GrabbedFrame:
-        region = self.settings.region
-        if image.shape != (region.height_px, region.width_px):
+    def _grabbed(self, image: np.ndarray, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
+        settings = self.settings
+        if image.shape != (settings.region.height_px, settings.region.width_px):
             raise HardwareError(
-                f"frame {delivered.frame_id} of the camera {self.address} has {image.shape[1]} x "
-                f"{image.shape[0]} px, expected {region.width_px} x {region.height_px} px"
+                f"frame {frame.frame_id} of the camera {self.address} has {image.shape[1]} x {image.shape[0]} px, "
+                f"expected {settings.region.width_px} x {settings.region.height_px} px"
             )
-        time_s = time.monotonic() if delivered.time_s is None else delivered.time_s
-        exposure_ms = self.settings.exposure_ms if delivered.exposure_ms is None else delivered.exposure_ms
-        return GrabbedFrame(image, time_s, delivered.frame_id, exposure_ms, status)
+        time_s = time.monotonic() if frame.time_s is None else frame.time_s
+        exposure_ms = settings.exposure_ms if frame.exposure_ms is None else frame.exposure_ms
+        return GrabbedFrame(image, time_s, frame.frame_id, exposure_ms, status)
 
     def _no_frame(self, timeout_s: float) -> HardwareError:
         """The error of a frame that did not come; another HardwareError where the camera is gone altogether."""
         # Should the camera be gone, nothing is left to be stopped.
         self._started = False
         if self.settings.trigger == "software":
-            self._check.missed()
+            self._check.begin_anew("unanswered")
             self._stop()
             self._start()
             self._started = True
@@ -395,9 +368,9 @@ class Camera(ABC):
             "whether another program uses it"
         )
 
-    def _grey_format(self, bits: int | None, current: str, offered: Sequence[str]) -> str:
-        """The pixel format for so many bits; for None the current one if it is grey, else that of 8 bits."""
-        wanted = current if bits is None and current in MONO_BITS else f"Mono{bits or 8}"
+    def _grey_format(self, bits: int, offered: Sequence[str]) -> str:
+        """The pixel format for so many bits."""
+        wanted = f"Mono{bits}"
         if wanted not in offered or wanted not in MONO_BITS:
             raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
         return wanted
@@ -422,7 +395,7 @@ class Camera(ABC):
         """Let go of everything that ``_open`` acquired, even if the camera is gone."""
 
     @abstractmethod
-    def _configure(self, requested: RequestedSettings) -> CameraSettings:
+    def _configure(self, wanted: CameraSettings) -> CameraSettings:
         """Set what is asked for, and read back what came of it."""
 
     @abstractmethod
@@ -444,10 +417,3 @@ class Camera(ABC):
     @abstractmethod
     def _answers(self) -> None:
         """HardwareError where the camera is gone."""
-
-
-def _refuse_outside(region: Region, info: CameraInfo) -> None:
-    right, below = region.x_px + region.width_px, region.y_px + region.height_px
-    inside = min(region.x_px, region.y_px) >= 0 and min(region.width_px, region.height_px) > 0
-    if not inside or right > info.width_px or below > info.height_px:
-        raise HardwareError(f"{region} is not within the image sensor of {info.width_px} x {info.height_px} px")

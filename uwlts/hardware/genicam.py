@@ -8,28 +8,18 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import (
-    BUFFERS,
-    MONO_BITS,
-    Camera,
-    CameraInfo,
-    CameraSettings,
-    Delivered,
-    Region,
-    RequestedSettings,
-)
+from uwlts.hardware.camera import BUFFERS, MONO_BITS, Camera, CameraInfo, CameraSettings, Delivered, Region
 from uwlts.model.errors import HardwareError, SetupError
 
 # GenApi's access modes count: not implemented, not available, write only, read only, both.
 _WRITE_ONLY = 2
 # Names after the standard, then those in use before it.
 _EXPOSURE_US, _FRAME_RATE = ("ExposureTime", "ExposureTimeAbs"), ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
-_HOW_TO_INSTALL = "the libraries harvesters and genicam are not installed: pip install harvesters genicam"
+_GAIN = ("Gain",)
 
 
 class GenicamCamera(Camera):
@@ -46,7 +36,13 @@ class GenicamCamera(Camera):
         self._timeout: type[BaseException] = BaseException
 
     def _open(self) -> CameraInfo:
-        core, genapi, gentl = _libraries()
+        try:
+            from genicam import genapi, gentl
+            from harvesters import core
+        except ImportError as error:
+            raise SetupError(
+                f"the libraries harvesters and genicam are not installed: pip install harvesters genicam ({error})"
+            ) from error
         self._faults = (genapi.GenericException, gentl.GenericException)
         self._timeout = gentl.TimeoutException
         if not self._producer.is_file():
@@ -62,7 +58,7 @@ class GenicamCamera(Camera):
 
     def _connect(self, harvester: Any) -> CameraInfo:
         harvester.add_file(str(self._producer))
-        try:
+        with self._reporting("opening it"):
             harvester.update()
             found = list(harvester.device_info_list)
             fitting = [each for each in found if self._serial in (None, each.serial_number)]
@@ -77,9 +73,15 @@ class GenicamCamera(Camera):
             self._acquirer.num_buffers = BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
             bits = MONO_BITS.get(self._node("PixelFormat").value, 8)
-        except self._faults as error:
-            raise self._failed("opening it", error) from error
         return CameraInfo(f"{fitting[0].vendor} {fitting[0].model}", fitting[0].serial_number, width, height, bits)
+
+    @contextmanager
+    def _reporting(self, doing: str) -> Iterator[None]:
+        """Turn the errors of the libraries into a HardwareError."""
+        try:
+            yield
+        except self._faults as error:
+            raise self._failed(doing, error) from error
 
     @property
     def _acquirer(self) -> Any:
@@ -95,44 +97,32 @@ class GenicamCamera(Camera):
         if harvester is not None:
             harvester.reset()
 
-    def _configure(self, requested: RequestedSettings) -> CameraSettings:
-        try:
+    def _configure(self, wanted: CameraSettings) -> CameraSettings:
+        with self._reporting("configuring it"):
             self._set_if_there("AcquisitionMode", "Continuous")
             self._set_if_there("TriggerMode", "Off")
-            self._set_pixel_format(requested.bits)
-            self._set_region(requested.region)
-            self._set_number(_EXPOSURE_US, requested.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
-            self._set_number(("Gain",), requested.gain_db, "gain", automatic="GainAuto")
-            if requested.frame_rate_hz is not None:
+            self._set_if_there("PixelFormat", self._grey_format(wanted.bits, self._node("PixelFormat").symbolics))
+            self._set_region(wanted.region)
+            self._set_number(_EXPOSURE_US, wanted.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
+            self._set_number(_GAIN, wanted.gain_db, "gain", automatic="GainAuto")
+            if wanted.frame_rate_hz is not None:
                 self._set_if_there("AcquisitionFrameRateEnable", True)
-            self._set_number(_FRAME_RATE, requested.frame_rate_hz, "frame rate")
-            if requested.trigger != "free":
-                self._set_trigger("Software" if requested.trigger == "software" else "Line0")
-            return self._settings_read(requested)
-        except self._faults as error:
-            raise self._failed("configuring it", error) from error
+            self._set_number(_FRAME_RATE, wanted.frame_rate_hz, "frame rate")
+            if wanted.trigger != "free":
+                self._set_trigger("Software" if wanted.trigger == "software" else "Line0")
+            exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, _GAIN, _FRAME_RATE))
+            x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
+            width, height = (int(self._node(name).value) for name in ("Width", "Height"))
+            return CameraSettings(
+                exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
+                gain_db=gain,
+                region=Region(x, y, width, height),
+                bits=MONO_BITS[self._node("PixelFormat").value],
+                trigger=wanted.trigger,
+                frame_rate_hz=rate,
+            )
 
-    def _settings_read(self, requested: RequestedSettings) -> CameraSettings:
-        exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, ("Gain",), _FRAME_RATE))
-        x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
-        region = Region(x, y, int(self._node("Width").value), int(self._node("Height").value))
-        return CameraSettings(
-            exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
-            gain_db=gain,
-            region=region,
-            bits=MONO_BITS[self._node("PixelFormat").value],
-            trigger=requested.trigger,
-            frame_rate_hz=rate if requested.trigger == "free" else None,
-        )
-
-    def _set_pixel_format(self, bits: int | None) -> None:
-        node = self._node("PixelFormat")
-        wanted = self._grey_format(bits, node.value, node.symbolics)
-        if node.value != wanted:
-            node.value = wanted
-
-    def _set_region(self, region: Region | None) -> None:
-        wanted = region or Region(0, 0, self.info.width_px, self.info.height_px)
+    def _set_region(self, wanted: Region) -> None:
         # Moved to the corner first: a width is refused that would not fit beside the offset.
         for name in ("OffsetX", "OffsetY"):
             self._set_if_there(name, 0)
@@ -151,8 +141,7 @@ class GenicamCamera(Camera):
     ) -> None:
         if value is None:
             return
-        name = next((name for name in names if self._has(name)), None)
-        if name is None:
+        if (name := next(filter(self._has, names), None)) is None:
             raise HardwareError(f"the camera {self.address} has no setting for {what} ({' or '.join(names)})")
         if automatic is not None:
             self._set_if_there(automatic, "Off")
@@ -189,27 +178,22 @@ class GenicamCamera(Camera):
         return int(self._node(side).max)
 
     def _start(self) -> None:
-        try:
+        with self._reporting("starting it"):
             self._acquirer.start()
-        except self._faults as error:
-            raise self._failed("starting it", error) from error
 
     def _stop(self) -> None:
         self._acquirer.stop()
 
     def _trigger(self) -> None:
-        try:
+        with self._reporting("triggering it"):
             self._node("TriggerSoftware").execute()
-        except self._faults as error:
-            raise self._failed("triggering it", error) from error
 
     def _next(self, timeout_s: float) -> Delivered | None:
-        try:
-            buffer = self._acquirer.fetch(timeout=timeout_s)
-        except self._timeout:
-            return None
-        except self._faults as error:
-            raise self._failed("waiting for a frame", error) from error
+        with self._reporting("waiting for a frame"):
+            try:
+                buffer = self._acquirer.fetch(timeout=timeout_s)
+            except self._timeout:
+                return None
         try:
             return self._delivered(buffer)
         finally:
@@ -229,10 +213,8 @@ class GenicamCamera(Camera):
         return Delivered(image, raw.frame_id, time_s)
 
     def _answers(self) -> None:
-        try:
+        with self._reporting("asking it"):
             self._whole("Width")
-        except self._faults as error:
-            raise self._failed("asking it", error) from error
 
 
 @contextmanager
@@ -242,13 +224,3 @@ def _own_interrupt() -> Iterator[None]:
     yield
     if before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, before)
-
-
-def _libraries() -> tuple[ModuleType, ModuleType, ModuleType]:
-    """harvesters.core, genicam.genapi and genicam.gentl, which most users do not need."""
-    try:
-        from genicam import genapi, gentl
-        from harvesters import core
-    except ImportError as error:
-        raise SetupError(f"{_HOW_TO_INSTALL} ({error})") from error
-    return core, genapi, gentl

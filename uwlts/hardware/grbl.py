@@ -26,9 +26,10 @@ When the laser goes off:
 
 import math
 import time
-from types import TracebackType
+from collections.abc import Callable
+from typing import Self
 
-from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, GrblSettings, Message, Setting, Status, parse_settings
+from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, Status, parse_settings
 from uwlts.model.errors import HardwareError, RangeError
 
 # A stage that moves by less than a step in this time, and in that of some steps, stands still.
@@ -59,28 +60,20 @@ class GrblStage:
         self._power, self._held = 0.0, False
         try:
             self.port, self.version = port, self._line.version
-            answers = self._line.command("$$")
-            self.settings: GrblSettings = parse_settings({a.number: a.value for a in answers if isinstance(a, Setting)})
-            self._read_options()
+            self.settings = parse_settings(self._line.settings())
+            options, travel = self._line.options(), self.settings.travel_mm
+            if "V" not in options:
+                raise HardwareError(
+                    f"this Grbl's options are {options!r}, without V: the laser needs a firmware with variable spindle"
+                )
+            zero_at_low_end = "Z" in options and self.settings.homes_to_negative
+            self._origin_mm = -travel if self.settings.homing and not zero_at_low_end else 0.0
+            self.limits_mm = (0.0, travel) if self.settings.homing else (-travel, travel)
             # Locked at the start: homing is enabled and has not been done. A board whose reset is disabled keeps it.
             self._position_known = self._line.status().state != "Alarm"
         except BaseException as error:
             self._line.close(error)
             raise
-
-    def _read_options(self) -> None:
-        texts = [answer.text for answer in self._line.command("$I") if isinstance(answer, Message)]
-        options = next((text.removeprefix("OPT:").split(",")[0] for text in texts if text.startswith("OPT:")), "")
-        if "V" not in options:
-            raise HardwareError(
-                f"this Grbl's options are {options!r}, without V: the laser needs a firmware with variable spindle"
-            )
-        travel = self.settings.travel_mm
-        zero_at_switch = "Z" in options
-        self._origin_mm = (
-            0.0 if not self.settings.homing or (zero_at_switch and self.settings.homes_to_negative) else -travel
-        )
-        self.limits_mm = (0.0, travel) if self.settings.homing else (-travel, travel)
 
     @property
     def position_known(self) -> bool:
@@ -95,10 +88,7 @@ class GrblStage:
     def home(self) -> float:
         """Find the limit switch and return the position read back in mm; ends a fault. The laser goes off.
 
-        Raises
-        ------
-        HardwareError
-            Homing is disabled, fails, or takes too long; or another fault.
+        HardwareError where homing is disabled, fails, or takes too long, and for every other fault.
         """
         settings = self.settings
         if not settings.homing:
@@ -139,14 +129,16 @@ class GrblStage:
     def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
         """Move, wait until the stage rests, and return the position read back in mm.
 
-        Raises
-        ------
-        RangeError
-            The target lies outside the travel, or the feed outside what the stage can do. Nothing has moved.
-        HardwareError
-            The position is not known, or a fault: alarm, stall, hold, lost steps, restart, silence, noise, lost line.
+        RangeError where the target lies outside the travel, or the feed outside what the stage can do; nothing has
+        moved then. HardwareError where the position is not known, and for every fault: alarm, stall, hold, lost steps,
+        restart, silence, noise, lost line.
         """
-        self._refuse_outside(position_mm, feed_mm_per_min)
+        low, high = self.limits_mm
+        if not low <= position_mm <= high:
+            raise RangeError(f"{position_mm:g} mm is outside the stage's travel of {low:g} to {high:g} mm")
+        fastest = self.settings.max_feed_mm_per_min
+        if not 0 < feed_mm_per_min <= fastest:
+            raise RangeError(f"the feed {feed_mm_per_min:g} mm/min is not above 0 and up to {fastest:g} mm/min ($110)")
         if self._held:
             raise HardwareError("the stage is held since it was stopped: unlock or home it")
         if not self._position_known and self._line.fault is None:
@@ -156,7 +148,7 @@ class GrblStage:
         # Distance at full speed plus a ramp up and one down: never less than the real time, however short the way.
         expected_s = abs(position_mm - start_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
         self._line.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
-        watch = _MotionWatch(self, start_mm, feed_mm_s)
+        watch = self._motion_watch(start_mm, feed_mm_s)
         # A dwell is acknowledged when all movements before it are done.
         self._line.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
         reached_mm = self._rest()
@@ -168,13 +160,24 @@ class GrblStage:
             )
         return reached_mm
 
-    def _refuse_outside(self, position_mm: float, feed_mm_per_min: float) -> None:
-        low, high = self.limits_mm
-        if not low <= position_mm <= high:
-            raise RangeError(f"{position_mm:g} mm is outside the stage's travel of {low:g} to {high:g} mm")
-        fastest = self.settings.max_feed_mm_per_min
-        if not 0 < feed_mm_per_min <= fastest:
-            raise RangeError(f"the feed {feed_mm_per_min:g} mm/min is not above 0 and up to {fastest:g} mm/min ($110)")
+    def _motion_watch(self, start_mm: float, feed_mm_s: float) -> Callable[[Status], None]:
+        """Check of a movement's status reports for a stall and for states in which it will not end."""
+        last_mm, since = start_mm, time.monotonic()
+        patience_s = _STALL_S + _STALL_STEPS * self.settings.step_mm / feed_mm_s
+
+        def check(report: Status) -> None:
+            nonlocal last_mm, since
+            self._refuse_stop(report)
+            position_mm, now = self._position_of(report), time.monotonic()
+            if report.state != "Run" or not math.isclose(position_mm, last_mm, abs_tol=1e-9):
+                last_mm, since = position_mm, now
+            elif now - since > patience_s:
+                raise self._line.failed(
+                    f"stall: the stage has stood at {position_mm:.3f} mm for {now - since:.1f} s although the "
+                    "controller says it runs: restart the controller, then home"
+                )
+
+        return check
 
     def _rest(self) -> float:
         """Wait until the controller says Idle and return the position."""
@@ -215,9 +218,6 @@ class GrblStage:
         }
         if report.state in advice:
             raise self._line.failed(f"the controller has stopped: {advice[report.state]}")
-        self._refuse_pressed_switch(report)
-
-    def _refuse_pressed_switch(self, report: Status) -> None:
         if not self.settings.homing or "X" not in report.pins:
             return
         position_mm = self._position_of(report)
@@ -229,21 +229,11 @@ class GrblStage:
             )
 
     def laser(self, on: bool, *, power: float = 1.0) -> None:
-        """Switch the laser at once and see that the controller says so.
+        """Switch the laser at once and see that the controller says so; only the camera can show whether it is lit.
 
-        Only the camera can show whether light comes out. Below full power the pin is pulsed at some kHz.
-
-        Parameters
-        ----------
-        power : float
-            0 < power <= 1, the share of the time in which the pin is on.
-
-        Raises
-        ------
-        RangeError
-            The power is outside its range.
-        HardwareError
-            The controller is locked or does not follow, the guard process is gone, or another fault.
+        ``power``, 0 < power <= 1, is the share of the time in which the pin is on: below 1 it is pulsed at some kHz.
+        RangeError where it is outside this range; HardwareError where the controller is locked or does not follow, the
+        guard process is gone, and for every other fault.
         """
         if not 0 < power <= 1:
             raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
@@ -298,29 +288,8 @@ class GrblStage:
         """Switch the laser off and close the port; HardwareError where the controller does not confirm."""
         self._line.close(error)
 
-    def __enter__(self) -> "GrblStage":
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.close(error)
-
-
-class _MotionWatch:
-    """Looks at the status reports of a movement for a stall and for states in which it will not end."""
-
-    def __init__(self, stage: GrblStage, start_mm: float, feed_mm_s: float):
-        self._stage, self._last_mm, self._since = stage, start_mm, time.monotonic()
-        self._patience_s = _STALL_S + _STALL_STEPS * stage.settings.step_mm / feed_mm_s
-
-    def __call__(self, report: Status) -> None:
-        self._stage._refuse_stop(report)
-        position_mm, now = self._stage._position_of(report), time.monotonic()
-        if report.state != "Run" or not math.isclose(position_mm, self._last_mm, abs_tol=1e-9):
-            self._last_mm, self._since = position_mm, now
-        elif now - self._since > self._patience_s:
-            raise self._stage._line.failed(
-                f"stall: the stage has stood at {position_mm:.3f} mm for {now - self._since:.1f} s although the "
-                "controller says it runs: restart the controller, then home"
-            )

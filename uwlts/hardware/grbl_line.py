@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Literal, assert_never
 
 import serial
 from serial.tools.list_ports import comports
@@ -22,58 +22,35 @@ from uwlts.hardware import laser_guard
 from uwlts.model.errors import HardwareError
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
-_BANNER = re.compile(r"Grbl (1\.1[a-z]?) \['\$' for help\]$")
-_STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::(\d+))?$")
-_COORDINATES = re.compile(rf"{_NUMBER}(?:,{_NUMBER})*$")
-_SETTING = re.compile(rf"\$(\d+)=({_NUMBER})(?: \(.*\))?$")
+_STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::(\d+))?")
+_COORDINATES = re.compile(rf"{_NUMBER}(?:,{_NUMBER})*")
+
+ReplyKind = Literal["ok", "error", "ALARM", "banner", "setting", "message", "garbage"]
+_PATTERNS: tuple[tuple[ReplyKind, str], ...] = (
+    ("ok", "ok"),
+    ("error", r"error:(?P<number>\d{1,3})"),
+    ("ALARM", r"ALARM:(?P<number>\d{1,3})"),
+    # Noise may stand before the first character that a starting controller sends.
+    ("banner", r".*Grbl (?P<text>1\.1[a-z]?) \['\$' for help\]"),
+    ("setting", rf"\$(?P<number>\d+)=(?P<value>{_NUMBER})(?: \(.*\))?"),
+    ("message", r"\[(?P<text>[ -~]*)\]"),
+    ("message", r"(?P<text>>[ -~]*:(?:ok|error:\d+)|\$N\d=[ -~]*)"),
+)
 
 
 @dataclass(frozen=True)
-class Ok:
-    """A line was accepted."""
+class Reply:
+    """A line from the controller other than a status report.
 
+    "ok": a line was accepted; "error": it was not executed; "ALARM": the controller has stopped everything; "banner":
+    the greeting after every start and reset, ``text`` being the version; "setting": one line of the answer to ``$$``;
+    "message": a line in brackets, without them, or the report of a startup line; "garbage": what Grbl does not say.
+    """
 
-@dataclass(frozen=True)
-class Refusal:
-    """``error:N``: a line was not executed."""
-
-    code: int
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """``ALARM:N``: the controller has stopped everything."""
-
-    code: int
-
-
-@dataclass(frozen=True)
-class Banner:
-    """The greeting after every start and reset."""
-
-    version: str
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One line of the answer to ``$$``."""
-
-    number: int
-    value: float
-
-
-@dataclass(frozen=True)
-class Message:
-    """A line in brackets, without them, or the report of a startup line."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Garbage:
-    """Anything that Grbl does not say."""
-
-    text: str
+    kind: ReplyKind
+    number: int = 0
+    value: float = 0.0
+    text: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,39 +71,24 @@ class Status:
     pins: str = ""
 
 
-Reply = Ok | Refusal | Alarm | Banner | Setting | Message | Status | Garbage
-
-
-def parse_reply(line: str) -> Reply:
-    """One line from the controller, without its end. What Grbl 1.1 does not say becomes `Garbage`."""
-    if line == "ok":
-        return Ok()
-    if found := re.fullmatch(r"(error|ALARM):(\d{1,3})", line):
-        return (Refusal if found[1] == "error" else Alarm)(int(found[2]))
-    # Noise may stand before the first character that a starting controller sends.
-    if found := _BANNER.search(line):
-        return Banner(found[1])
-    if found := _SETTING.fullmatch(line):
-        return Setting(int(found[1]), float(found[2]))
-    if line.startswith("[") and line.endswith("]") and line.isascii() and line.isprintable():
-        return Message(line[1:-1])
-    if re.fullmatch(r">[ -~]*:(ok|error:\d+)", line) or re.fullmatch(r"\$N\d=[ -~]*", line):
-        return Message(line)
-    if line.startswith("<") and line.endswith(">"):
-        return _parse_status(line[1:-1]) or Garbage(line)
-    return Garbage(line)
+def parse_reply(line: str) -> Reply | Status:
+    """One line from the controller, without its end. What Grbl 1.1 does not say becomes "garbage"."""
+    for kind, pattern in _PATTERNS:
+        if found := re.fullmatch(pattern, line):
+            part = found.groupdict()
+            return Reply(kind, int(part.get("number", 0)), float(part.get("value", 0)), part.get("text", ""))
+    status = _parse_status(line[1:-1]) if line.startswith("<") and line.endswith(">") else None
+    return status or Reply("garbage", text=line)
 
 
 def _parse_status(body: str) -> Status | None:
     first, *rest = body.split("|")
-    state = _STATE.match(first)
+    state = _STATE.fullmatch(first)
     fields = {name: values for name, _, values in (field.partition(":") for field in rest)}
-    positions = {name: fields[name] for name in ("MPos", "WPos", "WCO", "FS") if name in fields}
-    if not state or ("MPos" in fields) == ("WPos" in fields):
+    numbers = {name: fields[name] for name in ("MPos", "WPos", "WCO", "FS") if name in fields}
+    if not state or ("MPos" in fields) == ("WPos" in fields) or not all(map(_COORDINATES.fullmatch, numbers.values())):
         return None
-    if not all(_COORDINATES.match(values) for values in positions.values()):
-        return None
-    x = {name: float(values.split(",")[0]) for name, values in positions.items()}
+    x = {name: float(values.split(",")[0]) for name, values in numbers.items()}
     return Status(
         state=state[1],
         substate=int(state[2]) if state[2] else None,
@@ -193,32 +155,25 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
     )
 
 
-def alarm_text(code: int) -> str:
-    """What an alarm means and what to do."""
-    meaning, advice = _ALARMS.get(code, ("unknown to Grbl 1.1", "reset the controller and home"))
-    return f"ALARM:{code}, {meaning}; {advice}"
+def code_text(kind: Literal["error", "ALARM"], number: int) -> str:
+    """Meaning of an ``error:N`` or ``ALARM:N`` and, where the operator can do something, what to do."""
+    if kind == "error":
+        return f"error:{number}, {_ERRORS.get(number, 'unknown to Grbl 1.1')}"
+    return f"ALARM:{number}, {_ALARMS.get(number, 'unknown to Grbl 1.1; reset the controller and home')}"
 
 
-def refusal_text(code: int) -> str:
-    """What an ``error:N`` means and, where the operator can do something, what."""
-    return f"error:{code}, {_ERRORS.get(code, 'unknown to Grbl 1.1')}"
-
-
-_HOME = "the position is lost: see why it happened, then home"
 _ALARMS = {
-    1: ("hard limit: the limit switch was hit, or its line caught noise", _HOME),
-    2: ("soft limit: the target lies outside the travel", "the position is kept: unlock, and stay within the travel"),
-    3: ("reset while moving", "the position is lost: home"),
-    4: ("probe: not in the expected state at the start", "check the wiring of A5, then unlock"),
-    5: ("probe: no contact within the movement", "check the probe, then unlock"),
-    6: ("homing: a reset stopped it", "home again"),
-    7: ("homing: the safety door was opened", "close it and home again"),
-    8: ("homing: the limit switch stayed pressed after the pull-off", "check its wiring, or enlarge the pull-off $27"),
-    9: (
-        "homing: no limit switch was found",
-        "check the switch, its wiring, the direction $23 and the travel $130; "
-        "a firmware that homes axes which are not there ends so too",
-    ),
+    1: "hard limit: the limit switch was hit, or its line caught noise; the position is lost: see why it happened, "
+    "then home",
+    2: "soft limit: the target lies outside the travel; the position is kept: unlock, and stay within the travel",
+    3: "reset while moving; the position is lost: home",
+    4: "probe: not in the expected state at the start; check the wiring of A5, then unlock",
+    5: "probe: no contact within the movement; check the probe, then unlock",
+    6: "homing: a reset stopped it; home again",
+    7: "homing: the safety door was opened; close it and home again",
+    8: "homing: the limit switch stayed pressed after the pull-off; check its wiring, or enlarge the pull-off $27",
+    9: "homing: no limit switch was found; check the switch, its wiring, the direction $23 and the travel $130; "
+    "a firmware that homes axes which are not there ends so too",
 }
 _ERRORS = {
     1: "a word does not begin with a letter",
@@ -291,38 +246,41 @@ class GrblLine:
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
         self.port = port
         self.fault: str | None = None
-        self.messages: list[str] = []
         self.offset_mm: float | None = None
         self._received, self._unacknowledged = bytearray(), 0
         self._serial = _open(port, baud)
         self._guard: subprocess.Popen[bytes] | None = None
-        self._alive: int | None = None
         try:
-            _hang_up_on_close(self._serial.fileno())
+            self._hang_up_on_close()
             self._start_guard()
             self.version = self._greeting(boot_s)
         except BaseException as error:
             self.close(error)
             raise
 
-    def _start_guard(self) -> None:
-        ending, self._alive = os.pipe()
-        descriptor = self._serial.fileno()
-        command = [sys.executable, "-I", "-S", str(Path(laser_guard.__file__)), str(os.getpid()), str(ending)]
+    def _hang_up_on_close(self) -> None:
+        """Have DTR drop when the port is closed by any process; docs/how-to/hardware-stage.md explains why."""
         try:
-            # In a session of its own the terminal's Ctrl-C does not reach it.
+            attributes = termios.tcgetattr(self._serial.fileno())
+            attributes[2] |= termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, attributes)
+        except termios.error as error:
+            raise HardwareError(f"the serial port cannot be set up: {error}") from error
+
+    def _start_guard(self) -> None:
+        descriptor = self._serial.fileno()
+        try:
+            # Its standard input ends with this program. In its own session the terminal's Ctrl-C does not reach it.
             self._guard = subprocess.Popen(
-                [*command, str(descriptor)],
-                pass_fds=(ending, descriptor),
+                [sys.executable, "-I", "-S", laser_guard.__file__, str(os.getpid()), str(descriptor)],
+                pass_fds=(descriptor,),
                 start_new_session=True,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
             )
         except OSError as error:
             raise HardwareError(f"cannot start the guard that switches the laser off: {error.strerror}") from error
-        finally:
-            os.close(ending)
 
     @property
     def guarded(self) -> bool:
@@ -336,13 +294,13 @@ class GrblLine:
                 self._write(wake)
             deadline = time.monotonic() + wait_s
             while (line := self._read_line(deadline)) is not None:
-                if isinstance(reply := parse_reply(line), Banner):
-                    return reply.version
-                heard = line or heard
+                reply = parse_reply(line)
+                if isinstance(reply, Reply) and reply.kind == "banner":
+                    return reply.text
+                heard = line
                 if "Grbl" in line or "FluidNC" in line:
                     raise HardwareError(f"{self.port} is not Grbl 1.1, it says {heard!r}: flash Grbl 1.1h")
-        heard = heard or _readable(self._received[:60])
-        if heard:
+        if heard := heard or _readable(self._received[:60]):
             raise HardwareError(
                 f"{self.port} does not speak Grbl, it says {heard!r}: wrong port, or not {self._serial.baudrate} baud"
             )
@@ -353,27 +311,11 @@ class GrblLine:
 
     def command(
         self, line: str, *, timeout_s: float = ANSWER_S, watch: Callable[[Status], None] | None = None
-    ) -> list[Setting | Message]:
-        """Send one line and wait until it, and all before it, are acknowledged.
+    ) -> list[Reply]:
+        """Send one line, without its end, wait until it and all before it are acknowledged, and return what came first.
 
-        Parameters
-        ----------
-        line : str
-            Without its end.
-        timeout_s : float
-            Longest time to the acknowledgement.
-        watch : callable
-            Given every status report while waiting; without it no status is asked for.
-
-        Returns
-        -------
-        list
-            The settings and messages that came before the acknowledgement.
-
-        Raises
-        ------
-        HardwareError
-            The line is refused, or a fault of the line or the controller.
+        ``watch`` is called with every status report while waiting; without it no status is asked for. HardwareError
+        where the line is refused or not done in ``timeout_s``, and for every fault of the line or the controller.
         """
         self._refuse_after_fault()
         # A line feed alone: with a carriage return as well Grbl acknowledges twice.
@@ -388,15 +330,23 @@ class GrblLine:
                 reply = self._next_reply(deadline)
                 if reply is None:
                     raise self.failed(f"{line!r} was not done in {timeout_s:.1f} s: the controller hangs or is held")
-            if isinstance(reply, Setting | Message):
+            if isinstance(reply, Reply):
                 answers.append(reply)
         return answers
 
+    def settings(self) -> dict[int, float]:
+        """Answer to ``$$``, by number."""
+        return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}
+
+    def options(self) -> str:
+        """Letters of the firmware's options in the answer to ``$I``; empty where it has none."""
+        texts = [each.text for each in self.command("$I")]
+        return next((text.removeprefix("OPT:").split(",")[0] for text in texts if text.startswith("OPT:")), "")
+
     def status(self) -> Status:
         """Ask for a status report; HardwareError where none comes, and for every fault."""
-        self._refuse_after_fault()
         for _ in range(_QUERIES):
-            self._write(STATUS_QUERY)
+            self.realtime(STATUS_QUERY)
             deadline = time.monotonic() + _QUERY_S
             while (reply := self._next_reply(deadline)) is not None:
                 if isinstance(reply, Status):
@@ -423,28 +373,24 @@ class GrblLine:
         self._write(SOFT_RESET)
         deadline = time.monotonic() + ANSWER_S
         while (line := self._read_line(deadline)) is not None:
-            if isinstance(parse_reply(line), Banner):
+            reply = parse_reply(line)
+            if isinstance(reply, Reply) and reply.kind == "banner":
                 return
         raise self.failed("the controller does not restart on Ctrl-X: switch its power off and on")
 
     def failed(self, what: str) -> HardwareError:
         """Make everything safe after a fault and return the error to raise."""
         self.fault = what
-        sent = self._try_to_reset()
-        laser = (
-            "the command to switch the laser off was sent"
-            if sent
-            else "the laser CANNOT be switched off: switch its power off before going near"
-        )
+        laser = "the laser CANNOT be switched off: switch its power off before going near"
+        with suppress(OSError):
+            self._serial.write(SOFT_RESET)
+            laser = "the command to switch the laser off was sent"
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
 
     def close(self, error: BaseException | None = None) -> None:
         """Switch the laser off and close; after an ``error`` without asking whether it worked.
 
-        Raises
-        ------
-        HardwareError
-            The controller did not confirm, and there was no error before.
+        HardwareError where the controller did not confirm and there was no error before.
         """
         if not self._serial.is_open:
             return
@@ -452,21 +398,21 @@ class GrblLine:
             if error is None and self.fault is None and self._guard is not None:
                 self._reset()
             else:
-                self._try_to_reset()
+                with suppress(OSError):
+                    self._serial.write(SOFT_RESET)
         finally:
             self._dismiss_guard()
             self._serial.close()
 
     def _dismiss_guard(self) -> None:
-        if self._alive is not None:
-            os.close(self._alive)
-            self._alive = None
-        if self._guard is not None:
-            try:
-                self._guard.wait(ANSWER_S + 1)
-            except subprocess.TimeoutExpired:
-                self._guard.kill()
-                self._guard.wait()
+        if self._guard is None or self._guard.stdin is None:
+            return
+        self._guard.stdin.close()
+        try:
+            self._guard.wait(ANSWER_S + 1)
+        except subprocess.TimeoutExpired:
+            self._guard.kill()
+            self._guard.wait()
 
     def _refuse_after_fault(self) -> None:
         if not self._serial.is_open:
@@ -474,44 +420,42 @@ class GrblLine:
         if self.fault is not None:
             raise HardwareError(f"the stage on {self.port} has stopped after a fault: {self.fault}; home or unlock it")
 
-    def _try_to_reset(self) -> bool:
-        with suppress(OSError):
-            self._serial.write(SOFT_RESET)
-            return True
-        return False
-
     def _write(self, data: bytes) -> None:
         try:
             self._serial.write(data)
         except OSError as error:
             raise self.failed(f"the connection is lost: {error}; is the cable plugged in?") from error
 
-    def _next_reply(self, deadline: float) -> Reply | None:
+    def _next_reply(self, deadline: float) -> Reply | Status | None:
         """The next reply that is no fault, or None at the deadline."""
         line = self._read_line(deadline)
         if line is None:
             return None
-        match reply := parse_reply(line):
-            case Ok() | Refusal() if self._unacknowledged == 0:
+        reply = parse_reply(line)
+        if isinstance(reply, Status):
+            self.offset_mm = self.offset_mm if reply.offset_mm is None else reply.offset_mm
+            return reply
+        match reply.kind:
+            case "ok" | "error" if self._unacknowledged == 0:
                 raise self.failed(f"{line!r} came although nothing was sent: does another program use the port?")
-            case Ok():
+            case "ok":
                 self._unacknowledged -= 1
-            case Refusal(code):
+            case "error":
                 self._unacknowledged -= 1
-                raise HardwareError(f"the stage on {self.port} refuses: {refusal_text(code)}")
-            case Alarm(code):
-                raise self.failed(alarm_text(code))
-            case Banner():
+                raise HardwareError(f"the stage on {self.port} refuses: {code_text('error', reply.number)}")
+            case "ALARM":
+                raise self.failed(code_text("ALARM", reply.number))
+            case "banner":
                 raise self.failed(
                     "the controller restarted by itself: a dip of its supply, its reset button or interference; "
                     "its position is lost, home again"
                 )
-            case Garbage(text):
-                raise self.failed(f"garbage on the line, {text!r}: interference, or a cable that is too long or loose")
-            case Message(text):
-                self.messages.append(text)
-            case Status() if reply.offset_mm is not None:
-                self.offset_mm = reply.offset_mm
+            case "garbage":
+                raise self.failed(f"garbage on the line, {line!r}: interference, or a cable that is too long or loose")
+            case "setting" | "message":
+                pass
+            case _:
+                assert_never(reply.kind)
         return reply
 
     def _read_line(self, deadline: float) -> str | None:
@@ -546,21 +490,11 @@ def _open(port: str, baud: int) -> serial.Serial:
         raise HardwareError(f"cannot open {port} with {baud} baud: {error}") from error
     except OSError as error:
         found = ", ".join(sorted(entry.device for entry in comports())) or "none"
+        busy = dict.fromkeys((errno.EBUSY, errno.EAGAIN), "another program uses it; close that program")
         advice = {
             errno.ENOENT: f"there is no such port; ports found: {found}",
             errno.ENODEV: f"the device is gone; ports found: {found}",
             errno.EACCES: "no permission; add yourself to the group dialout and log in again",
-            errno.EBUSY: "another program uses it; close that program",
-            errno.EAGAIN: "another program uses it; close that program",
+            **busy,
         }.get(error.errno or 0, str(error))
         raise HardwareError(f"cannot open {port}: {advice}") from error
-
-
-def _hang_up_on_close(descriptor: int) -> None:
-    """Have DTR drop when the port is closed by any process; docs/how-to/hardware-stage.md explains why."""
-    try:
-        attributes = termios.tcgetattr(descriptor)
-        attributes[2] |= termios.HUPCL
-        termios.tcsetattr(descriptor, termios.TCSANOW, attributes)
-    except termios.error as error:
-        raise HardwareError(f"the serial port cannot be set up: {error}") from error

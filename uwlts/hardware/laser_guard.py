@@ -1,6 +1,6 @@
 """Switches the laser off when the program that lit it is gone: killed, crashed, or ended without closing the port.
 
-A process of its own, started by `GrblLine` with the open port and the reading end of a pipe whose writing end only
+A process of its own, started by `GrblLine` with the open port and, as standard input, a pipe whose writing end only
 that program has. When the program ends, however it does, the pipe ends; the guard then sends Ctrl-X, on which Grbl
 switches its spindle pin off at once, and closes the port. It runs as a plain script so that it starts within
 milliseconds and needs nothing but the standard library.
@@ -16,14 +16,13 @@ _SOFT_RESET = b"\x18"
 _WATCH_S, _GIVE_UP_S = 0.2, 2.0
 
 
-def wait_for_the_end_of(parent: int, alive: int) -> None:
-    """Return when the pipe ``alive`` ends, or when the process ``parent`` is no longer this one's parent.
+def wait_for_the_end_of(parent: int) -> None:
+    """Return when standard input ends, or when the process ``parent`` is no longer this one's parent.
 
     The second way is for a pipe that a forked child of the program keeps open.
     """
-    while os.getppid() == parent:
-        if select.select([alive], [], [], _WATCH_S)[0]:
-            return
+    while os.getppid() == parent and not select.select([0], [], [], _WATCH_S)[0]:
+        pass
 
 
 def switch_off(port: int) -> None:
@@ -33,14 +32,13 @@ def switch_off(port: int) -> None:
         try:
             os.write(port, _SOFT_RESET)
             termios.tcdrain(port)
+            return
         except BlockingIOError:
             select.select([], [port], [], _WATCH_S)
         except (OSError, termios.error):
             return
-        else:
-            return
 
 
 if __name__ == "__main__":
-    wait_for_the_end_of(int(sys.argv[1]), int(sys.argv[2]))
-    switch_off(int(sys.argv[3]))
+    wait_for_the_end_of(int(sys.argv[1]))
+    switch_off(int(sys.argv[2]))

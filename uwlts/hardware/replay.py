@@ -2,11 +2,12 @@
 
 import re
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, Camera, CameraInfo, CameraSettings, Delivered, Region, RequestedSettings
+from uwlts.hardware.camera import BUFFERS, Camera, CameraInfo, CameraSettings, Delivered
 from uwlts.model.errors import HardwareError, ImageError
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_.images import SUFFIXES, read_image
@@ -17,14 +18,8 @@ class ReplayCamera(Camera):
 
     A free-running replay without a frame rate shows an image whenever one is asked for. With one it does not wait for a
     program that is too slow: what no longer fits into its buffers is dropped, as by a real camera. Exposures are those
-    of the capture; of a folder's images nobody knows it, so the one that is configured counts.
-
-    Parameters
-    ----------
-    path
-        Folder or capture.
-    repeat
-        Begin again after the last image; without it grabbing more is a HardwareError.
+    of the capture; of a folder's images nobody knows it, so the one that is configured counts. With ``repeat`` it
+    begins again after the last image; without it grabbing more is a HardwareError.
     """
 
     def __init__(self, path: str | Path, *, repeat: bool = False, address: str | None = None):
@@ -33,10 +28,9 @@ class ReplayCamera(Camera):
         self._repeat = repeat
         self._files: list[Path] = []
         self._capture: Capture | None = None
-        self._shown = 0
-        self._due = 0
+        self._shown = self._due = 0
         self._began_s = 0.0
-        self._triggers = 0
+        self._triggered = False
 
     def _open(self) -> CameraInfo:
         self._shown = 0
@@ -63,41 +57,37 @@ class ReplayCamera(Camera):
         if capture is not None:
             capture.close()
 
-    def _configure(self, requested: RequestedSettings) -> CameraSettings:
-        info = self.info
-        if requested.trigger == "line":
+    def _configure(self, wanted: CameraSettings) -> CameraSettings:
+        if wanted.trigger == "line":
             raise HardwareError(f"{self.address} has no trigger input: use trigger 'free' or 'software'")
-        if requested.bits not in (None, info.bits):
-            raise HardwareError(f"{self.address} has images of {info.bits} bits, not {requested.bits}")
-        if requested.gain_db is not None:
+        if wanted.bits != self.info.bits:
+            raise HardwareError(f"{self.address} has images of {self.info.bits} bits, not {wanted.bits}")
+        if wanted.gain_db is not None:
             raise HardwareError(f"{self.address} has no gain: its images are what they are")
-        exposure_ms = requested.exposure_ms if self._capture is None else float(self._capture.exposure_ms[0])
-        rate = requested.frame_rate_hz if requested.trigger == "free" else None
-        region = requested.region or Region(0, 0, info.width_px, info.height_px)
-        return CameraSettings(exposure_ms, None, region, info.bits, requested.trigger, rate)
+        return wanted if self._capture is None else replace(wanted, exposure_ms=float(self._capture.exposure_ms[0]))
 
     def _start(self) -> None:
-        self._began_s, self._due, self._triggers = time.monotonic(), 0, 0
+        self._began_s, self._due, self._triggered = time.monotonic(), 0, False
 
     def _stop(self) -> None:
-        self._triggers = 0
+        self._triggered = False
 
     def _trigger(self) -> None:
-        self._triggers = 1
+        self._triggered = True
 
     def _next(self, timeout_s: float) -> Delivered | None:
         stamp_s = time.monotonic()
         if self.settings.trigger == "software":
-            if not self._triggers:
+            if not self._triggered:
                 time.sleep(timeout_s)
                 return None
-            self._triggers = 0
+            self._triggered = False
         elif self.settings.frame_rate_hz is not None:
             stamp_s = self._wait_for_frame(timeout_s, 1 / self.settings.frame_rate_hz)
             if stamp_s is None:
                 return None
-        index, self._shown = self._shown, self._shown + 1
-        return self._deliver(index, stamp_s)
+        self._shown += 1
+        return self._deliver(self._shown - 1, stamp_s)
 
     def _wait_for_frame(self, timeout_s: float, period_s: float) -> float | None:
         """Time of the next frame once it has come; None if it does not come in time."""

@@ -64,7 +64,7 @@ def test_without_a_period_or_time_stamps_nothing_is_late_or_equal():
 def test_after_an_unanswered_trigger_the_count_may_begin_anew():
     check = FrameCheck()
     check.judge(frame_id=8, time_s=1.0, complete=True)
-    check.missed()
+    check.begin_anew("unanswered")
     assert check.judge(frame_id=1, time_s=2.0, complete=True) is OK
     assert check.counts == FrameCounts(ok=2, unanswered=1)
 

@@ -22,20 +22,7 @@ from twin.devices.grbl_controller import GrblController
 from twin.devices.grbl_firmware import GrblError, parse_block
 from twin.devices.grbl_motion import Axis, Ramp
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.grbl_line import (
-    Alarm,
-    Banner,
-    Garbage,
-    Message,
-    Ok,
-    Refusal,
-    Setting,
-    Status,
-    alarm_text,
-    parse_reply,
-    parse_settings,
-    refusal_text,
-)
+from uwlts.hardware.grbl_line import Reply, Status, code_text, parse_reply, parse_settings
 from uwlts.model.errors import HardwareError, RangeError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -73,15 +60,15 @@ def stage(controller: GrblController) -> Iterator[GrblStage]:
 @pytest.mark.parametrize(
     ("line", "meaning"),
     [
-        ("ok", Ok()),
-        ("error:9", Refusal(9)),
-        ("ALARM:1", Alarm(1)),
-        ("Grbl 1.1h ['$' for help]", Banner("1.1h")),
-        ("\\xffGrbl 1.1f ['$' for help]", Banner("1.1f")),
-        ("$100=80.000", Setting(100, 80.0)),
-        ("$13=0 (report inches, bool)", Setting(13, 0.0)),
-        ("[MSG:'$H'|'$X' to unlock]", Message("MSG:'$H'|'$X' to unlock")),
-        (">G54G20:ok", Message(">G54G20:ok")),
+        ("ok", Reply("ok")),
+        ("error:9", Reply("error", 9)),
+        ("ALARM:1", Reply("ALARM", 1)),
+        ("Grbl 1.1h ['$' for help]", Reply("banner", text="1.1h")),
+        ("\\xffGrbl 1.1f ['$' for help]", Reply("banner", text="1.1f")),
+        ("$100=80.000", Reply("setting", 100, 80.0)),
+        ("$13=0 (report inches, bool)", Reply("setting", 13, 0.0)),
+        ("[MSG:'$H'|'$X' to unlock]", Reply("message", text="MSG:'$H'|'$X' to unlock")),
+        (">G54G20:ok", Reply("message", text=">G54G20:ok")),
         (
             "<Hold:0|MPos:-5.000,1.000,0.000|Bf:15,128|FS:0,1000|Pn:XZ|WCO:1.500,0.000,0.000>",
             Status("Hold", 0, machine_mm=-5.0, offset_mm=1.5, spindle=1000.0, pins="XZ"),
@@ -113,14 +100,14 @@ def test_replies_are_understood(line, meaning):
     ],
 )
 def test_what_grbl_never_says_is_garbage(line):
-    assert parse_reply(line) == Garbage(line)
+    assert parse_reply(line) == Reply("garbage", text=line)
 
 
 def test_every_documented_alarm_and_error_has_its_meaning():
     # doc/csv of Grbl 1.1: alarms 1 to 9, errors 1 to 17 and 20 to 38.
-    assert all("unknown" not in alarm_text(code) for code in range(1, 10))
-    assert all("unknown to" not in refusal_text(code) for code in [*range(1, 18), *range(20, 39)])
-    assert "unknown" in alarm_text(10) and "unknown to" in refusal_text(18)
+    assert all("unknown" not in code_text("ALARM", code) for code in range(1, 10))
+    assert all("unknown to" not in code_text("error", code) for code in [*range(1, 18), *range(20, 39)])
+    assert "unknown" in code_text("ALARM", 10) and "unknown to" in code_text("error", 18)
 
 
 def test_settings_that_cannot_work_are_refused():
