@@ -9,17 +9,17 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from pydantic import JsonValue
 
 import uwlts
 from uwlts.hardware.camera import Camera, GrabbedFrame
+from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings, Table
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
-from uwlts.stripe import StripeStatus, extract_stripe
+from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
 """The brightest pixel of every line that counts is looked at; 2 % of the lines may be brighter than wanted."""
@@ -42,6 +42,12 @@ _DOWN = 1 / 16
 """Factor from a saturated image, in which it is unknown by how much it is too bright."""
 _UP = 30.0
 """Largest factor from a dark image, in which noise limits the estimate."""
+
+
+def stripe_of(image: np.ndarray, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
+    """The stripe in an image (H, W) of a sensor, from which a background (H, W) is subtracted."""
+    along, full_dn = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
+    return extract_stripe(image, stripe_along=along, saturation=full_dn, background=background)
 
 
 def not_few(count: int, lines: int) -> bool:
@@ -75,12 +81,11 @@ class Brightness:
 
 def brightness(image: np.ndarray, sensor: Sensor, light: Light) -> Brightness:
     """Brightness of an image (H, W) in grey values, as the sensor's detector gives them, in a light."""
-    along, full = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
-    black = sensor.detector.black_level_dn
-    peak = image.max(axis=0 if along == "width" else 1).astype(float)
+    full, black = sensor.detector.full_scale_dn(), sensor.detector.black_level_dn
+    peak = image.max(axis=0 if sensor.camera.stripe_along == "width" else 1).astype(float)
     counts = peak - black > _DIM_SHARE * (peak.max() - black)
     if light == "laser":
-        counts &= extract_stripe(image, stripe_along=along, saturation=full).status != StripeStatus.NO_STRIPE
+        counts &= stripe_of(image, sensor).status != StripeStatus.NO_STRIPE
     if not counts.any():
         return Brightness(peak.size, 0, 0, 0.0)
     level = float(np.quantile(peak[counts], BRIGHT_SHARE))
@@ -137,30 +142,27 @@ def provenance_of(plan: RigPlan, camera: Camera, *, source: str, stage: str, **m
     }
 
 
-class LaserStage(Protocol):
-    """What a rig needs of a stage and its laser; positions in mm."""
+class HandSwitchedLaser:
+    """In place of a stage where there is none: the operator is asked to switch the laser, and nothing moves."""
 
-    @property
-    def limits_mm(self) -> tuple[float, float]:
-        """Lowest and highest position."""
-        ...
+    limits_mm = (-math.inf, math.inf)
 
-    @property
-    def laser_power(self) -> float:
-        """Power in force, 0 when the laser is off."""
-        ...
+    def __init__(self, ask: Callable[[str], object]):
+        self._ask = ask
+        self.laser_power = 0.0
 
     def position_mm(self) -> float:
-        """Position as it is read back."""
-        ...
+        """Nothing moves."""
+        return 0.0
 
     def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
-        """Move, wait until the stage rests, and return the position read back."""
-        ...
+        """Nothing moves."""
+        return 0.0
 
     def laser(self, on: bool, *, power: float = 1.0) -> None:
-        """Switch the laser."""
-        ...
+        """Ask for it."""
+        self._ask("switch the laser on and the lamp off" if on else "switch the laser off and the lamp on")
+        self.laser_power = power if on else 0.0
 
 
 class Rig:
@@ -171,9 +173,16 @@ class Rig:
     """
 
     def __init__(
-        self, plan: RigPlan, settings: StageSettings, sensor: Sensor, camera: Camera, stage: LaserStage, *, ahead: float
+        self,
+        plan: RigPlan,
+        settings: StageSettings,
+        sensor: Sensor,
+        camera: Camera,
+        stage: GrblStage | HandSwitchedLaser,
+        *,
+        ahead: float,
     ):
-        self._plan, self._bits, self._camera, self._stage = plan, sensor.detector.bits, camera, stage
+        self._plan, self._sensor, self._camera, self._stage = plan, sensor, camera, stage
         self._feed_mm_per_min, self._ahead = settings.feed_mm_per_min, math.copysign(1.0, ahead)
         self._settle_s = sensor.stage.settling_s if settings.settle_s is None else settings.settle_s
         self._position_mm: float | None = None
@@ -186,15 +195,12 @@ class Rig:
         if self._position_mm is None or abs(self._position_mm - position_mm) > 1e-9:
             self._laser(False)
             if (position_mm - self._read_back_mm) * self._ahead < 0:
-                low, high = self._stage.limits_mm
-                self._move(min(max(position_mm - self._ahead * _RUN_UP_MM, low), high))
-            self._read_back_mm = self._move(position_mm)
+                run_up_mm = float(np.clip(position_mm - self._ahead * _RUN_UP_MM, *self._stage.limits_mm))
+                self._stage.move_to(run_up_mm, feed_mm_per_min=self._feed_mm_per_min)
+            self._read_back_mm = self._stage.move_to(position_mm, feed_mm_per_min=self._feed_mm_per_min)
             time.sleep(self._settle_s)
             self._position_mm = position_mm
         return self._read_back_mm
-
-    def _move(self, position_mm: float) -> float:
-        return self._stage.move_to(position_mm, feed_mm_per_min=self._feed_mm_per_min)
 
     def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
         """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says."""
@@ -203,6 +209,12 @@ class Rig:
         frame = self._grab()
         return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
 
+    def settled_exposure(self, light: Light, *, start_ms: float) -> float | None:
+        """Exposure in ms for what is seen now; None if even the longest is dark."""
+        return settled_exposure(
+            lambda exposure_ms: self.image(light, exposure_ms)[0], sensor=self._sensor, light=light, start_ms=start_ms
+        )
+
     def _laser(self, on: bool) -> None:
         if (self._stage.laser_power > 0) != on:
             self._stage.laser(on, power=self._plan.laser_power)
@@ -210,8 +222,9 @@ class Rig:
     def _configure(self, exposure_ms: float) -> None:
         if self._exposure_ms is not None and abs(self._exposure_ms / exposure_ms - 1) < 1e-6:
             return
+        bits = self._sensor.detector.bits
         self._camera.stop()
-        self._camera.configure(exposure_ms=exposure_ms, gain_db=self._plan.gain_db, bits=self._bits, trigger="software")
+        self._camera.configure(exposure_ms=exposure_ms, gain_db=self._plan.gain_db, bits=bits, trigger="software")
         self._camera.start(faults="raise")
         self._exposure_ms = exposure_ms
 

@@ -17,7 +17,7 @@ from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
 Light = Literal["laser", "lamp"]
-"""The description of a target or an artefact, or provenance, as it is written to captures."""
+LIGHTS: tuple[Light, ...] = ("laser", "lamp")
 
 
 def _unit(value: Vector) -> Vector:
@@ -90,10 +90,9 @@ class RigPlan(Description):
         direction: Vector,
         provenance: Table,
         zero_dn: int = 0,
-        target: Table | None = None,
-        artefact: Table | None = None,
+        **shown: Table | None,
     ) -> CaptureHeader:
-        """Header of a capture; DescriptionError where medium or target are not valid.
+        """Header of a capture that shows a ``target`` or an ``artefact``; DescriptionError where one is not valid.
 
         ``zero_dn`` stands for no difference in images from which a background is subtracted.
         """
@@ -104,11 +103,9 @@ class RigPlan(Description):
             "medium": sensor.medium(medium),
             "stage_direction": direction,
             "saturation_dn": sensor.detector.full_scale_dn() + zero_dn,
-            "target": target,
-            "artefact": artefact,
             "provenance": provenance,
         }
-        return validated(CaptureHeader, table, f"the plan '{self.title}'")
+        return validated(CaptureHeader, table | shown, f"the plan '{self.title}'")
 
 
 class StagePlan(StageSettings):
@@ -141,13 +138,7 @@ class ScanPlan(RigPlan):
     artefact: Table | None = None
 
     def header(self, name: str, *, provenance: Table) -> CaptureHeader:
-        """Header of the capture.
-
-        Raises
-        ------
-        DescriptionError, EvaluationError
-            Sensor, medium, target or artefact are not valid.
-        """
+        """Header of the capture; DescriptionError or EvaluationError where what the plan describes is not valid."""
         sensor = self.described_sensor()
         if self.target is not None:
             parse_target(self.target)

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.hardware.rig import Brightness, Rig, not_few
+from uwlts.hardware.rig import Brightness, Rig, not_few, stripe_of
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
-from uwlts.stripe import Stripe, StripeStatus, extract_stripe
+from uwlts.stripe import Stripe, StripeStatus
 
 LOOKS = 9
 """Positions at which a stripe is looked for before a scan is given up."""
@@ -45,15 +45,15 @@ def shows_laser(lit: np.ndarray, unlit: np.ndarray, sensor: Sensor, *, differenc
     ``difference``: the stripe is measured in the difference of both; else it has to be in the image itself,
     as a lamp that is on while the laser is off leaves a difference of its own.
     """
-    along, full = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
-    added = extract_stripe(lit, stripe_along=along, saturation=full, background=unlit)
+    full = sensor.detector.full_scale_dn()
+    added = stripe_of(lit, sensor, background=unlit)
     shown = added.status == StripeStatus.OK
     if not difference:
-        alone = extract_stripe(lit, stripe_along=along, saturation=full)
+        alone = stripe_of(lit, sensor)
         # Elsewhere, or lower, is what noise leaves of edges that daylight shows in both.
         shown &= np.abs(alone.centre_px - added.centre_px) < _SAME_PX
         shown &= added.amplitude > _ITS_OWN * alone.amplitude
-    flooded = ((lit >= full) & (unlit < full / 2)).any(axis=0 if along == "width" else 1)
+    flooded = ((lit >= full) & (unlit < full / 2)).any(axis=0 if sensor.camera.stripe_along == "width" else 1)
     return not_few(int((shown | flooded).sum()), len(shown))
 
 
@@ -91,12 +91,8 @@ class LaserWatch:
     ) -> None:
         """Judge a laser image (H, W), its stripe and brightness, before it is stored; may move the stage.
 
-        ``unlit`` is an image without laser beside it, if there is one; ``last``: no further image comes.
-
-        Raises
-        ------
-        HardwareError
-            The laser gives no light.
+        ``unlit`` is an image without laser beside it, if there is one; ``last``: no further image comes. HardwareError
+        where the laser gives no light.
         """
         now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), bright.level)
         if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):

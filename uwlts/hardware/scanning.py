@@ -18,7 +18,7 @@ from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, provenance_of, settled_exposure
+from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, provenance_of, stripe_of
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import (
     LOOKS,
@@ -37,21 +37,12 @@ from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.images import without_background
-from uwlts.stripe import Stripe, StripeStatus, extract_stripe
+from uwlts.stripe import Stripe, StripeStatus
 
 _FAINT = 0.1
 """Laser images below this share of the full scale are reported as faint."""
 _EXPOSED_AT = 5
 """Positions, evenly spread over a plan, at which automatic exposure looks."""
-
-
-@dataclass(frozen=True)
-class Shot:
-    """An image to take: its number, the position of the stage in mm, and the light."""
-
-    number: int
-    position_mm: float
-    light: Light
 
 
 @dataclass
@@ -88,12 +79,6 @@ class Seen:
         return said
 
 
-def shots_of(plan: ScanPlan) -> list[Shot]:
-    """All images of a plan in their order."""
-    pairs = enumerate(product(plan.stage.positions_mm(), plan.lights))
-    return [Shot(number, position, light) for number, (position, light) in pairs]
-
-
 def scan(
     plan: str | Path | ScanPlan,
     out: str | Path,
@@ -112,7 +97,9 @@ def scan(
 ) -> Seen:
     """Connect camera and stage and record a scan into a capture.
 
-    The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends.
+    The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends. An
+    interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that the
+    recorded images have.
 
     Parameters
     ----------
@@ -140,12 +127,18 @@ def scan(
     Raises
     ------
     DescriptionError
-        Neither the plan nor an argument names the camera or the stage.
-    RangeError, DesignError, HardwareError, OutputError
-        As `record_scan`.
+        Camera or stage are not named; sensor, medium, target or artefact are not valid.
+    RangeError, DesignError
+        The plan cannot be carried out; nothing has moved.
+    HardwareError
+        Camera, stage or laser fail, or the camera has another image size than the sensor's description. Or the stage
+        has lost steps, which is seen at the end: all images are in ``out.part`` then, and ``resume`` takes them as they
+        are.
+    OutputError
+        The file exists, or cannot be written.
     """
-    described, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
-    address, port = camera or described.camera, stage or described.stage.port
+    plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
+    address, port = camera or plan.camera, stage or plan.stage.port
     if address is None or port is None:
         what = "camera" if address is None else "stage"
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
@@ -155,7 +148,12 @@ def scan(
         if not watch:
             raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
         load_calibration(calibration)
-    report(plan_text(described))
+    positions_mm = plan.stage.positions_mm()
+    shots = list(product(positions_mm, plan.lights))
+    images = len(positions_mm) * (len(plan.lights) + int(plan.background and "laser" in plan.lights))
+    report(
+        f"{len(positions_mm)} positions from {positions_mm[0]:g} to {positions_mm[-1]:g} mm, {images} images to take"
+    )
     with ExitStack() as stack:
         page = stack.enter_context(PageBeside(out, calibration=calibration, say=report)) if watch else None
         moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
@@ -163,81 +161,35 @@ def scan(
             moved.home()
         elif unlock:
             moved.unlock()
-
-        def recorded(done: int, total: int, seen: Seen) -> None:
-            progress(done, total)
-            if page:
-                page.start()
-
-        return record_scan(
-            described, out, camera=opened, stage=moved, overwrite=overwrite, resume=resume, progress=recorded, warn=warn
+        sensor = plan.described_sensor()
+        check_camera(opened, sensor)
+        plan.check(moved)
+        dtype = np.dtype(np.uint16 if plan.background or opened.info.bits > 8 else np.uint8)
+        provenance = provenance_of(
+            plan, opened, source="scan", stage=f"Grbl {moved.version}", images=len(shots), background=plan.background
         )
-
-
-def record_scan(
-    plan: ScanPlan,
-    out: Path,
-    *,
-    camera: Camera,
-    stage: GrblStage,
-    overwrite: bool = False,
-    resume: bool = False,
-    progress: Callable[[int, int, Seen], None] = lambda done, total, seen: None,
-    warn: Callable[[str], None] = lambda text: None,
-) -> Seen:
-    """Carry out a plan with an open camera and a stage that knows where it is, into a capture.
-
-    An interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that
-    the recorded images have. ``progress(done, total, seen)`` is called after every image, ``warn(text)`` when there
-    is something to see to.
-
-    Raises
-    ------
-    RangeError, DesignError, DescriptionError
-        The plan cannot be carried out; nothing has moved.
-    HardwareError
-        Camera, stage or laser fail, or the camera has another image size than the sensor's description. Or the stage
-        has lost steps, which is seen at the end: all images are in ``out.part`` then, and ``resume`` takes them as they
-        are.
-    OutputError
-        The file exists, or cannot be written.
-    """
-    sensor = plan.described_sensor()
-    check_camera(camera, sensor)
-    plan.check(stage)
-    dtype = np.dtype(np.uint16) if plan.background or camera.info.bits > 8 else np.dtype(np.uint8)
-    shots, seen = shots_of(plan), Seen()
-    version = f"Grbl {stage.version}"
-    provenance = provenance_of(
-        plan, camera, source="scan", stage=version, images=len(shots), background=plan.background
-    )
-    seen.exposure_ms, before_s = left_over(out) if resume else ({}, 0.0)
-    with CaptureWriter(
-        out, plan.header(out.stem, provenance=provenance), dtype=dtype, overwrite=overwrite, resume=resume
-    ) as writer:
+        known_ms, before_s = left_over(out) if resume else ({}, 0.0)
+        seen = Seen(exposure_ms=known_ms)
+        header = plan.header(out.stem, provenance=provenance)
+        writer = stack.enter_context(CaptureWriter(out, header, dtype=dtype, overwrite=overwrite, resume=resume))
         begun = len(writer)
         if begun == len(shots):
             return seen
-        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
+        rig = Rig(plan, plan.stage, sensor, opened, moved, ahead=plan.stage.step_mm)
         taking = _Taking(plan, sensor, rig, seen, warn)
         taking.settle_exposures()
         start_s = time.monotonic() - before_s
-        for shot in shots[begun:]:
-            position, image, exposure_ms = taking.take(shot, last=shot is shots[-1])
-            writer.append(
-                Frame(
-                    image.astype(dtype, copy=False),
-                    position,
-                    shot.light == "laser",
-                    exposure_ms,
-                    time.monotonic() - start_s,
-                )
-            )
-            progress(shot.number + 1, len(shots), seen)
+        for done, (position_mm, light) in enumerate(shots[begun:], begun + 1):
+            position, image, exposure_ms = taking.take(position_mm, light, last=done == len(shots))
+            image = image.astype(dtype, copy=False)
+            writer.append(Frame(image, position, light == "laser", exposure_ms, time.monotonic() - start_s))
+            progress(done, len(shots))
+            if page:
+                page.start()
         # What is replayed does not know where the stage is.
-        if plan.check_steps and not isinstance(camera, ReplayCamera):
+        if plan.check_steps and not isinstance(opened, ReplayCamera):
             taking.check_steps()
-    return seen
+        return seen
 
 
 def left_over(path: Path) -> tuple[dict[Light, float], float]:
@@ -278,11 +230,12 @@ class _Taking:
         exposures: dict[Light, float] = self._seen.exposure_ms
         missing: list[Light] = []
         for light in dict.fromkeys(self._plan.lights):
-            planned = self._plan.planned_ms(light)
-            if light not in exposures and planned == "auto":
-                missing.append(light)
-            elif light not in exposures and planned != "auto":
-                exposures[light] = planned
+            if light not in exposures:
+                planned = self._plan.planned_ms(light)
+                if planned == "auto":
+                    missing.append(light)
+                else:
+                    exposures[light] = planned
         looked = spread(self._positions_mm, _EXPOSED_AT)
         further = [position for position in spread(self._positions_mm, LOOKS) if position not in looked]
         for position in looked + further if missing else ():
@@ -317,51 +270,39 @@ class _Taking:
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
     def _settled(self, light: Light) -> float | None:
-        return settled_exposure(
-            lambda wanted: self._rig.image(light, wanted)[0],
-            sensor=self._sensor,
-            light=light,
-            start_ms=self._seen.exposure_ms.get(light, START_MS),
-        )
+        return self._rig.settled_exposure(light, start_ms=self._seen.exposure_ms.get(light, START_MS))
 
-    def take(self, shot: Shot, *, last: bool) -> tuple[float, np.ndarray, float]:
+    def take(self, position_mm: float, light: Light, *, last: bool) -> tuple[float, np.ndarray, float]:
         """Position read back, image (H, W) as it is stored, and its exposure in ms."""
-        position, light, zero_dn = self._rig.move_to(shot.position_mm), shot.light, self._plan.zero_dn(self._sensor)
-        image, exposure_ms = self._rig.image(light, self._seen.exposure_ms[light])
+        rig, seen, zero_dn = self._rig, self._seen, self._plan.zero_dn(self._sensor)
+        position = rig.move_to(position_mm)
+        image, exposure_ms = rig.image(light, seen.exposure_ms[light])
         bright = brightness(image, self._sensor, light)
-        if bright.overexposed and self._plan.planned_ms(light) == "auto" and self._shorten(light, shot.position_mm):
-            image, exposure_ms = self._rig.image(light, self._seen.exposure_ms[light])
+        if bright.overexposed and self._plan.planned_ms(light) == "auto" and self._shorten(light, position_mm):
+            image, exposure_ms = rig.image(light, seen.exposure_ms[light])
             bright = brightness(image, self._sensor, light)
-        unlit = self._rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
+        unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
         if light == "laser":
-            stripe, place = self._stripe(image, unlit), LitPlace(shot.position_mm, exposure_ms)
+            stripe, place = stripe_of(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
             self._slip.see(Place(position, exposure_ms, centres_of(stripe)))
             self._watch.see(image, stripe, bright, place, unlit=unlit, last=last)
             self._count(stripe, bright)
-        self._seen.images += 1
-        self._seen.repeated = self._rig.repeated
+        seen.images += 1
+        seen.repeated = rig.repeated
         if zero_dn:
             image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)
         return position, image, exposure_ms
 
-    def _stripe(self, image: np.ndarray, unlit: np.ndarray | None) -> Stripe:
-        return extract_stripe(
-            image,
-            stripe_along=self._sensor.camera.stripe_along,
-            background=unlit,
-            saturation=self._sensor.detector.full_scale_dn(),
-        )
-
     def check_steps(self) -> None:
         """Visit an early place again, if one has relief; HardwareError where the stage stands elsewhere than before."""
-        if self._slip.relief is None:
+        if (relief := self._slip.relief) is None:
             return
-        place = self._slip.relief.place
+        place = relief.place
         self._rig.move_to(place.position_mm)
         image = self._rig.image("laser", place.exposure_ms)[0]
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
-        slip_mm, error_mm = self._slip.relief.slip(centres_of(self._stripe(image, unlit)))
-        if self._slip.relief.is_significant(slip_mm, error_mm):
+        slip_mm, error_mm = relief.slip(centres_of(stripe_of(image, self._sensor, background=unlit)))
+        if relief.is_significant(slip_mm, error_mm):
             raise HardwareError(
                 f"the stage has lost steps, or sensor or object were moved: back at {place.position_mm:g} mm the "
                 f"stripe lies as if the stage stood {slip_mm:+.2f} mm (std {error_mm:.2f} mm) beside it. All images "
@@ -391,10 +332,3 @@ class _Taking:
                 self._warn("a laser image is saturated on many lines: shorten laser_ms")
         if not bright.dark and bright.level < _FAINT:
             seen.faint += 1
-
-
-def plan_text(plan: ScanPlan) -> str:
-    """Summary of a plan: positions and images."""
-    positions = plan.stage.positions_mm()
-    images = len(positions) * (len(plan.lights) + int(plan.background and "laser" in plan.lights))
-    return f"{len(positions)} positions from {positions[0]:g} to {positions[-1]:g} mm, {images} images to take"

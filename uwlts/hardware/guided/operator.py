@@ -60,30 +60,6 @@ class Operator:
         return answer
 
 
-class HandSwitchedLaser:
-    """In place of a stage where there is none: the operator switches the laser, and nothing moves."""
-
-    limits_mm = (-float("inf"), float("inf"))
-
-    def __init__(self, operator: Operator):
-        self._operator = operator
-        self.laser_power = 0.0
-
-    def position_mm(self) -> float:
-        """Nothing moves."""
-        return 0.0
-
-    def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
-        """Nothing moves."""
-        return 0.0
-
-    def laser(self, on: bool, *, power: float = 1.0) -> None:
-        """Ask for it."""
-        request = "switch the laser on and the lamp off" if on else "switch the laser off and the lamp on"
-        self._operator.wait(request)
-        self.laser_power = power if on else 0.0
-
-
 _FOUND, _STRIPE = (0, 140, 0), (255, 60, 40)
 _COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
 _MAP_CELL_PX = 48

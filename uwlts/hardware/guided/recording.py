@@ -16,25 +16,17 @@ import numpy as np
 
 from uwlts.calibration.camera import Poses
 from uwlts.calibration.guidance.pose_advice import State
-from uwlts.calibration.guidance.solution import RecordedPose, Setting
+from uwlts.calibration.guidance.solution import Setting
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.attempt import GuidedImages, PoseJudge
-from uwlts.hardware.guided.operator import GuidedPage, HandSwitchedLaser, Operator
-from uwlts.hardware.guided.phases import (
-    Session,
-    StepJudge,
-    StepPhase,
-    TargetPhase,
-    places_left,
-    recorded_poses,
-    still_missing,
-)
+from uwlts.hardware.guided.operator import GuidedPage, Operator
+from uwlts.hardware.guided.phases import Session, StepJudge, StepPhase, TargetPhase, places_left, still_missing
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep, load_guided_plan
-from uwlts.hardware.rig import Rig, provenance_of
+from uwlts.hardware.rig import HandSwitchedLaser, Rig, provenance_of
 from uwlts.hardware.scanning import check_camera, left_over
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import DescriptionError
@@ -50,16 +42,6 @@ class GuidedRecording:
     step: tuple[Path, ...]
     poses: Poses
     missing: tuple[str, ...]
-
-
-def target_path(out: Path) -> Path:
-    """Capture of the target beside the calibration."""
-    return out.with_name(f"{out.stem}-target.h5")
-
-
-def step_path(out: Path) -> Path:
-    """Capture of the step standard beside the calibration."""
-    return out.with_name(f"{out.stem}-step.h5")
 
 
 def record_guided(
@@ -118,28 +100,30 @@ def record_guided(
     try:
         report(f"open {page.address}; Ctrl-C ends it, what was accepted is kept")
         operator = Operator(report, button=page.pressed)
-        setting = replace(described.setting(), camera=CameraOptions(distortion=distortion))
-        serial = None if described.stage is None else described.stage.port
-        phases = _Phases(described, setting, described.camera, serial, page, operator, resume, overwrite and not resume)
-        return _recorded(phases, Path(out), refractions=refractions)
+        options = CalibrationOptions(
+            refractions=refractions, poses=described.poses, camera=CameraOptions(distortion=distortion)
+        )
+        setting = replace(described.setting(), camera=options.camera)
+        operator = Operator(report, button=page.pressed)
+        phases = _Phases(described, setting, described.camera, page, operator, resume, overwrite and not resume)
+        out = Path(out)
+        target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
+        missing = still_missing(phases.target(target))
+        if described.step is not None:
+            with Capture(target) as capture:
+                known = calibrate_sequentially([capture], (), options=options).calibration
+            sensor = described.described_sensor()
+            window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
+            missing += phases.step(step, described.step, StepJudge(described.step, sensor, known, window))
+        return GuidedRecording(
+            air=(target,) if described.target_in_air() else (),
+            water=() if described.target_in_air() else (target,),
+            step=(step,) if described.step is not None else (),
+            poses=described.poses,
+            missing=tuple(missing),
+        )
     finally:
         page.close()
-
-
-def _recorded(phases: "_Phases", out: Path, *, refractions: Literal[1, 2]) -> GuidedRecording:
-    plan, target = phases.plan, target_path(out)
-    state = phases.target(target)
-    missing = tuple(still_missing(state))
-    in_air, in_water = ((target,), ()) if plan.target_in_air() else ((), (target,))
-    if plan.step is None:
-        return GuidedRecording(in_air, in_water, (), plan.poses, missing)
-    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=phases.setting.camera)
-    with Capture(target) as capture:
-        known = calibrate_sequentially([capture], (), options=options).calibration
-    sensor = plan.described_sensor()
-    window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
-    unseen = phases.step(step_path(out), plan.step, StepJudge(plan.step, sensor, known, window))
-    return GuidedRecording(in_air, in_water, (step_path(out),), plan.poses, (*missing, *unseen))
 
 
 @dataclass(frozen=True)
@@ -149,28 +133,29 @@ class _Phases:
     plan: GuidedPlan
     setting: Setting
     camera: str
-    port: str | None
     page: GuidedPage
     operator: Operator
     resume: bool
     overwrite: bool
 
+    def _left(self, path: Path) -> Path | None:
+        """Recording to go on with: interrupted, or finished but perhaps not enough."""
+        return next((each for each in (part_path(path), path) if each.is_file()), None) if self.resume else None
+
     def target(self, path: Path) -> State:
         """Record the target; how far that leads."""
         judge = PoseJudge(self.setting, self.plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
-        if self.resume and path.is_file() and not part_path(path).exists():
-            with Capture(path) as capture:
-                state = judge.state(recorded_poses(capture, judge))
+        left = self._left(path)
+        state = judge.state([] if left is None else judge.recorded(left))
+        if left == path:
             if not self._to_go_on(state):
                 self.operator.say(f"{path.name} is complete: {len(state.recorded)} poses")
                 return state
             os.replace(path, part_path(path))
         stage = self.plan.stage
         positions = [] if self.plan.poses == "free" or stage is None else stage.places_mm()
-        before = self._before(path, judge)
-        header = partial(self.plan.target_header, path.stem)
-        with self._session(path, positions, header) as session:
-            return TargetPhase(self.plan, session, judge).run(judge.state(before))
+        with self._session(path, positions, partial(self.plan.target_header, path.stem)) as session:
+            return TargetPhase(self.plan, session, judge).run(state)
 
     def _to_go_on(self, state: State) -> bool:
         """Whether a finished recording of the target is not enough, and more poses can be taken."""
@@ -178,31 +163,21 @@ class _Phases:
             return bool(still_missing(state)) and len(state.recorded) < self.plan.most_images
         return bool(places_left(self.plan, state))
 
-    def _before(self, path: Path, judge: PoseJudge) -> list[RecordedPose]:
-        if not (self.resume and part_path(path).exists()):
-            return []
-        with Capture(part_path(path)) as capture:
-            return recorded_poses(capture, judge)
-
     def step(self, path: Path, step: GuidedStep, judge: StepJudge) -> list[str]:
         """Record the step standard; what is missing of it."""
-        seen: list[float] = []
-        if self.resume:
-            left = part_path(path) if part_path(path).exists() else path
-            if left.is_file():
-                with Capture(left) as capture:
-                    seen = judge.depths_mm(capture)
-            if left == path and path.is_file():
-                if next_depth_mm(seen, judge.sensor) is None:
-                    self.operator.say(f"{path.name} is complete")
-                    return []
-                os.replace(path, part_path(path))
+        left = self._left(path)
+        seen = [] if left is None else judge.depths_mm(left)
+        if left == path:
+            if next_depth_mm(seen, judge.sensor) is None:
+                self.operator.say(f"{path.name} is complete")
+                return []
+            os.replace(path, part_path(path))
         request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
         self.page.request(request)
         self.operator.wait(request)
         header = partial(self.plan.step_header, path.stem, step)
         with self._session(path, list(step.positions_mm), header) as session:
-            seen = StepPhase(step, judge, session).run(seen)
+            seen = StepPhase(judge, session).run(seen)
         count = len(apart_mm(seen, judge.sensor))
         return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
 
@@ -216,21 +191,21 @@ class _Phases:
             check_camera(camera, sensor)
             version = f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none"
             described = header(provenance=provenance_of(self.plan, camera, source="guided calibration", stage=version))
-            dtype = np.dtype(np.uint16) if camera.info.bits > 8 else np.dtype(np.uint8)
+            dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
             ahead = positions_mm[-1] - positions_mm[0] if positions_mm else 1.0
             rig = Rig(self.plan, self.plan.stage or GuidedStage(), sensor, camera, stage, ahead=ahead)
             known, before_s = left_over(path) if self.resume else ({}, 0.0)
-            images = GuidedImages(rig, self.plan, sensor, dtype=dtype, known_ms=known)
+            images = GuidedImages(rig, self.plan, dtype=dtype, known_ms=known)
             with CaptureWriter(path, described, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
                 yield Session(images, self.operator, self.page, writer, before_s=before_s)
 
     @contextmanager
     def _stage(self, positions_mm: list[float]) -> Iterator[GrblStage | HandSwitchedLaser]:
         planned = self.plan.stage
-        if planned is None or self.port is None:
-            yield HandSwitchedLaser(self.operator)
+        if planned is None or planned.port is None:
+            yield HandSwitchedLaser(self.operator.wait)
             return
-        with GrblStage(self.port) as stage:
+        with GrblStage(planned.port) as stage:
             planned.check(positions_mm, stage)
             if planned.home:
                 stage.home()
