@@ -11,6 +11,7 @@ import shlex
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +22,7 @@ PRODUCERS = "GENICAM_GENTL64_PATH"
 # Aravis waits a second for answers; drivers of broken USB devices may take for ever.
 _DISCOVERY_S = 2.5
 _USUAL_GROUP = "dialout"
+_JOIN_GROUP = "sudo usermod -aG {} $USER\nthen log out and in again"
 
 
 def examine_cameras() -> list[Finding]:
@@ -64,20 +66,20 @@ def examine_producers(folders: str | None = None) -> list[Finding]:
         if not producers:
             what = "holds no producer (*.cti)" if folder.is_dir() else "is no folder"
             findings.append(Finding("GenTL producers", "warning", f"{folder} {what}", f"correct {PRODUCERS}"))
-        findings += map(_examine_producer, producers)
+        for path in producers:
+            # A producer's kind is read, not run: it is a program of the camera's maker.
+            try:
+                fits = _kind_of_program(path) == _kind_of_program(Path(sys.executable))
+            except OSError as error:
+                fault, advice = f": {error.strerror}", f"make {path} readable"
+            else:
+                fault = "" if fits else " is no library for this machine"
+                advice = f"install the camera maker's software for {os.uname().machine}"
+            if fault:
+                findings.append(Finding("GenTL producer", "warning", f"{path}{fault}", advice))
+            else:
+                findings.append(Finding("GenTL producer", "ok", f"genicam:{path}"))
     return findings
-
-
-def _examine_producer(path: Path) -> Finding:
-    """A producer's kind is read, not run: it is a program of the camera's maker."""
-    try:
-        fits = _kind_of_program(path) == _kind_of_program(Path(sys.executable))
-    except OSError as error:
-        return Finding("GenTL producer", "warning", f"{path}: {error.strerror}", f"make {path} readable")
-    if not fits:
-        advice = f"install the camera maker's software for {os.uname().machine}"
-        return Finding("GenTL producer", "warning", f"{path} is no library for this machine", advice)
-    return Finding("GenTL producer", "ok", f"genicam:{path}")
 
 
 def _kind_of_program(path: Path) -> tuple[bytes, bytes]:
@@ -107,36 +109,20 @@ def _examine_port(port: str, description: str) -> Finding:
         return Finding("serial port", "warning", f"{named} is not there", "check the cable")
     if os.access(port, os.R_OK | os.W_OK):
         return Finding("serial port", "ok", named)
-    user, group = _user_name(), _group_name(os.stat(port).st_gid)
-    if group == "root" or os.stat(port).st_mode & 0o060 != 0o060:
+    owned = os.stat(port)
+    user, group, members = f"user {os.geteuid()}", str(owned.st_gid), []
+    with suppress(KeyError):
+        user = pwd.getpwuid(os.geteuid()).pw_name
+    with suppress(KeyError):
+        group, _, _, members = grp.getgrgid(owned.st_gid)
+    if group == "root" or owned.st_mode & 0o060 != 0o060:
+        fault = f"nor has group {group}"
         advice = f"sudo chgrp {_USUAL_GROUP} {shlex.quote(port)} && sudo chmod 660 {shlex.quote(port)}"
-        return Finding("serial port", "warning", f"{named}: no permission, nor has group {group}", advice)
-    if _is_listed(user, group):
-        advice = "log out and in again, or restart the computer"
-        return Finding("serial port", "warning", f"{named}: no permission, group {group} is not in force yet", advice)
-    advice = f"sudo usermod -aG {group} $USER\nthen log out and in again"
-    return Finding("serial port", "warning", f"{named}: no permission, {user} is not in group {group}", advice)
-
-
-def _is_listed(user: str, group: str) -> bool:
-    try:
-        return user in grp.getgrnam(group).gr_mem
-    except KeyError:
-        return False
-
-
-def _user_name() -> str:
-    try:
-        return pwd.getpwuid(os.geteuid()).pw_name
-    except KeyError:
-        return f"user {os.geteuid()}"
-
-
-def _group_name(number: int) -> str:
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
+    elif user in members:
+        fault, advice = f"group {group} is not in force yet", "log out and in again, or restart the computer"
+    else:
+        fault, advice = f"{user} is not in group {group}", _JOIN_GROUP.format(group)
+    return Finding("serial port", "warning", f"{named}: no permission, {fault}", advice)
 
 
 FRAMES, _FRAME_S = 10, 5.0
@@ -194,70 +180,47 @@ def try_camera(address: str) -> list[Finding]:
         advice.append("most of the image is saturated: shorten the exposure, close the aperture, shade the tank")
     if mean < _DARKEST_MEAN:
         advice.append("the images are black: right in the dark without a laser, else check lens cap and exposure")
-    return [Finding("camera", "warning" if advice else "ok", found, "\n".join(advice))]
+    return [Finding.judged("camera", found, "\n".join(advice))]
 
 
 def try_stage(port: str) -> list[Finding]:
     """Ask a Grbl controller for its version, settings and state."""
-    from uwlts.hardware.grbl_line import GrblLine, Message, Setting
+    from uwlts.hardware.grbl_line import GrblLine
 
     try:
-        line = GrblLine(port)
-        try:
-            settings = {each.number: each.value for each in line.command("$$") if isinstance(each, Setting)}
-            built = [each.text for each in line.command("$I") if isinstance(each, Message)]
-            report, version = line.status(), line.version
-        except BaseException as error:
-            line.close(error)
-            raise
-        line.close()
+        with GrblLine(port) as line:
+            settings, options, report = line.settings(), line.options(), line.status()
     except HardwareError as failed:
         advice = "see 'In case of trouble' in docs/how-to/hardware-stage.md"
         if "no permission" in str(failed):
-            advice = "sudo usermod -aG dialout $USER\nthen log out and in again"
+            advice = _JOIN_GROUP.format(_USUAL_GROUP)
         return [Finding("stage", "missing", str(failed), advice)]
-    return [
-        _judge_build(f"{port}: Grbl {version}", built),
-        *judge_settings(settings),
-        _judge_state(report.state, report.pins, homing=settings.get(22, 0) != 0),
-    ]
-
-
-def _judge_build(who: str, built: list[str]) -> Finding:
-    options = next((text.removeprefix("OPT:").split(",")[0] for text in built if text.startswith("OPT:")), "")
-    found = f"{who}, options {options or 'not given'}"
+    build = Finding("stage", "ok", f"{port}: Grbl {line.version}, options {options or 'not given'}")
     if "V" not in options:
-        return Finding(
-            "stage",
-            "missing",
-            f"{found}, without V: it cannot switch the laser",
-            "flash a Grbl with VARIABLE_SPINDLE, see docs/how-to/hardware-stage.md",
-        )
-    return Finding("stage", "ok", found)
+        found = f"{build.found}, without V: it cannot switch the laser"
+        advice = "flash a Grbl with VARIABLE_SPINDLE, see docs/how-to/hardware-stage.md"
+        build = Finding("stage", "missing", found, advice)
+    state = _judge_state(report.state, report.pins, homing=settings.get(22, 0) != 0)
+    return [build, *judge_settings(settings), state]
 
 
 def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
     """What differs from docs/how-to/hardware-stage.md in the answer to ``$$``, given by number."""
     unsafe = {number: wanted for number, (wanted, _) in BEHAVIOUR.items() if settings.get(number) != wanted}
     other = {number: wanted for number, wanted in MECHANICS.items() if settings.get(number) != wanted}
+    now = {n: f"${n} is {settings[n]:g}" if n in settings else f"${n} is not there" for n in (*unsafe, *other)}
     findings = []
     if unsafe:
-        found = "; ".join(
-            f"{_is(settings, number)}, not {unsafe[number]} ({BEHAVIOUR[number][1]})" for number in unsafe
-        )
+        found = "; ".join(f"{now[n]}, not {wanted} ({BEHAVIOUR[n][1]})" for n, wanted in unsafe.items())
         advice = f"send, one line each, what docs/how-to/hardware-stage.md asks for: {_lines(unsafe)}"
         if {20, 22} & unsafe.keys():
             advice += "\n$20=0 and $22=0 are right for a stage without a limit switch"
         findings.append(Finding("stage settings", "warning", found, advice))
     if other:
-        found = f"other than the thesis's bench: {', '.join(_is(settings, number) for number in other)}"
+        found = f"other than the thesis's bench: {', '.join(now[n] for n in other)}"
         advice = f"right if your mechanics are other ones; for the thesis's bench send {_lines(other)}"
         findings.append(Finding("stage mechanics", "warning", found, advice))
     return findings or [Finding("stage settings", "ok", "as docs/how-to/hardware-stage.md asks for")]
-
-
-def _is(settings: Mapping[int, float], number: int) -> str:
-    return f"${number} is {settings[number]:g}" if number in settings else f"${number} is not there"
 
 
 def _lines(wanted: Mapping[int, float]) -> str:
@@ -276,7 +239,7 @@ def _judge_state(state: str, pins: str, *, homing: bool) -> Finding:
     elif state == "Idle":
         found = "idle"
     else:
-        found = f"{state}"
+        found = state
         advice.append("restart the controller; then home the stage, or unlock it where it has no limit switch")
     found += f", inputs {pins} are active" if pins else ""
-    return Finding("stage state", "warning" if advice else "ok", found, "\n".join(advice))
+    return Finding.judged("stage state", found, "\n".join(advice))

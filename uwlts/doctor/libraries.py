@@ -5,7 +5,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -60,9 +60,8 @@ def examine_python(wanted: str) -> Finding:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"
     if not SpecifierSet(wanted).contains(platform.python_version(), prereleases=True):
         return Finding("Python", "missing", f"{found}; needed is {wanted}", f"install Python {wanted}")
-    if sys.platform != "linux":
-        return Finding("Python", "warning", found, "use Linux for cameras and stage: nothing else has been tried")
-    return Finding("Python", "ok", found)
+    advice = "" if sys.platform == "linux" else "use Linux for cameras and stage: nothing else has been tried"
+    return Finding.judged("Python", found, advice)
 
 
 def examine_required(requirements: Sequence[str]) -> list[Finding]:
@@ -70,21 +69,15 @@ def examine_required(requirements: Sequence[str]) -> list[Finding]:
 
     One finding for all that are as they should be, and one for every other.
     """
-    faults, good = {}, {}
-    for requirement in map(Requirement, requirements):
-        version, fault = _version_and_fault(requirement)
-        if fault is None:
-            good[requirement.name] = version
-        else:
-            faults[requirement] = fault
-    by_name = {requirement.name: requirement for requirement in map(Requirement, requirements)}
-    for name, fault in _load_faults(list(good)).items():
-        faults[by_name[name]] = f"{good.pop(name)} does not load: {fault}"
-    found = [Finding("required libraries", "ok", ", ".join(f"{name} {good[name]}" for name in good))] if good else []
-    for requirement, fault in faults.items():
-        force = "--force-reinstall --no-deps " if "does not load" in fault else ""
-        found.append(Finding(requirement.name, "missing", fault, _pip(f"{force}{shlex.quote(str(requirement))}")))
-    return found
+    examined = _examined(map(Requirement, requirements))
+    good = ", ".join(f"{requirement.name} {version}" for requirement, version, fault in examined if not fault)
+    findings = [Finding("required libraries", "ok", good)] if good else []
+    for requirement, _, fault in examined:
+        if fault:
+            force = "--force-reinstall --no-deps " if "does not load" in fault else ""
+            advice = _pip(f"{force}{shlex.quote(str(requirement))}")
+            findings.append(Finding(requirement.name, "missing", fault, advice))
+    return findings
 
 
 def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str] = ()) -> list[Finding]:
@@ -93,28 +86,31 @@ def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str]
     A version counts where one of the ``requirements`` asks for it.
     """
     asked = {canonicalize_name(each.name): each for each in map(Requirement, requirements)}
-    wanted = {name: asked.get(canonicalize_name(name), Requirement(name)) for name in purposes}
-    states = {name: _version_and_fault(requirement) for name, requirement in wanted.items()}
-    broken = _load_faults([name for name, (_, fault) in states.items() if fault is None])
+    examined = _examined(asked.get(canonicalize_name(name), Requirement(name)) for name in purposes)
     findings = []
-    for name, (version, fault) in states.items():
-        fault = f"{version} does not load: {broken[name]}" if name in broken else fault
-        if fault is None:
-            findings.append(Finding(name, "ok", f"{version}, for {purposes[name]}"))
-        else:
-            advice = f"only for {purposes[name]}:\n{_pip(shlex.quote(str(wanted[name])))}"
-            findings.append(Finding(name, "warning", fault, advice))
+    for (name, purpose), (requirement, version, fault) in zip(purposes.items(), examined, strict=True):
+        advice = f"only for {purpose}:\n{_pip(shlex.quote(str(requirement)))}" if fault else ""
+        findings.append(Finding.judged(name, fault or f"{version}, for {purpose}", advice))
     return findings
 
 
-def _version_and_fault(requirement: Requirement) -> tuple[str, str | None]:
-    try:
-        version = metadata.version(requirement.name)
-    except metadata.PackageNotFoundError:
-        return "", "not installed"
-    if not requirement.specifier.contains(version, prereleases=True):
-        return version, f"{version} is installed, {requirement.specifier} is needed"
-    return version, None
+def _examined(requirements: Iterable[Requirement]) -> list[tuple[Requirement, str, str]]:
+    """Every library with its version, and what is wrong with it, empty if nothing is."""
+    states: list[tuple[Requirement, str, str]] = []
+    for requirement in requirements:
+        version = fault = ""
+        try:
+            version = metadata.version(requirement.name)
+            if not requirement.specifier.contains(version, prereleases=True):
+                fault = f"{version} is installed, {requirement.specifier} is needed"
+        except metadata.PackageNotFoundError:
+            fault = "not installed"
+        states.append((requirement, version, fault))
+    broken = _load_faults([requirement.name for requirement, _, fault in states if not fault])
+    for k, (requirement, version, _) in enumerate(states):
+        if requirement.name in broken:
+            states[k] = requirement, version, f"{version} does not load: {broken[requirement.name]}"
+    return states
 
 
 def _load_faults(names: Sequence[str]) -> dict[str, str]:

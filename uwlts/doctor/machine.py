@@ -38,6 +38,11 @@ class Finding:
     found: str
     advice: str = ""
 
+    @classmethod
+    def judged(cls, subject: str, found: str, advice: str) -> "Finding":
+        """A warning where there is advice."""
+        return cls(subject, "warning" if advice else "ok", found, advice)
+
 
 FRAME_BYTES, FRAMES_PER_S = 1280 * 1024, 60
 _TRIAL_BYTES = 64_000_000
@@ -55,26 +60,24 @@ def examine(folder: Path) -> list[Finding]:
 
 def examine_folder(folder: Path) -> Finding:
     """Whether captures can be written to a folder, fast enough: 64 MB are, and vanish again whatever happens."""
-    subject, path = "folder", folder.resolve()
-    elsewhere = "work in a folder that you may write to, on a local disk"
+    path = folder.resolve()
     try:
         free = shutil.disk_usage(folder).free
         if free < 2 * _TRIAL_BYTES:
-            return Finding(subject, "warning", f"the disk of {path} is full: {free / 1e6:.0f} MB free", "make room")
+            return Finding("folder", "warning", f"the disk of {path} is full: {free / 1e6:.0f} MB free", "make room")
         rate = _writing_rate(folder)
     except OSError as error:
-        return Finding(subject, "warning", f"{path} cannot be written to: {error.strerror}", elsewhere)
+        advice = "work in a folder that you may write to, on a local disk"
+        return Finding("folder", "warning", f"{path} cannot be written to: {error.strerror}", advice)
     minutes = free / (FRAME_BYTES * FRAMES_PER_S) / 60
     found = (
         f"{path} takes {rate / FRAME_BYTES:.0f} frames/s of 1280 x 1024 px ({rate / 1e6:.0f} MB/s), has room for "
         f"{free / 1e9:.0f} GB, {minutes:.0f} min at {FRAMES_PER_S} frames/s"
     )
+    advice = f"make room: a long scan takes {_SCAN_BYTES / 1e9:.0f} GB" if free < _SCAN_BYTES else ""
     if rate < FRAME_BYTES * FRAMES_PER_S:
         advice = f"for {FRAMES_PER_S} frames/s use a faster disk, end what else writes to it, or read out a region"
-        return Finding(subject, "warning", found, advice)
-    if free < _SCAN_BYTES:
-        return Finding(subject, "warning", found, f"make room: a long scan takes {_SCAN_BYTES / 1e9:.0f} GB")
-    return Finding(subject, "ok", found)
+    return Finding.judged("folder", found, advice)
 
 
 def _writing_rate(folder: Path) -> float:
@@ -94,22 +97,18 @@ def _writing_rate(folder: Path) -> float:
 
 def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
     """Whether a frame of a GigE camera may wait in the network's buffer while the program is busy."""
-    subject = "network buffer"
     try:
         allowed = int(limit.read_text())
     except (OSError, ValueError) as error:
-        return Finding(
-            subject, "warning", f"{limit} cannot be read: {error}", "only for GigE cameras: look at its docs"
-        )
+        found, advice = f"{limit} cannot be read: {error}", "only for GigE cameras: look at its docs"
+        return Finding("network buffer", "warning", found, advice)
     found = f"net.core.rmem_max is {allowed} bytes, {allowed / FRAME_BYTES:.1f} frames of 1280 x 1024 px"
-    if allowed >= FRAME_BYTES:
-        return Finding(subject, "ok", found)
     advice = (
         "only for GigE cameras, which lose packets otherwise:\n"
         f"sudo sysctl -w net.core.rmem_max={_RECOMMENDED_BUFFER}\n"
         f"echo net.core.rmem_max={_RECOMMENDED_BUFFER} | sudo tee /etc/sysctl.d/60-gige-camera.conf"
     )
-    return Finding(subject, "warning", found, advice)
+    return Finding.judged("network buffer", found, "" if allowed >= FRAME_BYTES else advice)
 
 
 def examine_computer() -> Finding:
@@ -118,10 +117,9 @@ def examine_computer() -> Finding:
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     load = os.getloadavg()[0]
     found = f"{processors} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
-    if processors < _LEAST_PROCESSORS or memory < _LEAST_MEMORY:
-        advice = f"take a computer of {_LEAST_PROCESSORS} processors and {_LEAST_MEMORY / 1e9:.0f} GB or more"
-        return Finding("computer", "warning", found, advice)
-    return Finding("computer", "ok", found)
+    enough = processors >= _LEAST_PROCESSORS and memory >= _LEAST_MEMORY
+    advice = f"take a computer of {_LEAST_PROCESSORS} processors and {_LEAST_MEMORY / 1e9:.0f} GB or more"
+    return Finding.judged("computer", found, "" if enough else advice)
 
 
 def examine_clock(files: Path | None = None) -> Finding:
@@ -133,10 +131,10 @@ def examine_clock(files: Path | None = None) -> Finding:
     newest = max(path.stat().st_mtime for path in folder.rglob("*") if path.is_file())
     now = time.time()
     found = f"{_date(now)} UTC"
-    if now < newest - 1:
-        found += f", before the date of files in {folder}, {_date(newest)} UTC"
-        return Finding("clock", "warning", found, "set the clock: sudo timedatectl set-ntp true")
-    return Finding("clock", "ok", found)
+    if now >= newest - 1:
+        return Finding("clock", "ok", found)
+    found += f", before the date of files in {folder}, {_date(newest)} UTC"
+    return Finding("clock", "warning", found, "set the clock: sudo timedatectl set-ntp true")
 
 
 def _date(seconds: float) -> str:
@@ -148,22 +146,21 @@ _RENDERER_S = 330
 
 def examine_renderer() -> list[Finding]:
     """Whether the twin's renderer finds a libLLVM and can run a kernel with it; the twin is asked, as a program."""
-    subject = "libLLVM"
     if find_spec("twin") is None:
-        return [Finding(subject, "ok", "not needed: the twin is not installed")]
+        return [Finding("libLLVM", "ok", "not needed: the twin is not installed")]
     command = [sys.executable, "-m", "twin.backend.llvm"]
     try:
         asked = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_RENDERER_S)
     except subprocess.TimeoutExpired:
-        return [Finding(subject, "warning", f"no answer within {_RENDERER_S} s", f"try: {shlex.join(command)}")]
+        return [Finding("libLLVM", "warning", f"no answer within {_RENDERER_S} s", f"try: {shlex.join(command)}")]
     chosen = [line.removeprefix("chosen: ") for line in asked.stdout.splitlines() if line.startswith("chosen: ")]
     if asked.returncode == 0 and chosen:
-        return [Finding(subject, "ok", f"{chosen[0]}; a trial kernel ran")]
+        return [Finding("libLLVM", "ok", f"{chosen[0]}; a trial kernel ran")]
     said = asked.stderr.strip().splitlines() or [f"it ended with status {asked.returncode}"]
     # An own error says most in its first line, a traceback in its last.
     reason = said[0].removeprefix("error: ") if said[0].startswith("error: ") else said[-1]
     advice = f"only for rendering by the twin:\n{shlex.join(command)} --install"
-    return [Finding(subject, "warning", f"the twin cannot render: {reason}", advice)]
+    return [Finding("libLLVM", "warning", f"the twin cannot render: {reason}", advice)]
 
 
 def print_findings(findings: Sequence[Finding], *, console: Console | None = None) -> None:

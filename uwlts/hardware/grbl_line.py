@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, assert_never
+from typing import Literal, Self, assert_never
 
 import serial
 from serial.tools.list_ports import comports
@@ -403,6 +403,12 @@ class GrblLine:
         finally:
             self._dismiss_guard()
             self._serial.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self.close(error)
 
     def _dismiss_guard(self) -> None:
         if self._guard is None or self._guard.stdin is None:
