@@ -14,17 +14,9 @@ ADDRESSES = """\
 
 
 def open_camera(address: str) -> Camera:
-    """Open the camera at an address such as "gige:127.0.0.1"; a context manager that closes it.
+    """Open the camera at an address, `ADDRESSES`, such as "gige:127.0.0.1"; a context manager that closes it.
 
-    Parameters
-    ----------
-    address : str
-        "gige:NAME" or "aravis:NAME", "genicam:PRODUCER.cti[:SERIAL]", or "replay:PATH".
-
-    Returns
-    -------
-    Camera
-        Open, not configured.
+    The camera is open, not configured.
 
     Raises
     ------

@@ -31,7 +31,7 @@ class GenicamCamera(Camera):
         self._serial = serial
         # harvesters comes without type information.
         self._harvester: Any = None
-        self._open_acquirer: Any = None
+        self._acquirer: Any = None
         self._faults: tuple[type[BaseException], ...] = ()
         self._timeout: type[BaseException] = BaseException
 
@@ -69,7 +69,7 @@ class GenicamCamera(Camera):
                     f"Found:{listed or ' none; check power, cable, and that the file is a producer for this machine'}"
                 )
             with _own_interrupt():
-                self._open_acquirer = harvester.create(found.index(fitting[0]))
+                self._acquirer = harvester.create(found.index(fitting[0]))
             self._acquirer.num_buffers = BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
             bits = MONO_BITS.get(self._node("PixelFormat").value, 8)
@@ -83,14 +83,8 @@ class GenicamCamera(Camera):
         except self._faults as error:
             raise self._failed(doing, error) from error
 
-    @property
-    def _acquirer(self) -> Any:
-        if self._open_acquirer is None:
-            raise HardwareError(f"the camera {self.address} is not open: call open() first")
-        return self._open_acquirer
-
     def _close(self) -> None:
-        acquirer, self._open_acquirer = self._open_acquirer, None
+        acquirer, self._acquirer = self._acquirer, None
         harvester, self._harvester = self._harvester, None
         if acquirer is not None:
             acquirer.destroy()
@@ -109,7 +103,13 @@ class GenicamCamera(Camera):
                 self._set_if_there("AcquisitionFrameRateEnable", True)
             self._set_number(_FRAME_RATE, wanted.frame_rate_hz, "frame rate")
             if wanted.trigger != "free":
-                self._set_trigger("Software" if wanted.trigger == "software" else "Line0")
+                source = "Software" if wanted.trigger == "software" else "Line0"
+                for name, value in (("Selector", "FrameStart"), ("Mode", "On"), ("Source", source)):
+                    self._set_if_there(f"Trigger{name}", value)
+                if not self._has("TriggerMode") or (source == "Software" and not self._has("TriggerSoftware")):
+                    raise HardwareError(
+                        f"the camera {self.address} cannot be triggered by {source}: use trigger 'free'"
+                    )
             exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, _GAIN, _FRAME_RATE))
             x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
             width, height = (int(self._node(name).value) for name in ("Width", "Height"))
@@ -150,13 +150,6 @@ class GenicamCamera(Camera):
 
     def _number(self, names: tuple[str, ...]) -> float | None:
         return next((float(self._node(name).value) for name in names if self._has(name)), None)
-
-    def _set_trigger(self, source: str) -> None:
-        self._set_if_there("TriggerSelector", "FrameStart")
-        self._set_if_there("TriggerMode", "On")
-        self._set_if_there("TriggerSource", source)
-        if not self._has("TriggerMode") or (source == "Software" and not self._has("TriggerSoftware")):
-            raise HardwareError(f"the camera {self.address} cannot be triggered by {source}: use trigger 'free'")
 
     def _set_if_there(self, name: str, value: object) -> None:
         # Cameras with only one value refuse to have it set.

@@ -47,12 +47,8 @@ class GrblStage:
 
     ``port`` is a serial port such as /dev/ttyACM0; ``boot_s`` is how long a controller that restarts when the port is
     opened may take. Attributes are the ``settings`` as ``$$`` reports them, Grbl's ``version``, and ``limits_mm``, the
-    lowest and the highest position.
-
-    Raises
-    ------
-    HardwareError
-        The port cannot be opened, nothing answers, or not a Grbl 1.1 that can do this.
+    lowest and the highest position. HardwareError where the port cannot be opened, nothing answers, or not a Grbl 1.1
+    that can do this.
     """
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):

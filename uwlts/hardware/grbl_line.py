@@ -235,12 +235,8 @@ class GrblLine:
     """An open line to a controller of version 1.1, just restarted. Not safe between threads.
 
     ``port`` is a serial port such as /dev/ttyACM0. ``boot_s`` is how long the greeting of a controller that restarts
-    when the port is opened may take; then Ctrl-X asks for it.
-
-    Raises
-    ------
-    HardwareError
-        The port is missing, forbidden or in use, nothing answers, or what answers is not Grbl 1.1.
+    when the port is opened may take; then Ctrl-X asks for it. HardwareError where the port is missing, forbidden or in
+    use, nothing answers, or what answers is not Grbl 1.1.
     """
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -55,49 +55,43 @@ _FAINT, _MANY = 0.1, 0.05
 """A laser image is faint below this part of the full scale, saturated with more than this part of its lines there."""
 
 
-@dataclass(frozen=True)
-class Seen:
+@dataclass(frozen=True, eq=False)
+class Shown:
     """One image of a recording: its number, position in mm, light, picture (H, W, 3), stripe, and points (N, 3) in mm.
 
-    ``found`` of the ``lines`` have a stripe; ``remarks`` are warnings. ``planned`` is
-    how many images there will be, where that is known, and ``left_s`` the time they take.
+    ``found`` of the ``lines`` have a stripe; ``remarks`` are warnings. ``planned`` is how many images there will be,
+    where that is known, and ``left_s`` the time they take.
     """
 
     number: int
     stage_mm: float
     laser_on: bool
     picture: np.ndarray
-    found: int
-    lines: int
-    points_mm: np.ndarray
-    remarks: tuple[str, ...]
-    planned: int | None = None
-    left_s: float | None = None
+    planned: int | None
+    left_s: float | None
+    found: int = 0
+    lines: int = 0
+    points_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    remarks: tuple[str, ...] = ()
 
 
-def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> Seen:
-    """What one image of a capture shows.
-
-    Raises
-    ------
-    CalibrationError
-        The calibration does not fit the capture.
-    """
-    frame = capture[number]
-    along = capture.header.sensor.camera.stripe_along
-    points, (planned, left_s) = np.zeros((0, 3)), _outlook(capture, number)
+def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> Shown:
+    """What one image of a capture shows; CalibrationError where the calibration does not fit the capture."""
+    frame, full = capture[number], capture.header.saturation_dn
+    # Dark parts raised, and small enough to be sent often.
+    picture, scale = small_picture(frame.image, full_dn=full)
+    shown = Shown(number, frame.stage_mm, frame.laser_on, picture, *_outlook(capture, number))
     if not frame.laser_on:
-        picture = _picture(frame.image, capture, None)
-        return Seen(number, frame.stage_mm, False, picture, 0, 0, points, (), planned, left_s)
-    stripe = extract_stripe(frame.image, stripe_along=along, saturation=capture.header.saturation_dn)
-    line = stripe.lines
+        return shown
+    along = capture.header.sensor.camera.stripe_along
+    stripe = extract_stripe(frame.image, stripe_along=along, saturation=full)
+    line, points = stripe.lines, shown.points_mm
+    centre = stripe.centre_px[line]
     if calibration is not None and len(line):
-        stripes = FoundStripes(
-            np.full(len(line), number), line, stripe.centre_px[line], stripe.amplitude[line], stripe.width_px[line], {}
-        )
+        of_image = np.full(len(line), number)
+        stripes = FoundStripes(of_image, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
         points = reconstruct_stripes(capture, stripes, calibration).points_mm
     brightest = frame.image.max(axis=0 if along == "width" else 1)
-    full = capture.header.saturation_dn
     remarks = []
     if (brightest >= full).mean() > _MANY:
         remarks.append("saturated on many lines: shorten the exposure")
@@ -105,10 +99,11 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
         remarks.append("faint: lengthen the exposure, or is the laser lit?")
     if len(line) < 0.05 * len(stripe.status):
         remarks.append("hardly any stripe: is the object in the volume?")
-    picture = _picture(frame.image, capture, (line, stripe.centre_px[line]))
-    return Seen(
-        number, frame.stage_mm, True, picture, len(line), len(stripe.status), points, tuple(remarks), planned, left_s
+    rows, columns = (
+        (scale * values).astype(int) for values in ((centre, line) if along == "width" else (line, centre))
     )
+    picture[np.clip(rows, 0, len(picture) - 1), np.clip(columns, 0, picture.shape[1] - 1)] = _STRIPE_COLOUR
+    return replace(shown, found=len(line), lines=len(stripe.status), points_mm=points, remarks=tuple(remarks))
 
 
 def _outlook(capture: Capture, number: int) -> tuple[int | None, float | None]:
@@ -123,26 +118,10 @@ def _outlook(capture: Capture, number: int) -> tuple[int | None, float | None]:
     return planned, float(pace_s * (planned - number - 1))
 
 
-def _picture(image: np.ndarray, capture: Capture, stripe: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
-    """The image (H, W, 3), uint8, dark parts raised, the stripe's centres marked; small enough to be sent often."""
-    picture, scale = small_picture(image, full_dn=capture.header.saturation_dn)
-    if stripe is not None:
-        line, centre = ((scale * values).astype(int) for values in stripe)
-        rows, columns = (centre, line) if capture.header.sensor.camera.stripe_along == "width" else (line, centre)
-        last_row, last_column = picture.shape[0] - 1, picture.shape[1] - 1
-        picture[np.clip(rows, 0, last_row), np.clip(columns, 0, last_column)] = _STRIPE_COLOUR
-    return picture
-
-
-def images_of(path: Path, calibration: AnyCalibration | None) -> Iterator[Seen | None]:
+def images_of(path: Path, calibration: AnyCalibration | None) -> Iterator[Shown | None]:
     """Every image of a recording as it is written; None whenever there is nothing new. Ends after the finished file's.
 
-    Raises
-    ------
-    CaptureError
-        The finished file is damaged.
-    CalibrationError
-        The calibration does not fit the capture.
+    CaptureError where the finished file is damaged; CalibrationError where the calibration does not fit the capture.
     """
     shown = 0
     while True:
@@ -171,48 +150,34 @@ class LiveView(LivePage):
         self._image = self.server.gui.add_image(np.zeros((2, 2, 3), np.uint8), label="latest image", format="jpeg")
         self._found = self._lines = self._points = 0
 
-    def show(self, seen: Seen) -> None:
+    def show(self, seen: Shown) -> None:
         """Show an image, and its profile in the cloud."""
         self._image.image = seen.picture
         self._found, self._lines = self._found + seen.found, self._lines + seen.lines
-        self._points += len(seen.points_mm)
         if len(seen.points_mm):
-            depth = seen.points_mm[:, 2]
+            if not self._points:
+                # The viewers' camera stands before the first profile, which is seen as the sensor sees it.
+                camera, middle = self.server.initial_camera, seen.points_mm.mean(axis=0)
+                camera.position, camera.look_at = tuple(middle + np.array([-60.0, 0.0, -250.0])), tuple(middle)
+                camera.up = (1.0, 0.0, 0.0)
+            # Colours repeat every 50 mm of depth.
+            share = (seen.points_mm[:, 2] / 50 * 255 % 255).astype(np.uint8)
             self.server.scene.add_point_cloud(
                 f"/profiles/{seen.number}",
                 seen.points_mm.astype(np.float32),
-                _coloured(depth),
+                cv2.applyColorMap(share[:, None], cv2.COLORMAP_TURBO).reshape(-1, 3)[:, ::-1].copy(),
                 point_size=0.4,
                 precision="float32",
             )
-            if self._points == len(seen.points_mm):
-                self._look_at(seen.points_mm.mean(axis=0))
+        self._points += len(seen.points_mm)
+        of = "" if seen.planned is None else f" of {seen.planned}"
+        left = "" if not seen.left_s else f", {int(seen.left_s) // 60} min {int(seen.left_s) % 60} s left"
         remarks = "".join(f"\n\n**{remark}**" for remark in seen.remarks)
         light = "laser" if seen.laser_on else "lamp"
         self._words.content = (
-            f"image {seen.number + 1}{_of(seen)}, {light}, stage at {seen.stage_mm:.3f} mm\n\n"
+            f"image {seen.number + 1}{of}{left}, {light}, stage at {seen.stage_mm:.3f} mm\n\n"
             f"stripe on {self._found:,} of {self._lines:,} profile lines; {self._points:,} points{remarks}"
         )
-
-    def _look_at(self, middle: np.ndarray) -> None:
-        """Put the viewers' camera before the first profile, seen as the sensor sees it."""
-        self.server.initial_camera.position = tuple(middle + np.array([-60.0, 0.0, -250.0]))
-        self.server.initial_camera.look_at = tuple(middle)
-        self.server.initial_camera.up = (1.0, 0.0, 0.0)
-
-
-def _of(seen: Seen) -> str:
-    """How many images there will be, and when that is."""
-    if seen.planned is None:
-        return ""
-    left = f", {int(seen.left_s) // 60} min {int(seen.left_s) % 60} s left" if seen.left_s else ""
-    return f" of {seen.planned}{left}"
-
-
-def _coloured(depth_mm: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) that repeat every 50 mm of depth."""
-    share = (depth_mm / 50 * 255 % 255).astype(np.uint8)
-    return cv2.applyColorMap(share[:, None], cv2.COLORMAP_TURBO).reshape(-1, 3)[:, ::-1].copy()
 
 
 def watch(

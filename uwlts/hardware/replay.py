@@ -104,23 +104,20 @@ class ReplayCamera(Camera):
         return stamp_s
 
     def _deliver(self, index: int, stamp_s: float) -> Delivered:
-        count = len(self._files) if self._capture is None else len(self._capture)
+        capture, info, region = self._capture, self.info, self.settings.region
+        count = len(self._files) if capture is None else len(capture)
         if index >= count and not self._repeat:
             raise HardwareError(f"all {count} images of {self._path} have been shown")
-        image, exposure_ms = self._image(index % count)
-        info, region = self.info, self.settings.region
+        shown = index % count
+        image = _read(self._files[shown]) if capture is None else capture.image(shown)
         if image.shape != (info.height_px, info.width_px) or image.dtype.itemsize != (1 if info.bits == 8 else 2):
             raise ImageError(
-                f"image {index % count} of {self._path} has {image.shape[1]} x {image.shape[0]} px of {image.dtype}, "
+                f"image {shown} of {self._path} has {image.shape[1]} x {image.shape[0]} px of {image.dtype}, "
                 f"the first one {info.width_px} x {info.height_px} px of {info.bits} bits: give one camera's images"
             )
         part = image[region.y_px : region.y_px + region.height_px, region.x_px : region.x_px + region.width_px]
+        exposure_ms = None if capture is None else float(capture.exposure_ms[shown])
         return Delivered(np.ascontiguousarray(part), index + 1, stamp_s, exposure_ms)
-
-    def _image(self, index: int) -> tuple[np.ndarray, float | None]:
-        if self._capture is None:
-            return _read(self._files[index]), None
-        return self._capture.image(index), float(self._capture.exposure_ms[index])
 
     def _answers(self) -> None:
         """Files need no check; reading a missing one raises an error."""

@@ -16,9 +16,10 @@ from pydantic import JsonValue
 import uwlts
 from uwlts.hardware.camera import Camera, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings, Table
+from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import CaptureHeader
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
@@ -129,9 +130,11 @@ _RUN_UP_MM = 1.0
 """More than the play of a ball screw or belt."""
 
 
-def provenance_of(plan: RigPlan, camera: Camera, *, source: str, stage: str, **more: JsonValue) -> Table:
-    """Where the images of a capture come from."""
-    return {
+def with_provenance(
+    header: CaptureHeader, plan: RigPlan, camera: Camera, *, source: str, stage: str, **more: JsonValue
+) -> CaptureHeader:
+    """The header of a capture, with where its images come from."""
+    provenance = {
         "source": source,
         "title": plan.title,
         "camera": f"{camera.info.name} {camera.info.serial}".strip(),
@@ -140,6 +143,7 @@ def provenance_of(plan: RigPlan, camera: Camera, *, source: str, stage: str, **m
         "laser_power": plan.laser_power,
         "uwlts": uwlts.__version__,
     }
+    return header.model_copy(update={"provenance": provenance})
 
 
 class HandSwitchedLaser:
@@ -165,6 +169,9 @@ class HandSwitchedLaser:
         self.laser_power = power if on else 0.0
 
 
+LaserStage = GrblStage | HandSwitchedLaser
+
+
 class Rig:
     """Takes the images of a plan one by one. The laser is on for its own images only.
 
@@ -173,14 +180,7 @@ class Rig:
     """
 
     def __init__(
-        self,
-        plan: RigPlan,
-        settings: StageSettings,
-        sensor: Sensor,
-        camera: Camera,
-        stage: GrblStage | HandSwitchedLaser,
-        *,
-        ahead: float,
+        self, plan: RigPlan, settings: StageSettings, sensor: Sensor, camera: Camera, stage: LaserStage, *, ahead: float
     ):
         self._plan, self._sensor, self._camera, self._stage = plan, sensor, camera, stage
         self._feed_mm_per_min, self._ahead = settings.feed_mm_per_min, math.copysign(1.0, ahead)

@@ -82,15 +82,7 @@ class RigPlan(Description):
         return self.laser_ms if light == "laser" else self.lamp_ms
 
     def capture_header(
-        self,
-        name: str,
-        sensor: Sensor,
-        *,
-        medium: str,
-        direction: Vector,
-        provenance: Table,
-        zero_dn: int = 0,
-        **shown: Table | None,
+        self, name: str, sensor: Sensor, *, medium: str, direction: Vector, zero_dn: int = 0, **shown: Table | None
     ) -> CaptureHeader:
         """Header of a capture that shows a ``target`` or an ``artefact``; DescriptionError where one is not valid.
 
@@ -103,7 +95,6 @@ class RigPlan(Description):
             "medium": sensor.medium(medium),
             "stage_direction": direction,
             "saturation_dn": sensor.detector.full_scale_dn() + zero_dn,
-            "provenance": provenance,
         }
         return validated(CaptureHeader, table | shown, f"the plan '{self.title}'")
 
@@ -137,7 +128,7 @@ class ScanPlan(RigPlan):
     target: Table | None = None
     artefact: Table | None = None
 
-    def header(self, name: str, *, provenance: Table) -> CaptureHeader:
+    def header(self, name: str) -> CaptureHeader:
         """Header of the capture; DescriptionError or EvaluationError where what the plan describes is not valid."""
         sensor = self.described_sensor()
         if self.target is not None:
@@ -149,7 +140,6 @@ class ScanPlan(RigPlan):
             sensor,
             medium=self.medium,
             direction=self.stage.direction,
-            provenance=provenance,
             zero_dn=self.zero_dn(sensor),
             target=self.target,
             artefact=self.artefact,
@@ -162,12 +152,8 @@ class ScanPlan(RigPlan):
     def check(self, stage: GrblStage) -> None:
         """Refuse what the stage or the sensor cannot do, before anything moves.
 
-        Raises
-        ------
-        RangeError
-            A position lies outside the travel, or the feed is too high.
-        DesignError
-            The sensor cannot work in the medium.
+        RangeError where a position lies outside the travel, or the feed is too high; DesignError where the sensor
+        cannot work in the medium.
         """
         self.stage.check(self.stage.positions_mm(), stage)
         sensor = self.described_sensor()
@@ -180,10 +166,7 @@ class ScanPlan(RigPlan):
 def load_plan(path: Path) -> ScanPlan:
     """Plan in a TOML file; a sensor beside it is found by its file name.
 
-    Raises
-    ------
-    DescriptionError
-        The file is missing, no TOML, or holds an unknown or wrong key.
+    DescriptionError where the file is missing, no TOML, or holds an unknown or wrong key.
     """
     return validated(ScanPlan, plan_table(path, wanted="sensor, medium and stage (docs/how-to/scan.md)"), path)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.hardware.rig import Brightness, Rig, not_few, stripe_of
+from uwlts.hardware.rig import Rig, not_few, stripe_of
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
@@ -71,38 +71,30 @@ class LaserWatch:
     ``lit`` is where the stripe is known to be seen; ``difference`` as in `shows_laser`.
     """
 
-    def __init__(
-        self, rig: Rig, sensor: Sensor, positions_mm: Sequence[float], *, difference: bool, lit: LitPlace | None = None
-    ):
+    def __init__(self, rig: Rig, sensor: Sensor, positions_mm: Sequence[float], *, difference: bool):
         self._rig, self._sensor, self._difference = rig, sensor, difference
-        self._positions_mm, self.lit = positions_mm, lit
+        self._positions_mm = positions_mm
+        self.lit: LitPlace | None = None
         self._usual: tuple[int, float] | None = None
         self._without = 0
 
     def see(
-        self,
-        image: np.ndarray,
-        stripe: Stripe,
-        bright: Brightness,
-        place: LitPlace,
-        *,
-        unlit: np.ndarray | None = None,
-        last: bool = False,
+        self, image: np.ndarray, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
     ) -> None:
-        """Judge a laser image (H, W), its stripe and brightness, before it is stored; may move the stage.
+        """Judge a laser image (H, W), its stripe and its brightness ``level``, before it is stored; may move the stage.
 
         ``unlit`` is an image without laser beside it, if there is one; ``last``: no further image comes. HardwareError
         where the laser gives no light.
         """
-        now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), bright.level)
+        now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
         if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):
-            unlit = self._rig.image("lamp", place.exposure_ms)[0] if unlit is None else unlit
+            unlit = self._rig.image("lamp", here.exposure_ms)[0] if unlit is None else unlit
             if not shows_laser(image, unlit, self._sensor, difference=self._difference):
                 self._without += 1
                 if last or self._without % _AGAIN == 1:
-                    self._look_elsewhere(place)
+                    self._look_elsewhere(here)
                 return
-        self._usual, self.lit, self._without = now, place, 0
+        self._usual, self.lit, self._without = now, here, 0
 
     def _look_elsewhere(self, here: LitPlace) -> None:
         """See the stripe where it was, or somewhere; HardwareError where it is not."""
@@ -149,11 +141,9 @@ _GRAIN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class Place(LitPlace):
     """A laser image: its position and exposure, and the stripe's centres (N,) in px, NaN where there is none."""
 
-    position_mm: float
-    exposure_ms: float
     centre_px: np.ndarray
 
 
@@ -195,9 +185,9 @@ class SlipWatch:
 
     def see(self, place: Place) -> None:
         """Take an image into account."""
-        if self.relief is None:
-            self._latest = [*self._latest[-2:], place]
-            self.relief = _relief(*self._latest) if len(self._latest) == 3 else None
+        self._latest = [*self._latest[-2:], place]
+        if self.relief is None and len(self._latest) == 3:
+            self.relief = _relief(*self._latest)
 
 
 def centres_of(stripe: Stripe) -> np.ndarray:

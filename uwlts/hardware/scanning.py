@@ -18,7 +18,7 @@ from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, provenance_of, stripe_of
+from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import (
     LOOKS,
@@ -165,12 +165,17 @@ def scan(
         check_camera(opened, sensor)
         plan.check(moved)
         dtype = np.dtype(np.uint16 if plan.background or opened.info.bits > 8 else np.uint8)
-        provenance = provenance_of(
-            plan, opened, source="scan", stage=f"Grbl {moved.version}", images=len(shots), background=plan.background
+        header = with_provenance(
+            plan.header(out.stem),
+            plan,
+            opened,
+            source="scan",
+            stage=f"Grbl {moved.version}",
+            images=len(shots),
+            background=plan.background,
         )
         known_ms, before_s = left_over(out) if resume else ({}, 0.0)
         seen = Seen(exposure_ms=known_ms)
-        header = plan.header(out.stem, provenance=provenance)
         writer = stack.enter_context(CaptureWriter(out, header, dtype=dtype, overwrite=overwrite, resume=resume))
         begun = len(writer)
         if begun == len(shots):
@@ -285,7 +290,7 @@ class _Taking:
         if light == "laser":
             stripe, place = stripe_of(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
             self._slip.see(Place(position, exposure_ms, centres_of(stripe)))
-            self._watch.see(image, stripe, bright, place, unlit=unlit, last=last)
+            self._watch.see(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         seen.images += 1
         seen.repeated = rig.repeated

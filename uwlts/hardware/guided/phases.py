@@ -1,8 +1,11 @@
-"""Phases of a guided calibration: the target at the stage's positions or held by hand, then the step standard."""
+"""Guided calibration: images and attempts at poses of the target, and its phases.
+
+The target is shown at the stage's positions or held by hand; then comes the step standard.
+"""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +13,41 @@ import numpy as np
 from uwlts.calibration.guidance.pose_advice import (
     PoseAdvice,
     State,
+    Wanted,
     best_pose,
     format_pose_advice,
     gain_of,
     missing,
     missing_sheet,
+    state_of,
 )
-from uwlts.calibration.guidance.solution import pose_of
+from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual, pose_of
 from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
-from uwlts.calibration.image_quality import LampFault, LaserFault, MotionFault, judge_novelty, way_px
-from uwlts.hardware.guided.attempt import Accepted, Found, GuidedImages, PoseJudge
+from uwlts.calibration.image_quality import (
+    LampFault,
+    LaserFault,
+    MotionFault,
+    QualityLimits,
+    StripeQuality,
+    TargetQuality,
+    judge_motion,
+    judge_novelty,
+    judge_stripe,
+    judge_target,
+    way_px,
+    why_not_found,
+)
 from uwlts.hardware.guided.operator import GuidedPage, Operator
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
+from uwlts.hardware.rig import START_MS, Rig
+from uwlts.hardware.scan_plan import LIGHTS, Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.errors import CalibrationError, TargetError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureWriter, Frame
 from uwlts.targets import TargetView
 
 _TRIES = 3
-_SAME_POSITION_MM = 0.02
 # A target held by hand stands still while its points move by no more than this.
 _STILL_PX = 0.5
 # Free poses have no stage position; this numbers their images without looking like a motion of the stage.
@@ -36,32 +55,54 @@ _NUMBER_MM = 1e-3
 # A pose is taken without being asked for if it helps this much of what the best one would.
 _USEFUL = 0.25
 _RESETTLE_S = 2.0
-
-
-def still_missing(state: State) -> list[str]:
-    """What camera and laser sheet still lack."""
-    return [*missing(state), *missing_sheet(state)]
-
-
-def places_left(plan: GuidedPlan, state: State) -> list[float]:
-    """Stage positions of a plan that are not recorded yet; none for free poses."""
-    if plan.poses == "free" or plan.stage is None:
-        return []
-    done = np.array([pose.stage_mm for pose in state.recorded])
-    return [place for place in plan.stage.places_mm() if not (np.abs(done - place) <= _SAME_POSITION_MM).any()]
+# The stage's steps may be small; the poses are distinguished by its position.
+_STAGE_CHANGE_PX = 0.5
 
 
 class Session:
     """A recording with camera and stage open: takes images, talks to the operator, and writes the capture.
 
-    ``before_s`` is the time of the last image of an interrupted recording.
+    Images are taken at the exposure of their light. ``known_ms`` are exposures already settled, and ``before_s`` the
+    time of the last image, of an interrupted recording.
     """
 
     def __init__(
-        self, images: GuidedImages, operator: Operator, page: GuidedPage, writer: CaptureWriter, *, before_s: float
+        self,
+        rig: Rig,
+        plan: RigPlan,
+        writer: CaptureWriter,
+        operator: Operator,
+        page: GuidedPage,
+        *,
+        dtype: np.dtype,
+        known_ms: dict[Light, float],
+        before_s: float,
     ):
-        self.images, self.operator, self.page = images, operator, page
-        self._writer, self._start_s = writer, time.monotonic() - before_s
+        self.rig, self.operator, self.page = rig, operator, page
+        self._plan, self._writer, self._dtype = plan, writer, dtype
+        planned_ms: dict[Light, float] = {light: ms for light in LIGHTS if (ms := plan.planned_ms(light)) != "auto"}
+        self._exposure_ms = planned_ms | known_ms
+        self._start_s = time.monotonic() - before_s
+
+    def take(self, light: Light) -> tuple[np.ndarray, float]:
+        """Image (H, W) in a light, and its exposure in ms."""
+        if light not in self._exposure_ms:
+            self.settle(light)
+        image, exposure_ms = self.rig.image(light, self._exposure_ms.get(light, START_MS))
+        return image.astype(self._dtype, copy=False), exposure_ms
+
+    def unlit(self) -> np.ndarray:
+        """A short image (H, W) without laser, in whatever light there is."""
+        return self.rig.image("lamp", START_MS)[0]
+
+    def settle(self, light: Light) -> bool:
+        """Find the exposure for what is seen now; whether there is one that was not planned: in the dark is none."""
+        if self._plan.planned_ms(light) != "auto":
+            return False
+        found = self.rig.settled_exposure(light, start_ms=self._exposure_ms.get(light, START_MS))
+        if found is not None:
+            self._exposure_ms[light] = found
+        return found is not None
 
     def show(
         self, image: np.ndarray, remark: str, *, points: np.ndarray | None = None, stripe: np.ndarray | None = None
@@ -80,12 +121,139 @@ class Session:
         self._writer.append(Frame(image, stage_mm, laser_on, exposure_ms, time.monotonic() - self._start_s))
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A lamp image (H, W) with the target in it, None where there is none, and the reasons why it is of no use."""
+
+    image: np.ndarray
+    view: TargetView | None
+    quality: TargetQuality | None
+    reasons: tuple[str, ...]
+
+    @property
+    def usable(self) -> TargetView | None:
+        """The target, None where there is a reason against it."""
+        return None if self.reasons else self.view
+
+    def line(self) -> str:
+        """The reasons in a line."""
+        return f"refused: {'; '.join(self.reasons)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Accepted(Found):
+    """A pose to be recorded, and the ``state`` of the calibration with it.
+
+    ``lamp_ms`` is the exposure of the image; ``laser`` is the image (H, W) with the laser line, if that was on the
+    target, with its exposure in ms.
+    """
+
+    quality: TargetQuality
+    pose: RecordedPose
+    lamp_ms: float
+    laser: tuple[np.ndarray, float] | None
+    state: State
+
+    def line(self) -> str:
+        """Quality in a line."""
+        quality, state = self.quality, self.state
+        stripe = f"stripe on {len(self.pose.stripe)} lines" if self.laser else "no stripe on the target"
+        residual = "not yet" if state.solution is None else f"{state.solution.image_rms_px()[-1]:.2f} px"
+        return (
+            f"{quality.points} points, edges {quality.blur_px:.1f} px, coverage {100 * state.coverage.share:.0f} %, "
+            f"{stripe}, residual {residual}"
+        )
+
+
+class PoseJudge:
+    """Judges images of the target, taken now or read from a recording; pixels clip at the grey value ``full_dn``."""
+
+    def __init__(self, setting: Setting, wanted: Wanted, *, full_dn: int):
+        self._setting, self._wanted, self._full = setting, wanted, full_dn
+        limits = QualityLimits()
+        self.limits = limits if setting.poses == "free" else replace(limits, smallest_change_px=_STAGE_CHANGE_PX)
+
+    def find(self, image: np.ndarray) -> Found:
+        """The target in a lamp image (H, W), judged."""
+        try:
+            view = self._setting.target.detect(image)
+        except TargetError as error:
+            return Found(image, None, None, (why_not_found(image, str(error), full_dn=self._full),))
+        quality = judge_target(image, view, self._setting.target, full_dn=self._full, limits=self.limits)
+        return Found(image, view, quality, quality.reasons)
+
+    def stripe(self, image: np.ndarray, view: TargetView) -> StripeQuality:
+        """The stripe in a laser image (H, W) on the target where a view shows it."""
+        return judge_stripe(
+            image,
+            view,
+            self._setting.target,
+            stripe_along=self._setting.sensor.camera.stripe_along,
+            full_dn=self._full,
+            limits=self.limits,
+        )
+
+    def state(self, recorded: Sequence[RecordedPose]) -> State:
+        """How far recorded poses lead; errors as `state_of`."""
+        return state_of(recorded, self._setting, self._wanted)
+
+    def recorded(self, path: Path) -> list[RecordedPose]:
+        """The poses that a capture of the target holds, judged as when they were taken."""
+        with Capture(path) as capture:
+            stripes = {float(capture.stage_mm[k]): image for k, image in capture.frames(laser_on=True)}
+            poses = []
+            for frame, image in capture.frames(laser_on=False):
+                view, stage_mm = self.find(image).view, float(capture.stage_mm[frame])
+                if view is not None:
+                    lit = stripes.get(stage_mm)
+                    stripe = np.empty((0, 2)) if lit is None else self.stripe(lit, view).pixels
+                    poses.append(RecordedPose(view, stripe, stage_mm))
+        return poses
+
+    def attempt(self, session: Session, before: State, stage_mm: float) -> Found:
+        """Take the target as it stands, to be the next pose after those of ``before``; `Accepted`, or the reasons."""
+        lamp, lamp_ms = session.take("lamp")
+        found = self.find(lamp)
+        view, quality = found.usable, found.quality
+        if view is None or quality is None:
+            return found
+        if reasons := judge_novelty(view, [p.view for p in before.recorded], self.limits):
+            return replace(found, reasons=reasons)
+        laser = session.take("laser")
+        stripe = self.stripe(laser[0], view)
+        if stripe.reasons and session.settle("laser"):
+            laser = session.take("laser")
+            stripe = self.stripe(laser[0], view)
+        after = self.find(session.take("lamp")[0])
+        reasons = after.reasons if after.usable is None else judge_motion(view, after.usable, self.limits)
+        if reasons or stripe.reasons:
+            return replace(found, reasons=(*reasons, *stripe.reasons))
+        shown = stripe.lines >= self.limits.fewest_lines
+        pose = RecordedPose(view, stripe.pixels if shown else np.empty((0, 2)), stage_mm)
+        try:
+            state = self.state([*before.recorded, pose])
+        except CalibrationError as error:
+            return replace(found, reasons=(str(error),))
+        if state.solution is not None:
+            reasons = judge_residual(before.solution, state.solution)
+        elif before.solution is not None:
+            reasons = (f"contradicts the others: with it {state.undetermined}",)
+        if reasons:
+            return replace(found, reasons=reasons)
+        return Accepted(lamp, view, quality, (), pose, lamp_ms, laser if shown else None, state)
+
+
+def still_missing(state: State) -> list[str]:
+    """What camera and laser sheet still lack."""
+    return [*missing(state), *missing_sheet(state)]
+
+
 class TargetPhase:
     """Records poses of the target until what is wanted is reached."""
 
     def __init__(self, plan: GuidedPlan, session: Session, judge: PoseJudge):
         self._plan, self._session, self._judge = plan, session, judge
-        self._images, self._operator, self._page = session.images, session.operator, session.page
+        self._operator, self._page = session.operator, session.page
         self._settled_s = -np.inf
 
     def run(self, state: State) -> State:
@@ -97,12 +265,12 @@ class TargetPhase:
         return self._free(state) if self._plan.poses == "free" else self._by_stage(state)
 
     def _by_stage(self, state: State) -> State:
-        places = places_left(self._plan, state)
+        places = self._plan.places_left(state.recorded)
         for number, place in enumerate(places):
             self._page.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
-            position = self._images.rig.move_to(place)
+            position = self._session.rig.move_to(place)
             for _ in range(_TRIES):
-                found = self._judge.attempt(self._images, state, position)
+                found = self._judge.attempt(self._session, state, position)
                 state = self._done(found, state, f"{position:.2f} mm")
                 # Another attempt may be better once the target has come to rest, or with another exposure.
                 moved = any(isinstance(reason, MotionFault) for reason in found.reasons)
@@ -116,7 +284,7 @@ class TargetPhase:
         still: TargetView | None = None
         since_s = time.monotonic()
         while still_missing(state) and len(state.recorded) < self._plan.most_images:
-            found = self._judge.find(self._images.take("lamp")[0])
+            found = self._judge.find(self._session.take("lamp")[0])
             advice = advice or best_pose(state, spin_rad=_spin(found.usable, state))
             answer = self._operator.answer()
             if answer == "done":
@@ -130,7 +298,7 @@ class TargetPhase:
             if answer is None and (reasons or not stands):
                 continue
             last = max((round(pose.stage_mm / _NUMBER_MM) for pose in state.recorded), default=0)
-            found = self._judge.attempt(self._images, state, _NUMBER_MM * (last + 1))
+            found = self._judge.attempt(self._session, state, _NUMBER_MM * (last + 1))
             state = self._done(found, state, f"image {len(state.recorded) + 1}")
             still, since_s = None, time.monotonic()
             if isinstance(found, Accepted):
@@ -169,7 +337,7 @@ class TargetPhase:
         light = any(isinstance(reason, LampFault) for reason in reasons)
         if not light or time.monotonic() - self._settled_s < _RESETTLE_S:
             return False
-        changed = self._images.settle("lamp")
+        changed = self._session.settle("lamp")
         self._settled_s = time.monotonic()
         return changed
 
@@ -234,7 +402,7 @@ class StepPhase:
     """Records images of the standard until it was seen near, in the middle and far."""
 
     def __init__(self, judge: StepJudge, session: Session):
-        self._judge, self._session, self._images = judge, session, session.images
+        self._judge, self._session = judge, session
 
     def run(self, seen_mm: Sequence[float]) -> list[float]:
         """Go on after the depths that are recorded; all depths then. Errors as `TargetPhase.run`."""
@@ -244,7 +412,7 @@ class StepPhase:
                 f"put the step standard about {wanted:.0f} mm outside the window, with the laser line across its step"
             )
             session.page.request(request)
-            if session.operator.wait(request, lambda: session.show(self._images.unlit(), "the laser is off")) == "done":
+            if session.operator.wait(request, lambda: session.show(session.unlit(), "the laser is off")) == "done":
                 break
             before = tuple(seen)
             for position in self._judge.step.positions_mm or (None,):
@@ -254,14 +422,15 @@ class StepPhase:
 
     def _take(self, position: float | None, before_mm: Sequence[float]) -> float | None:
         """Take the standard as it stands; at which depth it was recorded, None if it was refused."""
-        stage_mm = 0.0 if position is None else self._images.rig.move_to(position)
-        image, exposure_ms = self._images.take("laser")
+        session = self._session
+        stage_mm = 0.0 if position is None else session.rig.move_to(position)
+        image, exposure_ms = session.take("laser")
         quality = self._judge.judge(image)
-        if any(isinstance(reason, LaserFault) for reason in quality.reasons) and self._images.settle("laser"):
-            image, exposure_ms = self._images.take("laser")
+        if any(isinstance(reason, LaserFault) for reason in quality.reasons) and session.settle("laser"):
+            image, exposure_ms = session.take("laser")
             quality = self._judge.judge(image)
         # Nobody moves the standard while the laser is on.
-        self._images.unlit()
+        session.unlit()
         depth_mm, reasons, sensor = quality.depth_mm, quality.reasons, self._judge.sensor
         if depth_mm is not None and not reasons and not is_new(depth_mm, before_mm, sensor):
             nearest = min(before_mm, key=lambda other: abs(other - depth_mm))
@@ -273,9 +442,9 @@ class StepPhase:
             line = f"refused: {'; '.join(reasons)}"
         else:
             line = f"stripe on {len(quality.pixels)} lines, {depth_mm:.0f} mm outside the window"
-        self._session.report(f"step: {line}")
-        self._session.show(image, line, stripe=quality.pixels)
+        session.report(f"step: {line}")
+        session.show(image, line, stripe=quality.pixels)
         if reasons or depth_mm is None:
             return None
-        self._session.record(image, exposure_ms, stage_mm=stage_mm, laser_on=True)
+        session.record(image, exposure_ms, stage_mm=stage_mm, laser_on=True)
         return depth_mm

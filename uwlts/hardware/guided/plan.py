@@ -1,5 +1,6 @@
 """Plan of a guided calibration: a TOML file with sensor, camera, stage, target, step and goals."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +10,7 @@ from pydantic import Field, model_validator
 
 from uwlts.calibration.camera import Poses
 from uwlts.calibration.guidance.pose_advice import Wanted
-from uwlts.calibration.guidance.solution import Setting, without_window
+from uwlts.calibration.guidance.solution import RecordedPose, Setting, without_window
 from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, plan_table
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import DescriptionError
@@ -17,6 +18,8 @@ from uwlts.model.library import validated
 from uwlts.model.sensor import Description, NotNegative, Positive
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
+
+_SAME_POSITION_MM = 0.02
 
 
 class GuidedStage(StageSettings):
@@ -78,13 +81,7 @@ class WantedPlan(Description):
 
     def wanted(self) -> Wanted:
         """The same in rad."""
-        return Wanted(
-            focal_std_px=self.focal_std_px,
-            centre_std_px=self.centre_std_px,
-            coverage=self.coverage,
-            tilt_rad=float(np.radians(self.tilt_deg)),
-            fewest_images=self.fewest_images,
-        )
+        return Wanted(**self.model_dump(exclude={"tilt_deg"}), tilt_rad=float(np.radians(self.tilt_deg)))
 
 
 class GuidedPlan(RigPlan):
@@ -120,6 +117,13 @@ class GuidedPlan(RigPlan):
             return wanted
         return replace(wanted, fewest_images=min(wanted.fewest_images, len(self.stage.places_mm())))
 
+    def places_left(self, recorded: Sequence[RecordedPose]) -> list[float]:
+        """Stage positions that are not recorded yet; none for free poses."""
+        if self.poses == "free" or self.stage is None:
+            return []
+        done = np.array([pose.stage_mm for pose in recorded])
+        return [place for place in self.stage.places_mm() if not (np.abs(done - place) <= _SAME_POSITION_MM).any()]
+
     def connected(self, *, camera: str | None, port: str | None) -> "GuidedPlan":
         """The plan with another address of the camera, or another port of the stage, if these are given."""
         stage = self.stage if port is None else (self.stage or GuidedStage()).model_copy(update={"port": port})
@@ -130,51 +134,36 @@ class GuidedPlan(RigPlan):
         return self.described_sensor().medium(self.medium).kind == "air"
 
     def setting(self) -> Setting:
-        """How the target is seen.
-
-        Raises
-        ------
-        DescriptionError
-            Sensor, medium or target are not valid.
-        """
+        """How the target is seen; DescriptionError where sensor, medium or target are not valid."""
         sensor = self.described_sensor()
         medium = sensor.medium(self.medium)
         mounted = medium.kind != "air" if self.window_mounted is None else self.window_mounted
-        approaching = self.stage is None or self.stage.direction[2] > 0
         return Setting(
             sensor=sensor if mounted else without_window(sensor),
             target=parse_target(self.target),
             medium=medium,
             poses=self.poses,
-            approaching=approaching,
+            approaching=self.stage is None or self.stage.direction[2] > 0,
         )
 
-    def target_header(self, name: str, *, provenance: Table) -> CaptureHeader:
+    def target_header(self, name: str) -> CaptureHeader:
         """Header of the capture of the target; errors as `setting`."""
         sensor, direction = self.setting().sensor, (self.stage or GuidedStage()).direction
-        return self.capture_header(
-            name, sensor, medium=self.medium, direction=direction, provenance=provenance, target=self.target
-        )
+        return self.capture_header(name, sensor, medium=self.medium, direction=direction, target=self.target)
 
-    def step_header(self, name: str, step: GuidedStep, *, provenance: Table) -> CaptureHeader:
+    def step_header(self, name: str, step: GuidedStep) -> CaptureHeader:
         """Header of the capture of the step standard; DescriptionError where sensor or medium are not valid."""
+        artefact = step.standard().model_dump(exclude_none=True)
         return self.capture_header(
-            name,
-            self.described_sensor(),
-            medium=step.medium,
-            direction=step.direction,
-            provenance=provenance,
-            artefact=step.standard().model_dump(exclude_none=True),
+            name, self.described_sensor(), medium=step.medium, direction=step.direction, artefact=artefact
         )
 
 
 def load_guided_plan(path: Path) -> GuidedPlan:
     """Plan in a TOML file; a sensor beside it is found by its file name.
 
-    Raises
-    ------
-    DescriptionError
-        The file is missing, no TOML, or holds an unknown or wrong key; sensor, medium or target are not valid.
+    DescriptionError where the file is missing, no TOML, or holds an unknown or wrong key, or where sensor, medium or
+    target are not valid.
     """
     plan = validated(GuidedPlan, plan_table(path, wanted="sensor and target (docs/how-to/calibrate-live.md)"), path)
     plan.setting()

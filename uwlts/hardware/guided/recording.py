@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -22,11 +21,10 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.attempt import GuidedImages, PoseJudge
 from uwlts.hardware.guided.operator import GuidedPage, Operator
-from uwlts.hardware.guided.phases import Session, StepJudge, StepPhase, TargetPhase, places_left, still_missing
+from uwlts.hardware.guided.phases import PoseJudge, Session, StepJudge, StepPhase, TargetPhase, still_missing
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep, load_guided_plan
-from uwlts.hardware.rig import HandSwitchedLaser, Rig, provenance_of
+from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, with_provenance
 from uwlts.hardware.scanning import check_camera, left_over
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import DescriptionError
@@ -99,7 +97,6 @@ def record_guided(
     page = GuidedPage(described.title, port=port)
     try:
         report(f"open {page.address}; Ctrl-C ends it, what was accepted is kept")
-        operator = Operator(report, button=page.pressed)
         options = CalibrationOptions(
             refractions=refractions, poses=described.poses, camera=CameraOptions(distortion=distortion)
         )
@@ -144,24 +141,22 @@ class _Phases:
 
     def target(self, path: Path) -> State:
         """Record the target; how far that leads."""
-        judge = PoseJudge(self.setting, self.plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
+        plan = self.plan
+        judge = PoseJudge(self.setting, plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
         left = self._left(path)
         state = judge.state([] if left is None else judge.recorded(left))
         if left == path:
-            if not self._to_go_on(state):
+            if plan.poses == "free":
+                more = bool(still_missing(state)) and len(state.recorded) < plan.most_images
+            else:
+                more = bool(plan.places_left(state.recorded))
+            if not more:
                 self.operator.say(f"{path.name} is complete: {len(state.recorded)} poses")
                 return state
             os.replace(path, part_path(path))
-        stage = self.plan.stage
-        positions = [] if self.plan.poses == "free" or stage is None else stage.places_mm()
-        with self._session(path, positions, partial(self.plan.target_header, path.stem)) as session:
-            return TargetPhase(self.plan, session, judge).run(state)
-
-    def _to_go_on(self, state: State) -> bool:
-        """Whether a finished recording of the target is not enough, and more poses can be taken."""
-        if self.plan.poses == "free":
-            return bool(still_missing(state)) and len(state.recorded) < self.plan.most_images
-        return bool(places_left(self.plan, state))
+        positions = plan.places_left([])
+        with self._session(path, positions, plan.target_header(path.stem)) as session:
+            return TargetPhase(plan, session, judge).run(state)
 
     def step(self, path: Path, step: GuidedStep, judge: StepJudge) -> list[str]:
         """Record the step standard; what is missing of it."""
@@ -175,32 +170,30 @@ class _Phases:
         request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
         self.page.request(request)
         self.operator.wait(request)
-        header = partial(self.plan.step_header, path.stem, step)
-        with self._session(path, list(step.positions_mm), header) as session:
+        with self._session(path, list(step.positions_mm), self.plan.step_header(path.stem, step)) as session:
             seen = StepPhase(judge, session).run(seen)
         count = len(apart_mm(seen, judge.sensor))
         return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
 
     @contextmanager
-    def _session(
-        self, path: Path, positions_mm: list[float], header: Callable[..., CaptureHeader]
-    ) -> Iterator[Session]:
-        """Camera and stage, ready to record a capture with a ``header(provenance=...)``."""
+    def _session(self, path: Path, positions_mm: list[float], header: CaptureHeader) -> Iterator[Session]:
+        """Camera and stage, ready to record a capture."""
         sensor = self.setting.sensor
         with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
             check_camera(camera, sensor)
             version = f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none"
-            described = header(provenance=provenance_of(self.plan, camera, source="guided calibration", stage=version))
+            header = with_provenance(header, self.plan, camera, source="guided calibration", stage=version)
             dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
             ahead = positions_mm[-1] - positions_mm[0] if positions_mm else 1.0
             rig = Rig(self.plan, self.plan.stage or GuidedStage(), sensor, camera, stage, ahead=ahead)
             known, before_s = left_over(path) if self.resume else ({}, 0.0)
-            images = GuidedImages(rig, self.plan, dtype=dtype, known_ms=known)
-            with CaptureWriter(path, described, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
-                yield Session(images, self.operator, self.page, writer, before_s=before_s)
+            with CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
+                yield Session(
+                    rig, self.plan, writer, self.operator, self.page, dtype=dtype, known_ms=known, before_s=before_s
+                )
 
     @contextmanager
-    def _stage(self, positions_mm: list[float]) -> Iterator[GrblStage | HandSwitchedLaser]:
+    def _stage(self, positions_mm: list[float]) -> Iterator[LaserStage]:
         planned = self.plan.stage
         if planned is None or planned.port is None:
             yield HandSwitchedLaser(self.operator.wait)
