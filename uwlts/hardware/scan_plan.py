@@ -17,7 +17,6 @@ from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
 Light = Literal["laser", "lamp"]
-LIGHTS: tuple[Light, ...] = ("laser", "lamp")
 
 
 def _unit(value: Vector) -> Vector:
@@ -77,9 +76,10 @@ class RigPlan(Description):
         """The sensor of the plan, with its window; DescriptionError where it is unknown or not valid."""
         return load_sensor(self.sensor)
 
-    def planned_ms(self, light: Light) -> float | Literal["auto"]:
-        """Exposure in a light."""
-        return self.laser_ms if light == "laser" else self.lamp_ms
+    def planned_ms(self) -> dict[Light, float]:
+        """Exposures of the lights for which they are given."""
+        exposures: tuple[tuple[Light, float | str], ...] = ("laser", self.laser_ms), ("lamp", self.lamp_ms)
+        return {light: ms for light, ms in exposures if not isinstance(ms, str)}
 
     def capture_header(
         self, name: str, sensor: Sensor, *, medium: str, direction: Vector, zero_dn: int = 0, **shown: Table | None

@@ -59,7 +59,6 @@ class Seen:
     saturated: int = 0
     faint: int = 0
     repeated: int = 0
-    images: int = 0
     exposure_ms: dict[Light, float] = field(default_factory=dict)
 
     def warnings(self) -> list[str]:
@@ -232,15 +231,10 @@ class _Taking:
 
     def settle_exposures(self) -> None:
         """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
-        exposures: dict[Light, float] = self._seen.exposure_ms
-        missing: list[Light] = []
-        for light in dict.fromkeys(self._plan.lights):
-            if light not in exposures:
-                planned = self._plan.planned_ms(light)
-                if planned == "auto":
-                    missing.append(light)
-                else:
-                    exposures[light] = planned
+        exposures, planned_ms = self._seen.exposure_ms, self._plan.planned_ms()
+        lights = [light for light in dict.fromkeys(self._plan.lights) if light not in exposures]
+        exposures.update({light: planned_ms[light] for light in lights if light in planned_ms})
+        missing = [light for light in lights if light not in planned_ms]
         looked = spread(self._positions_mm, _EXPOSED_AT)
         further = [position for position in spread(self._positions_mm, LOOKS) if position not in looked]
         for position in looked + further if missing else ():
@@ -283,7 +277,7 @@ class _Taking:
         position = rig.move_to(position_mm)
         image, exposure_ms = rig.image(light, seen.exposure_ms[light])
         bright = brightness(image, self._sensor, light)
-        if bright.overexposed and self._plan.planned_ms(light) == "auto" and self._shorten(light, position_mm):
+        if bright.overexposed and light not in self._plan.planned_ms() and self._shorten(light, position_mm):
             image, exposure_ms = rig.image(light, seen.exposure_ms[light])
             bright = brightness(image, self._sensor, light)
         unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
@@ -292,7 +286,6 @@ class _Taking:
             self._slip.see(Place(position, exposure_ms, centres_of(stripe)))
             self._watch.see(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
-        seen.images += 1
         seen.repeated = rig.repeated
         if zero_dn:
             image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)

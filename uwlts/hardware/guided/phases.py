@@ -40,7 +40,7 @@ from uwlts.calibration.image_quality import (
 from uwlts.hardware.guided.operator import GuidedPage, Operator
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
 from uwlts.hardware.rig import START_MS, Rig
-from uwlts.hardware.scan_plan import LIGHTS, Light, RigPlan
+from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError, TargetError
 from uwlts.model.sensor import Sensor
@@ -80,8 +80,7 @@ class Session:
     ):
         self.rig, self.operator, self.page = rig, operator, page
         self._plan, self._writer, self._dtype = plan, writer, dtype
-        planned_ms: dict[Light, float] = {light: ms for light in LIGHTS if (ms := plan.planned_ms(light)) != "auto"}
-        self._exposure_ms = planned_ms | known_ms
+        self._exposure_ms = plan.planned_ms() | known_ms
         self._start_s = time.monotonic() - before_s
 
     def take(self, light: Light) -> tuple[np.ndarray, float]:
@@ -97,7 +96,7 @@ class Session:
 
     def settle(self, light: Light) -> bool:
         """Find the exposure for what is seen now; whether there is one that was not planned: in the dark is none."""
-        if self._plan.planned_ms(light) != "auto":
+        if light in self._plan.planned_ms():
             return False
         found = self.rig.settled_exposure(light, start_ms=self._exposure_ms.get(light, START_MS))
         if found is not None:
@@ -362,13 +361,8 @@ class TargetPhase:
 
 def _spin(view: TargetView | None, state: State) -> float:
     """How the target is turned in the image, as it was last seen."""
-    if view is not None:
-        pose = pose_of(view, state.camera)
-    elif len(state.poses):
-        pose = state.poses[-1]
-    else:
-        return 0.0
-    return float(np.arctan2(pose[1, 0], pose[0, 0]))
+    poses = [pose_of(view, state.camera)] if view is not None else state.poses[-1:]
+    return float(np.arctan2(poses[0][1, 0], poses[0][0, 0])) if len(poses) else 0.0
 
 
 @dataclass(frozen=True)
