@@ -233,7 +233,7 @@ class _Taking:
         """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
         exposures, planned_ms = self._seen.exposure_ms, self._plan.planned_ms()
         lights: list[Light] = [light for light in dict.fromkeys(self._plan.lights) if light not in exposures]
-        missing = [light for light in lights if light not in planned_ms]
+        missing: list[Light] = [light for light in lights if light not in planned_ms]
         exposures.update({light: planned_ms[light] for light in lights if light in planned_ms})
         looked = spread(self._positions_mm, _EXPOSED_AT)
         further = [position for position in spread(self._positions_mm, LOOKS) if position not in looked]
