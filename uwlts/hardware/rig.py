@@ -205,7 +205,12 @@ class Rig:
     def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
         """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says."""
         self._laser(light == "laser")
-        self._configure(exposure_ms)
+        if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
+            camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
+            camera.stop()
+            camera.configure(exposure_ms=exposure_ms, gain_db=gain_db, bits=bits, trigger="software")
+            camera.start(faults="raise")
+            self._exposure_ms = exposure_ms
         frame = self._grab()
         return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
 
@@ -218,15 +223,6 @@ class Rig:
     def _laser(self, on: bool) -> None:
         if (self._stage.laser_power > 0) != on:
             self._stage.laser(on, power=self._plan.laser_power)
-
-    def _configure(self, exposure_ms: float) -> None:
-        if self._exposure_ms is not None and abs(self._exposure_ms / exposure_ms - 1) < 1e-6:
-            return
-        bits = self._sensor.detector.bits
-        self._camera.stop()
-        self._camera.configure(exposure_ms=exposure_ms, gain_db=self._plan.gain_db, bits=bits, trigger="software")
-        self._camera.start(faults="raise")
-        self._exposure_ms = exposure_ms
 
     def _grab(self) -> GrabbedFrame:
         """One image; asked for again if its frame was lost, as the stage is at rest. Between tries the laser is off."""

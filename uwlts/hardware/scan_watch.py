@@ -107,7 +107,7 @@ class LaserWatch:
                 self._rig.move_to(here.position_mm)
                 return
         if self.lit is None:
-            raise no_light(self._positions_mm, here.exposure_ms)
+            raise self.no_light(here.exposure_ms)
         passed = self._without - 1
         also = f"; the {passed} images before this one were without a stripe too" if passed else ""
         raise HardwareError(
@@ -115,15 +115,14 @@ class LaserWatch:
             f"laser on and off show the same{also}. Check its supply, key and interlock, then go on with --resume"
         )
 
-
-def no_light(positions_mm: Sequence[float], exposure_ms: float) -> HardwareError:
-    """The error of a scan that sees no stripe anywhere."""
-    looked = spread(positions_mm, LOOKS)
-    return HardwareError(
-        f"no laser light at any of {len(looked)} positions from {looked[0]:g} to {looked[-1]:g} mm, exposed by "
-        f"{exposure_ms:.3g} ms: images with the laser on and off show the same. Is the laser lit (supply, key, "
-        "interlock), the object in the volume, the lens open?"
-    )
+    def no_light(self, exposure_ms: float) -> HardwareError:
+        """The error of a scan that sees no stripe anywhere."""
+        looked = spread(self._positions_mm, LOOKS)
+        return HardwareError(
+            f"no laser light at any of {len(looked)} positions from {looked[0]:g} to {looked[-1]:g} mm, exposed by "
+            f"{exposure_ms:.3g} ms: images with the laser on and off show the same. Is the laser lit (supply, key, "
+            "interlock), the object in the volume, the lens open?"
+        )
 
 
 LARGEST_MM = 0.05

@@ -20,17 +20,7 @@ from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
-from uwlts.hardware.scan_watch import (
-    LOOKS,
-    LaserWatch,
-    LitPlace,
-    Place,
-    SlipWatch,
-    centres_of,
-    no_light,
-    shows_laser,
-    spread,
-)
+from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
 from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import load_calibration
@@ -247,7 +237,7 @@ class _Taking:
             if light not in exposures:
                 longest_ms = self._sensor.exposure.longest_ms
                 if light == "laser":
-                    raise no_light(self._positions_mm, longest_ms)
+                    raise self._watch.no_light(longest_ms)
                 exposures[light] = longest_ms
 
     def _settle(self, light: Light, position_mm: float) -> None:
@@ -257,7 +247,7 @@ class _Taking:
             here = brightness(self._rig.image(light, exposures[light])[0], self._sensor, light)
             if here.level <= self._sensor.exposure.auto_level:
                 return
-        exposure_ms = self._settled(light)
+        exposure_ms = self._rig.settled_exposure(light, start_ms=exposures.get(light, START_MS))
         if exposure_ms is None:
             return
         if light == "laser":
@@ -267,9 +257,6 @@ class _Taking:
                 return
             self._watch.lit = LitPlace(position_mm, exposure_ms)
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
-
-    def _settled(self, light: Light) -> float | None:
-        return self._rig.settled_exposure(light, start_ms=self._seen.exposure_ms.get(light, START_MS))
 
     def take(self, position_mm: float, light: Light, *, last: bool) -> tuple[float, np.ndarray, float]:
         """Position read back, image (H, W) as it is stored, and its exposure in ms."""
@@ -310,7 +297,8 @@ class _Taking:
 
     def _shorten(self, light: Light, position_mm: float) -> bool:
         """Settle the exposure of a light again if it turns out to be too long; False if that does not help."""
-        before_ms, shorter_ms = self._seen.exposure_ms[light], self._settled(light)
+        before_ms = self._seen.exposure_ms[light]
+        shorter_ms = self._rig.settled_exposure(light, start_ms=before_ms)
         if shorter_ms is None or shorter_ms >= before_ms:
             return False
         self._seen.exposure_ms[light] = shorter_ms
