@@ -9,7 +9,7 @@ import numpy as np
 
 from twin.design.description import Study
 from twin.design.parameters import followed, parameters_of
-from twin.design.verification import Candidate, Verification, verified
+from twin.design.verification import Candidate, verified
 from twin.options import CPU
 from uwlts.model.library import load_sensor, merged, validated
 from uwlts.model.sensor import Sensor
@@ -52,7 +52,7 @@ def main() -> None:
         study = Study.model_validate(
             {"title": name, "medium": medium, "variables": {"laser.power_mw": {"least": 1.0, "most": 10.0}}}
         )
-        found = verified(Verification(study, Candidate(name, number, built), 2, CPU))
+        found = verified(study, Candidate(name, number, built), workers=2, variant=CPU)
         if found.failure:
             print(f"| {name} | | | | | {found.failure} |", flush=True)
             continue

@@ -10,20 +10,9 @@ from twin.design.description import Study
 from twin.design.designs import Design, built
 from twin.design.figures import scatter_at
 from twin.design.parameters import parameters_of
-from twin.design.verification import (
-    Agreement,
-    CalibrationFigures,
-    Candidate,
-    Rendered,
-    Verification,
-    compared,
-    render,
-    verified,
-)
+from twin.design.verification import Agreement, Candidate, Rendered, compared, render, verified
 from twin.options import CPU
 from uwlts.runtime.workers import open_workers
-
-CALIBRATION = CalibrationFigures(None, None, None, 0.1, 5000.0, 9, 0.01, [])
 
 
 @pytest.fixture
@@ -38,7 +27,7 @@ def study() -> Study:
 def test_formulas_foretell_what_a_rendered_design_measures(study):
     # Unlike the thesis's in baseline, angle, stand-off and volume.
     design = Design(0, {"laser.baseline_mm": 200.0, "laser.triangulation_angle_deg": 30.0})
-    row = verified(Verification(study, Candidate("slim", 0, built(study, design)), 2, CPU))
+    row = verified(study, Candidate("slim", 0, built(study, design)), workers=2, variant=CPU)
     assert row.failure == ""
     assert row.agrees and row.ratio < 1.25
     found, foretold = np.array(row.rendered_mm), np.array(row.predicted_mm)
@@ -61,7 +50,6 @@ def test_a_disagreement_is_reported(study, thesis):
             error_mm=np.zeros(5),
             line_mm=np.full(5, 120.0),
             exposure_ms=1.0,
-            calibration=CALIBRATION,
             seconds={"render": 1.0},
         )
         return compared(study, Candidate("thesis", -1, thesis), rendered)
@@ -104,10 +92,10 @@ def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkey
     assert other.ratio == 1.25 and len(list(folder.iterdir())) == 2
 
 
-def _counted(job: Verification) -> Agreement:
-    first = job.candidate.label != "renamed"
+def _counted(study: Study, candidate: Candidate, **options: object) -> Agreement:
+    first = candidate.label != "renamed"
     return Agreement(
-        job.candidate.label,
+        candidate.label,
         -1,
         z_mm=[1.0],
         predicted_mm=[1.0],

@@ -1,5 +1,7 @@
 """Verification of designs by rendering: layout for unlike sensors, the comparison with the plane, and one whole run."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -229,9 +231,11 @@ def test_the_thesiss_sensor_measures_a_plane_in_water(thesis, tmp_path):
     assert (np.diff(found.line_mm) > 0).all()
     assert ((found.line_mm > 100) & (found.line_mm < 220)).all()
     # Seven step images give the window's distance with a standard deviation of 0.07 mm; seven of them.
-    assert found.calibration.window_mm == pytest.approx(thesis.camera.window.distance_mm, abs=0.5)
-    assert found.calibration.focal_length_px == pytest.approx(thesis.camera.focal_length_px(), rel=1e-3)
-    assert found.calibration.target_images == TARGET_POSES and found.calibration.warnings == []
+    calibration = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))
+    residuals = calibration["residuals"]
+    assert residuals["window"]["distance_mm"] == pytest.approx(thesis.camera.window.distance_mm, abs=0.5)
+    assert calibration["camera"]["fx_px"] == pytest.approx(thesis.camera.focal_length_px(), rel=1e-3)
+    assert residuals["camera"]["images"] == TARGET_POSES and calibration["provenance"]["warnings"] == []
     assert 0 < found.exposure_ms < thesis.exposure.longest_ms
     assert set(found.seconds) == {"render", "calibrate", "measure"}
     assert [path.name for path in tmp_path.iterdir()] == ["calibration.json"]

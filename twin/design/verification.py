@@ -7,15 +7,15 @@ scatter with what the formulas predict.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +29,8 @@ from twin.design.parameters import parameters_of
 from twin.design.screening import made_folder
 from twin.design.verification_scenes import Recording, recordings
 from twin.options import CPU, Options, use_variant
-from uwlts.model.errors import (
-    CalibrationError,
-    CaptureError,
-    DescriptionError,
-    Error,
-    EvaluationError,
-    OutputError,
-    SetupError,
-)
+from uwlts.model import errors
+from uwlts.model.errors import Error
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import Lost, Workers, work_through
 from uwlts.storage.capture import Capture, part_path
@@ -51,38 +44,16 @@ _LARGEST_RESIDUAL = 5.0
 _MAD_TO_STD = 1.4826
 
 
-@dataclass(frozen=True)
-class CalibrationFigures:
-    """Figures of a calibration: the window's distance found and the step heights' error with it (None where no window
-    was sought), the residuals of camera and sheet, and warnings."""
-
-    window_mm: float | None
-    window_std_mm: float | None
-    step_rms_mm: float | None
-    camera_rms_px: float
-    focal_length_px: float
-    target_images: int
-    sheet_rms_mm: float
-    warnings: list[str]
-
-
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """What a sensor measures of a plane square to the laser's axis, at K depths.
+    """Measurements of a plane square to the laser's axis at K depths; arrays (K,).
 
-    Attributes
-    ----------
-    z_mm : (K,)
-        True Z of the plane in the OCS, ascending.
-    points : (K,) int
-        Points found at each depth, including outliers.
-    scatter_mm, error_mm : (K,)
-        Along Z: standard deviation of the points about the profile's own quadratic trend (the random part), and their
-        mean deviation from the true plane (the systematic part, with the error of the calibrated OCS's origin, which
-        moves all depths alike). Outliers, farther from the trend than five robust standard deviations, are left out.
-        NaN where fewer than 20 points were found.
-    line_mm : (K,)
-        Length along Y over which points were found, without outliers; 0 where there are fewer than 20.
+    ``z_mm`` is the plane's true Z in the OCS, ascending; ``points`` counts the points found, outliers included.
+    ``scatter_mm`` is their standard deviation along Z about the profile's own quadratic trend (the random part),
+    ``error_mm`` their mean deviation along Z from the true plane (the systematic part, with the error of the calibrated
+    OCS's origin, which moves all depths alike), ``line_mm`` the length along Y over which they were found. Outliers,
+    farther from the trend than five robust standard deviations, are left out of these. Where fewer than 20 points were
+    found, scatter and error are NaN and the length is 0.
     """
 
     z_mm: np.ndarray
@@ -97,7 +68,6 @@ class Rendered(Profiles):
     """Profiles of a rendered sensor, exposure of the plane's images, and seconds to render, calibrate and measure."""
 
     exposure_ms: float
-    calibration: CalibrationFigures
     seconds: dict[str, float]
 
 
@@ -133,40 +103,40 @@ def verify(
         A process was ended from outside, or the machine cannot render.
     """
     if workers < 1:
-        raise DescriptionError(f"workers is {workers}; it must be at least 1")
+        raise errors.DescriptionError(f"workers is {workers}; it must be at least 1")
     planned = recordings(sensor, medium, reflectance=reflectance)
     calibration, cloud = folder / "calibration.json", folder / "standard.ply"
     made_folder(folder)
     try:
         calibration.unlink(missing_ok=True)  # one of an earlier run must not pass for this one's
     except OSError as error:
-        raise OutputError(f"cannot replace {calibration}: {error.strerror}") from error
+        raise errors.OutputError(f"cannot replace {calibration}: {error.strerror}") from error
     # Noise must differ between recordings: each has a seed of its own.
-    seeds = [int(np.random.SeedSequence([seed, k]).generate_state(1)[0]) for k in range(len(planned.all()))]
     jobs = [
-        _Job(recording, _capture(folder, recording), Options(spp=spp, seed=one), variant)
-        for recording, one in zip(planned.all(), seeds, strict=True)
+        (recording, Options(spp=spp, seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
+        for k, recording in enumerate(planned.all())
     ]
     seconds: dict[str, float] = {}
     try:
         with _timed(seconds, "render"):
-            work_through(_record, jobs, workers=min(workers, len(jobs)))
+            work_through(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
         with _timed(seconds, "calibrate"):
             steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
             target = str(_capture(folder, planned.target))
-            _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=CalibrationError)
+            _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
         with _timed(seconds, "measure"):
             capture = _capture(folder, planned.standard)
             known = ("--calibration", str(calibration), "--out", str(cloud))
-            _run("reconstruct", str(capture), *known, fails_as=CaptureError)
+            _run("reconstruct", str(capture), *known, fails_as=errors.CaptureError)
             with Capture(capture) as opened:
                 exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
             profiles = _judged(_points(cloud), stage)
     finally:
         if not keep:
-            for path in (cloud, *(path for job in jobs for path in job.files())):
+            captures = [_capture(folder, recording) for recording in planned.all()]
+            for path in (cloud, *captures, *map(truth_path, captures), *map(part_path, captures)):
                 path.unlink(missing_ok=True)
-    return Rendered(**vars(profiles), exposure_ms=exposure, calibration=_figures(calibration), seconds=seconds)
+    return Rendered(**vars(profiles), exposure_ms=exposure, seconds=seconds)
 
 
 @contextmanager
@@ -176,44 +146,26 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     seconds[name] = time.perf_counter() - begun
 
 
-# --- the twin's part --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Job:
-    """A recording to render into a file, one of several rendered at the same time."""
-
-    recording: Recording
-    path: Path
-    options: Options
-    variant: str
-
-    def files(self) -> tuple[Path, Path, Path]:
-        """Capture, truth and unfinished capture."""
-        return self.path, truth_path(self.path), part_path(self.path)
-
-
 def _capture(folder: Path, recording: Recording) -> Path:
     return folder / f"{recording.name}.h5"
 
 
-def _record(job: _Job, report: Callable[[object], None]) -> None:
-    use_variant(job.variant)
+def _record(folder: Path, variant: str, job: tuple[Recording, Options], report: Callable[[object], None]) -> None:
+    """Render a recording into its file, one of several rendered at the same time."""
+    use_variant(variant)
     import drjit as dr
 
     from twin.recording.studio import record_scene
 
-    recording, threads = job.recording, dr.thread_count()
+    (recording, options), threads = job, dr.thread_count()
     dr.set_thread_count(1)
     try:
-        record_scene(recording.scene, recording.sensor, job.path, options=job.options, overwrite=True)
+        path = _capture(folder, recording)
+        record_scene(recording.scene, recording.sensor, path, options=options, overwrite=True)
     except Error as error:
         raise type(error)(f"{recording.scene.title}: {error}") from error
     finally:
         dr.set_thread_count(threads)
-
-
-# --- the sensor's software --------------------------------------------------------------------------------------------
 
 
 def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
@@ -225,27 +177,7 @@ def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
     said = done.stderr.strip().splitlines() or ["it says nothing"]
     if done.returncode == _USER_ERROR:
         raise fails_as(said[-1].removeprefix("error: "))
-    raise SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
-
-
-def _figures(path: Path) -> CalibrationFigures:
-    """Figures of a calibration file."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    camera, sheet = content["residuals"]["camera"], content["residuals"]["sheet"]
-    window = content["residuals"].get("window")
-    return CalibrationFigures(
-        window_mm=window and window["distance_mm"],
-        window_std_mm=window and window["std_mm"],
-        step_rms_mm=window and float(np.sqrt(np.mean(np.square(window["errors_mm"])))),
-        camera_rms_px=camera["rms_px"],
-        focal_length_px=content["camera"]["fx_px"],
-        target_images=camera["images"],
-        sheet_rms_mm=sheet["rms_mm"],
-        warnings=content["provenance"]["warnings"],
-    )
-
-
-# --- the comparison ---------------------------------------------------------------------------------------------------
+    raise errors.SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
 
 
 def _points(cloud: Path) -> np.ndarray:
@@ -254,19 +186,17 @@ def _points(cloud: Path) -> np.ndarray:
         vertices = PlyData.read(str(cloud))["vertex"].data
         return np.column_stack([vertices[name] for name in ("frame", "y", "z")]).astype(np.float64)
     except (OSError, PlyParseError, ValueError) as error:
-        raise CaptureError(f"{cloud} is not the cloud of the plane standard: {error}") from error
+        raise errors.CaptureError(f"{cloud} is not the cloud of the plane standard: {error}") from error
 
 
 def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Profiles:
-    """Profiles, nearest first, from points (N, 3) with frame, Y and Z about the plane Z = 0.
-
-    The stage stood at ``stage_mm`` (K,) along Z.
-    """
+    """Profiles, nearest first, from points (N, 3) with frame, Y and Z about the plane Z = 0, the stage at ``stage_mm``
+    (K,) along Z."""
     order = np.argsort(-stage_mm)
     found = [points[points[:, 0] == frame, 1:] for frame in order]
     enough = [len(profile) >= _FEWEST_POINTS for profile in found]
     if not any(enough):
-        raise EvaluationError(
+        raise errors.EvaluationError(
             f"the plane standard shows {len(points)} points at {len(order)} depths, at least {_FEWEST_POINTS} are "
             "needed at one depth: check that the stripe is bright enough and in focus"
         )
@@ -305,17 +235,6 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Verification:
-    """A job: a candidate of a study, the number of processes it may use, the Mitsuba variant, and the seed."""
-
-    study: Study
-    candidate: Candidate
-    workers: int
-    variant: str
-    seed: int = 0
-
-
-@dataclass(frozen=True)
 class Agreement:
     """Rendered and predicted scatter of a candidate at depths Z, and whether they agree.
 
@@ -340,20 +259,12 @@ class Agreement:
     failure: str = ""
 
 
-def verified(job: Verification) -> Agreement:
-    """Render a candidate and compare its scatter with the predicted one."""
-    study, candidate = job.study, job.candidate
+def verified(study: Study, candidate: Candidate, *, workers: int, variant: str) -> Agreement:
+    """Render a candidate of a study in so many processes and compare its scatter with the predicted one."""
+    options = {"reflectance": study.reflectance, "variant": variant, "workers": workers}
     try:
         with tempfile.TemporaryDirectory(prefix="verify-") as folder:
-            rendered = verify(
-                candidate.sensor,
-                study.medium,
-                Path(folder),
-                reflectance=study.reflectance,
-                seed=job.seed,
-                variant=job.variant,
-                workers=job.workers,
-            )
+            rendered = verify(candidate.sensor, study.medium, Path(folder), **options)
     except (Error, OSError) as error:
         return Agreement(candidate.label, candidate.number, failure=str(error))
     return compared(study, candidate, rendered)
@@ -367,9 +278,8 @@ def compared(study: Study, candidate: Candidate, rendered: Rendered) -> Agreemen
     found = np.isfinite(rendered.scatter_mm) & (predicted > 0)
     ratio = math.nan
     if found.any():
-        squares = [
-            np.average(sigma[found] ** 2, weights=rendered.points[found]) for sigma in (rendered.scatter_mm, predicted)
-        ]
+        weights = rendered.points[found]
+        squares = [np.average(sigma[found] ** 2, weights=weights) for sigma in (rendered.scatter_mm, predicted)]
         ratio = math.sqrt(squares[0] / squares[1])
     factor = max(ratio, 1 / ratio)
     return Agreement(
@@ -410,16 +320,22 @@ def render(
         The workers' cluster is gone.
     """
     made_folder(folder)
-    paths = [folder / f"{_digest(study, candidate, variant)}.parquet" for candidate in candidates]
-    known = {place: kept for place, path in enumerate(paths) if (kept := _kept_in(path)) and not kept.failure}
+    paths = []
+    for candidate in candidates:
+        what = "\n".join([candidate.sensor.model_dump_json(), study.medium, repr(study.reflectance), variant])
+        paths.append(folder / f"{hashlib.sha256(what.encode()).hexdigest()[:16]}.parquet")
+    known: dict[int, Agreement] = {}
+    for place, path in enumerate(paths):
+        with suppress(pa.ArrowInvalid, OSError):  # a file that is missing or damaged
+            kept = Agreement(**pq.read_table(path).to_pylist()[0])
+            known |= {} if kept.failure else {place: kept}
     waiting = [place for place in range(len(candidates)) if place not in known]
-    each = workers.processes_for(len(waiting))
-    jobs = {place: Verification(study, candidates[place], each, variant) for place in waiting}
+    work = partial(verified, study, workers=workers.processes_for(len(waiting)), variant=variant)
     progress(len(known), len(candidates))
-    for job, result in workers.completed(verified, jobs.values()):
-        place = next(place for place, one in jobs.items() if one is job)
+    for candidate, result in workers.completed(work, [candidates[place] for place in waiting]):
+        place = next(place for place in waiting if candidates[place] is candidate)
         if isinstance(result, Lost):
-            result = Agreement(job.candidate.label, job.candidate.number, failure=result.reason)
+            result = Agreement(candidate.label, candidate.number, failure=result.reason)
         with written_aside(paths[place], overwrite=True) as aside:
             pq.write_table(pa.Table.from_pylist([asdict(result)]), aside)
         known[place] = result
@@ -429,17 +345,3 @@ def render(
         replace(known[place], label=one.label, design=one.number, agrees=known[place].ratio <= study.verify_tolerance)
         for place, one in enumerate(candidates)
     ]
-
-
-def _kept_in(path: Path) -> Agreement | None:
-    """The result that a file holds, None if there is none."""
-    try:
-        return Agreement(**pq.read_table(path).to_pylist()[0]) if path.is_file() else None
-    except (pa.ArrowInvalid, OSError):
-        return None
-
-
-def _digest(study: Study, candidate: Candidate, variant: str) -> str:
-    """A name for what is rendered."""
-    what = (candidate.sensor.model_dump_json(), study.medium, repr(study.reflectance), variant)
-    return hashlib.sha256("\n".join(what).encode()).hexdigest()[:16]
