@@ -155,8 +155,7 @@ class Study(Description):
 
     @model_validator(mode="after")
     def _figures_known(self) -> Study:
-        asked = [objective.figure for objective in self.objectives] + list(self.constraints)
-        if unknown := [name for name in asked if name not in FIGURES]:
+        if unknown := [name for name in self.wanted() if name not in FIGURES]:
             raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
         if not self.variables and not self.choices:
             raise ValueError("nothing is free: give variables or choices")
@@ -192,6 +191,10 @@ class Study(Description):
     def free(self) -> dict[str, Variable]:
         """All that is free, in order: variables, then choices by the names of their options."""
         return self.variables | {name: Variable(values=tuple(options)) for name, options in self.choices.items()}
+
+    def wanted(self) -> list[str]:
+        """Figures of the objectives and of the constraints, in this order."""
+        return list(dict.fromkeys([*(objective.figure for objective in self.objectives), *self.constraints]))
 
     def medium_of(self, sensor: Sensor) -> Medium:
         """The study's medium of a sensor."""

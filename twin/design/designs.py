@@ -49,6 +49,11 @@ class EvaluatedDesign:
         ends = {"violation": self.violation, "failure": self.failure}
         return {"design": self.number} | self.values | self.figures | ends
 
+    def number_of(self, name: str) -> float:
+        """A number by the name of its column, NaN where the design has none."""
+        value = self.table().get(name)
+        return math.nan if value is None or isinstance(value, str) else value
+
 
 @dataclass(frozen=True)
 class Marked:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
+from functools import partial
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +63,6 @@ class Field:
     in_view: Array
     exposure_ms: Array
     required_ms: Array
-    standoff_mm: Array
 
 
 def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
@@ -155,7 +156,6 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
         in_view=inside,
         exposure_ms=used,
         required_ms=required,
-        standoff_mm=standoff,
     )
 
 
@@ -173,6 +173,11 @@ def _largest(xp: ModuleType, values: Array, where: Array) -> Array:
     return xp.max(values)
 
 
+def _figure(words: str, unit: str = "mm") -> Any:
+    """A field of `Figures`, with its words and its unit on pages."""
+    return field(metadata={"words": words, "unit": unit})
+
+
 @dataclass(frozen=True)
 class Figures:
     """Figures of merit of N designs, one array (N,) each.
@@ -180,41 +185,46 @@ class Figures:
     Depths are counted along the camera's axis from the window's outer face. Sigmas are standard uncertainties: the
     largest in the part of the measuring volume that the camera sees, and ``sigma_z_rms_mm`` the root mean square over
     it; near, middle and far are the ends and the middle of that part. Z runs along the laser's axis, Y along the
-    stripe, X across the sheet, along the stage.
+    stripe, X across the sheet, along the stage. Sigma X comes from the stage's resolution alone, the others from the
+    stripe's noise; what is given per pixel holds in the middle of the volume.
     """
 
-    sigma_x_mm: np.ndarray  # by the stage's resolution alone, the others by the stripe's noise
-    sigma_y_mm: np.ndarray
-    sigma_z_mm: np.ndarray
-    sigma_z_rms_mm: np.ndarray
-    sigma_z_near_mm: np.ndarray  # root mean squares along the stripe
-    sigma_z_middle_mm: np.ndarray
-    sigma_z_far_mm: np.ndarray
-    depth_per_px_mm: np.ndarray  # Z and Y per pixel, in the middle
-    along_per_px_mm: np.ndarray
-    coverage: np.ndarray  # share of the volume that camera and laser reach
-    standoff_mm: np.ndarray  # where the sheet crosses the camera's axis
-    near_mm: np.ndarray  # depths of the volume's ends, and their difference
-    far_mm: np.ndarray
-    depth_mm: np.ndarray
-    line_near_mm: np.ndarray  # lengths of the stripe at near end, middle and far end
-    line_mm: np.ndarray
-    line_far_mm: np.ndarray
-    section_cm2: np.ndarray  # area of the sheet that the camera sees
-    occlusion_deg: np.ndarray  # largest angle between laser's and camera's rays: steeper walls hide one from the other
-    signal_e: np.ndarray  # faintest in the volume
-    exposure_ms: np.ndarray  # as used
-    required_ms: np.ndarray  # that the wanted brightness takes
-    stripe_px: np.ndarray  # standard deviation of the stripe's image, largest in the volume; the lens's part of it
-    blur_px: np.ndarray
-    centre_px: np.ndarray  # standard uncertainty of the stripe's centre, largest in the volume
-    speckle_limit_mm: np.ndarray  # Dorsch's limit along Z in the middle of the volume, for depolarised light
-    laser_class: np.ndarray  # number of the class after IEC 60825-1, see `CLASS_NAMES` and `laser_class`
-    window_mm: np.ndarray  # thickness that the camera's window needs for the pressure at the study's depth
-    baseline_mm: np.ndarray  # width of the sensor
+    sigma_x_mm: np.ndarray = _figure("σ X, by the stage")
+    sigma_y_mm: np.ndarray = _figure("σ Y, largest in the volume")
+    sigma_z_mm: np.ndarray = _figure("σ Z, largest in the volume")
+    sigma_z_rms_mm: np.ndarray = _figure("σ Z, rms over the volume")
+    sigma_z_near_mm: np.ndarray = _figure("σ Z at the near end")  # root mean squares along the stripe
+    sigma_z_middle_mm: np.ndarray = _figure("σ Z in the middle")
+    sigma_z_far_mm: np.ndarray = _figure("σ Z at the far end")
+    depth_per_px_mm: np.ndarray = _figure("depth per pixel", "mm/px")
+    along_per_px_mm: np.ndarray = _figure("length along the stripe per pixel", "mm/px")
+    coverage: np.ndarray = _figure("share of the volume in reach", "")  # of camera and laser
+    standoff_mm: np.ndarray = _figure("stand-off")  # where the sheet crosses the camera's axis
+    near_mm: np.ndarray = _figure("near end of the volume")
+    far_mm: np.ndarray = _figure("far end of the volume")
+    depth_mm: np.ndarray = _figure("depth of the volume")
+    line_near_mm: np.ndarray = _figure("line length at the near end")
+    line_mm: np.ndarray = _figure("line length in the middle")
+    line_far_mm: np.ndarray = _figure("line length at the far end")
+    section_cm2: np.ndarray = _figure("area of the sheet in the volume", "cm²")  # that the camera sees
+    # Largest angle between laser's and camera's rays: steeper walls hide one from the other.
+    occlusion_deg: np.ndarray = _figure("occlusion angle, largest", "°")
+    signal_e: np.ndarray = _figure("faintest signal", "e⁻")
+    exposure_ms: np.ndarray = _figure("exposure", "ms")  # as used
+    required_ms: np.ndarray = _figure("exposure required", "ms")  # that the wanted brightness takes
+    stripe_px: np.ndarray = _figure("width of the stripe's image (σ)", "px")  # largest in the volume, as the next two
+    blur_px: np.ndarray = _figure("the lens's blur (σ)", "px")
+    centre_px: np.ndarray = _figure("σ of the stripe's centre", "px")
+    speckle_limit_mm: np.ndarray = _figure("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
+    laser_class: np.ndarray = _figure("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
+    window_mm: np.ndarray = _figure("window thickness needed")  # for the pressure at the study's depth
+    baseline_mm: np.ndarray = _figure("width of the sensor")
 
 
-FIGURES = tuple(field.name for field in fields(Figures))
+FIGURES: dict[str, tuple[str, str]] = {
+    one.name: (one.metadata["words"], one.metadata["unit"]) for one in fields(Figures)
+}
+"""Words and unit of every figure of merit, by its name."""
 
 
 def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
@@ -244,19 +254,22 @@ def figures_of(
         depths = near + (far - near) * np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
         places = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
         f = field_of(np, p, depths, places, reflectance=reflectance)
-        shape = np.broadcast_shapes(f.sigma_z_mm.shape, (len(np.atleast_1d(p.near_mm.ravel())), DEPTHS, PLACES))
-        full = {
-            one.name: np.broadcast_to(np.asarray(getattr(f, one.name), dtype=float), shape) for one in fields(Field)
-        }
+        shape = np.broadcast_shapes(f.sigma_z_mm.shape, (p.near_mm.size, DEPTHS, PLACES))
+        full = {name: np.broadcast_to(np.asarray(values, dtype=float), shape) for name, values in vars(f).items()}
         figures = _reduced(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
         reasons = _reasons(p, figures, full)
     return figures, reasons
 
 
+def _each(values: Array, designs: int) -> np.ndarray:
+    """One number (N,) per design."""
+    return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (designs,)).copy()
+
+
 def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
-    n = len(f["z_mm"])
-    inside = f["lit"] > 0
-    middle = DEPTHS // 2
+    """Figures of N designs from their fields (N, DEPTHS, PLACES) and the share of the volume's depth in view."""
+    n, middle, inside = len(f["z_mm"]), DEPTHS // 2, f["lit"] > 0
+    one = partial(_each, designs=n)
 
     def worst(name: str) -> np.ndarray:
         return np.where(inside, f[name], -np.inf).max(axis=(1, 2))
@@ -264,35 +277,29 @@ def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, wate
     def rms(values: np.ndarray, where: np.ndarray) -> np.ndarray:
         return np.sqrt(np.where(where, values**2, 0.0).sum(axis=-1) / where.sum(axis=-1))
 
-    def one(values: object) -> np.ndarray:
-        return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (n,)).copy()
-
     per_depth = rms(f["sigma_z_mm"], inside)
-    flat = f["sigma_z_mm"].reshape(n, -1), inside.reshape(n, -1)
     line = np.where(inside.any(axis=2), 2 * f["half_line_mm"][:, :, 0], 0.0)
-    z = f["z_mm"][:, :, 0]
-    at = (slice(None), middle, PLACES // 2)
-    contrast = p.speckle_coherence / math.sqrt(2)
-    speckle_px = contrast * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
+    at, pose = (slice(None), middle, PLACES // 2), p.pose(np)
+    speckle_px = p.speckle_coherence / math.sqrt(2) * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
     return Figures(
         sigma_x_mm=one(p.stage_resolution_mm / math.sqrt(12)),
         sigma_y_mm=worst("sigma_y_mm"),
         sigma_z_mm=worst("sigma_z_mm"),
-        sigma_z_rms_mm=rms(*flat),
+        sigma_z_rms_mm=rms(f["sigma_z_mm"].reshape(n, -1), inside.reshape(n, -1)),
         sigma_z_near_mm=per_depth[:, 0],
         sigma_z_middle_mm=per_depth[:, middle],
         sigma_z_far_mm=per_depth[:, -1],
         depth_per_px_mm=f["depth_per_px_mm"][at],
         along_per_px_mm=f["along_per_px_mm"][at],
         coverage=one(np.maximum(share, 0.0)) * inside.mean(axis=(1, 2)),
-        standoff_mm=one(f["standoff_mm"][:, 0, 0] - one(p.outer_mm(np))),
+        standoff_mm=one(standoff_mm(pose) - p.outer_mm(np)),
         near_mm=one(p.near_mm),
         far_mm=one(p.far_mm),
         depth_mm=one(p.far_mm - p.near_mm),
         line_near_mm=line[:, 0],
         line_mm=line[:, middle],
         line_far_mm=line[:, -1],
-        section_cm2=0.01 * np.trapezoid(line, z, axis=1),
+        section_cm2=0.01 * np.trapezoid(line, f["z_mm"][:, :, 0], axis=1),
         occlusion_deg=degrees(worst("occlusion_rad")),
         signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
         exposure_ms=f["exposure_ms"][:, 0, 0],
@@ -303,17 +310,14 @@ def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, wate
         speckle_limit_mm=one(speckle_px) * f["depth_per_px_mm"][at],
         laser_class=one(laser_class(p)),
         window_mm=one(window_needed_mm(p, water_depth_m=water_depth_m)),
-        baseline_mm=one(np.hypot(p.pose(np).origin[0], p.pose(np).origin[1])),
+        baseline_mm=one(np.hypot(*pose.origin[:2])),
     )
 
 
 def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
-    """Why designs cannot work."""
+    """The first reason why each of N designs cannot work, "" for those that can."""
     n = len(figures.coverage)
-
-    def one(values: object) -> np.ndarray:
-        return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (n,))
-
+    one = partial(_each, designs=n)
     corner = np.hypot(p.width_px, p.height_px) / 2 * p.pixel_mm / p.focal_mm
     glass = corner / snell_root(np, p.window_index, corner)
     cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
@@ -321,41 +325,40 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
     inside = spread / snell_root(np, p.laser_window_index, spread)
     fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
     fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
-    nothing = np.zeros(n)
     checks = (
-        (one(p.focus_mm - p.focal_mm) <= 0, "the lens would be focused within its focal length", nothing),
+        (one(p.focus_mm - p.focal_mm) <= 0, None, "the lens would be focused within its focal length"),
         (
             ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5),
-            "the sheet crosses the camera's axis {:.0f} mm behind the window's outer face, not in front of it",
             -figures.standoff_mm,
+            "the sheet crosses the camera's axis {:.0f} mm behind the window's outer face, not in front of it",
         ),
         (
             ~(figures.near_mm > 0),
-            "the measuring volume would begin {:.0f} mm behind the window's outer face",
             -figures.near_mm,
+            "the measuring volume would begin {:.0f} mm behind the window's outer face",
         ),
         (
             cone > one(p.window_aperture_mm),
-            "the cone of view is {:.0f} mm wide at the window's outer face, wider than its opening",
             cone,
+            "the cone of view is {:.0f} mm wide at the window's outer face, wider than its opening",
         ),
         (
             fan > one(p.laser_window_aperture_mm),
-            "the laser's fan is {:.0f} mm wide at its window, wider than its opening",
             fan,
+            "the laser's fan is {:.0f} mm wide at its window, wider than its opening",
         ),
-        (~(figures.coverage > 0), "camera and laser reach no point of the measuring volume", nothing),
-        (fullest > 1, "the stripe saturates: at the given exposure it has {:.1f} times the full well", fullest),
+        (~(figures.coverage > 0), None, "camera and laser reach no point of the measuring volume"),
+        (fullest > 1, fullest, "the stripe saturates: at the given exposure it has {:.1f} times the full well"),
         (
             ~(np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm) < 0.5 * figures.standoff_mm),
+            None,
             "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser",
-            nothing,
         ),
     )
     reasons = [""] * n
-    for failed, text, value in checks:
+    for failed, values, text in checks:
         for i in np.flatnonzero(failed):
-            reasons[i] = reasons[i] or text.format(value[i])
+            reasons[i] = reasons[i] or (text if values is None else text.format(values[i]))
     return reasons
 
 

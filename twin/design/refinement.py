@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from twin.design.description import Study
 from twin.design.designs import Design, sensor_of
 from twin.design.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
-from twin.design.geometry import Array
+from twin.design.geometry import Array, standoff_mm
 from twin.design.parameters import Parameters, followed, numbers_of
 from twin.options import use_variant
 
@@ -83,7 +83,7 @@ SMOOTH: dict[str, Smooth] = {
     "line_mm": _line(MIDDLE),
     "line_far_mm": _line(DEPTHS - 1),
     "required_ms": lambda xp, p, f, mean: f.required_ms,
-    "standoff_mm": lambda xp, p, f, mean: f.standoff_mm - p.outer_mm(xp),
+    "standoff_mm": lambda xp, p, f, mean: standoff_mm(p.pose(xp)) - p.outer_mm(xp),
     "near_mm": lambda xp, p, f, mean: p.near_mm,
     "far_mm": lambda xp, p, f, mean: p.far_mm,
     "depth_mm": lambda xp, p, f, mean: p.far_mm - p.near_mm,

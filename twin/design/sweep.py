@@ -73,8 +73,7 @@ class SweepResult:
     def lines(self) -> list[str]:
         """The result in lines of text for a terminal."""
         lines = ["{} designs, {} work, {} meet all constraints".format(*self.counts()), *self.notes]
-        figures = [o.figure for o in self.study.objectives] + list(self.study.constraints)
-        names = [*self.study.free(), *dict.fromkeys(figures)]
+        names = [*self.study.free(), *self.study.wanted()]
         for one in self.marked:
             table = one.design.table()
             values = (f"{name} {_short(table[name])}" for name in names)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from functools import partial
+from html import escape
 
 import matplotlib
 import numpy as np
@@ -19,7 +20,8 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from twin.design.choice import pareto
-from twin.design.description import Value, Variable
+from twin.design.description import Variable
+from twin.design.designs import Marked
 from twin.design.figures import CLASS_NAMES
 from twin.design.report.tables import (
     Judged,
@@ -35,6 +37,9 @@ from twin.design.report.tables import (
 )
 from twin.design.verification import Agreement
 from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
+
+Static, Interactive = tuple[Figure, str], tuple[go.Figure, str]
+"""A figure for a page, and its caption."""
 
 RED, GREEN, PALE = "#c22f2f", "#2e8b57", "#c3cad2"
 _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
@@ -77,43 +82,14 @@ _BESIDE = 1e-4
 
 _plain_text = matplotlib.rc_context({"text.parse_math": False})
 """Names given by users hold no formulas, whatever dollar signs they have."""
-
-
-Kind = TypeVar("Kind", Figure, go.Figure)
-
-
-@dataclass(frozen=True, eq=False)
-class Chart(Generic[Kind]):
-    """A matplotlib or plotly figure for a page, and its caption."""
-
-    figure: Kind
-    caption: str
-
-
-@dataclass(frozen=True)
-class Point:
-    """A marked design: its label, its values by name, its number among the marked ones, and whether it is chosen."""
-
-    label: str
-    values: Mapping[str, Value | None]
-    number: int
-    chosen: bool
-
-    def value(self, name: str) -> float:
-        """A number of the design, NaN where there is none."""
-        value = self.values.get(name)
-        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
-
-    @property
-    def colour(self) -> str:
-        """Colour of its symbol and label."""
-        return RED if self.chosen else INK
+_escaped = partial(escape, quote=False)
+"""Text in which plotly finds no tags."""
 
 
 def shown_figures(judged: Judged) -> list[str]:
     """Figures to show: objectives, constraints, then the most informative others; those that are known."""
-    names = [o.figure for o in judged.study.objectives] + list(judged.study.constraints) + list(_SHOWN)
-    return [name for name in dict.fromkeys(names) if np.isfinite(judged.figure(name)[judged.works]).any()]
+    names = dict.fromkeys([*judged.study.wanted(), *_SHOWN])
+    return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
 
 
 # --- panels of static figures -----------------------------------------------------------------------------------------
@@ -127,19 +103,23 @@ def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[
     figure, axes = new_figure(_PANEL_INCHES[0] * columns, height * rows, rows=rows, columns=columns)
     for unused in axes[len(names) :]:
         unused.remove()
-    panels = list(zip(axes, names, strict=False))
-    for one, name in panels:
+    for one, name in zip(axes, names, strict=False):
         one.set_title(label_of(name))
-    return figure, panels
+    return figure, list(zip(axes, names, strict=False))
 
 
-def _mark(axes: Axes, points: Sequence[Point], x: str, y: str) -> None:
+def _mark(axes: Axes, marked: Sequence[Marked], x: str, y: str) -> None:
     """Draw marked designs as symbols, the chosen one in red."""
-    for point in points:
-        at, size = (point.value(x), point.value(y)), 10 if point.chosen else 8
+    for number, (one, colour) in enumerate(_coloured(marked)):
+        at, size = (one.design.number_of(x), one.design.number_of(y)), 10 if one is marked[-1] else 8
         if all(map(math.isfinite, at)):
-            style = {"color": point.colour, "markersize": size, "markeredgecolor": "white", "zorder": 6}
-            axes.plot(*at, _SYMBOLS[point.number % len(_SYMBOLS)][1], label=point.label, **style)
+            style = {"color": colour, "markersize": size, "markeredgecolor": "white", "zorder": 6}
+            axes.plot(*at, _SYMBOLS[number % len(_SYMBOLS)][1], label=one.label, **style)
+
+
+def _coloured(marked: Sequence[Marked]) -> list[tuple[Marked, str]]:
+    """Marked designs with the colours of their symbols and labels; the last is the chosen one."""
+    return [(one, RED if one is marked[-1] else INK) for one in marked]
 
 
 def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None:
@@ -156,7 +136,7 @@ def _dashed(judged: Judged) -> str:
 
 
 @_plain_text
-def curves(judged: Judged, marked: Sequence[Point], x: str) -> Chart[Figure]:
+def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
     """Figures over one variable: a curve for every combination of what else is free, or the best of all."""
     others = [name for name in judged.study.free() if name != x]
     groups: dict[str, list[int]] = {}
@@ -178,7 +158,7 @@ def curves(judged: Judged, marked: Sequence[Point], x: str) -> Chart[Figure]:
         axes.set(xlabel=label_of(x), xscale=judged.study.variables[x].scale)
     legend_below(figure)
     missed = "Hollow: misses a constraint. " if (judged.works & ~judged.feasible).any() else ""
-    return Chart(figure, f"{caption}{missed}{_dashed(judged)}".strip())
+    return figure, f"{caption}{missed}{_dashed(judged)}".strip()
 
 
 def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
@@ -187,22 +167,20 @@ def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
 
 def _first_at(judged: Judged, x: str, places: np.ndarray, *, best: bool) -> np.ndarray:
     """Places by ascending x, thinned out where there are many; of the best, which come first, one per interval."""
-    values = np.asarray(judged.columns[x], dtype=float)[places]
+    values = np.asarray(judged.columns[x], dtype=float)
     if best:
-        share = share_of(judged.study.variables[x], values)
+        share = share_of(judged.study.variables[x], values[places])
         places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
-        values = np.asarray(judged.columns[x], dtype=float)[places]
-    places = places[np.argsort(values, kind="stable")]
+    places = places[np.argsort(values[places], kind="stable")]
     return places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_OF_CURVE)).round().astype(int))]
 
 
 @_plain_text
-def bars(judged: Judged) -> Chart[Figure]:
+def bars(judged: Judged) -> Static:
     """Figures of every combination of choices, the best first."""
     places = judged.best_first[:_MOST_BARS]
     labels = [_combination(judged, list(judged.study.free()), place) for place in places]
-    height = max(_PANEL_INCHES[1], _BAR_INCHES * len(places))
-    figure, panels = _panels(shown_figures(judged), height=height)
+    figure, panels = _panels(shown_figures(judged), height=max(_PANEL_INCHES[1], _BAR_INCHES * len(places)))
     for number, (axes, name) in enumerate(panels):
         axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, PALE))
         # Long names stand at the left only.
@@ -211,7 +189,7 @@ def bars(judged: Judged) -> Chart[Figure]:
         _draw_bounds(axes.axvline, judged, name)
     count = f"The best {len(places)} of {int(judged.works.sum()):,} designs." if len(places) == _MOST_BARS else ""
     grey = " Grey: misses a constraint." if not judged.feasible[places].all() else ""
-    return Chart(figure, f"{count}{grey} {_dashed(judged)}".strip())
+    return figure, f"{count}{grey} {_dashed(judged)}".strip()
 
 
 def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
@@ -247,65 +225,42 @@ def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None
 
     A grid shows its designs, others are interpolated linearly. Where more is free, every cell shows its best design.
     """
-    axes = [np.unique(np.asarray(judged.columns[name], dtype=float)) for name in (x, y)]
-    alone = len(judged.study.free()) == 2
+    names, free = (x, y), judged.study.free()
+    variables = [judged.study.variables[name] for name in names]
+    columns = [np.asarray(judged.columns[name], dtype=float) for name in names]
+    axes = [np.unique(column) for column in columns]
     scattered = len(axes[0]) * len(axes[1]) > 2 * len(judged)
-    if scattered and alone:
-        return _interpolated(judged, x, y, figures)
-    variables = [judged.study.variables[name] for name in (x, y)]
-    if scattered:
-        cells = int(np.clip(math.sqrt(len(judged) / _PER_CELL), *_CELLS))
-        axes = [_cell_middles(variable, cells) for variable in variables]
-    else:
-        axes = [
-            found if len(found) <= _MOST_STEPS else _cell_middles(variable, _MOST_STEPS)
-            for found, variable in zip(axes, variables, strict=True)
-        ]
-    return _best_of_cells(judged, (x, y), axes, figures, smooth=not scattered, alone=alone)
-
-
-def _cell_middles(variable: Variable, count: int) -> np.ndarray:
-    return np.array([variable.at((k + 0.5) / count) for k in range(count)])
-
-
-def _best_of_cells(
-    judged: Judged, names: tuple[str, str], axes: list[np.ndarray], figures: Sequence[str], *, smooth: bool, alone: bool
-) -> Map:
-    at = [_nearest(axis, judged.columns[name]) for axis, name in zip(axes, names, strict=True)]
-    cell = at[1] * len(axes[0]) + at[0]
-    best = np.full(len(axes[0]) * len(axes[1]), -1)
+    if scattered and len(free) == 2:
+        shares = [share_of(variable, column) for variable, column in zip(variables, columns, strict=True)]
+        return _interpolated(judged, variables, np.column_stack(shares), figures)
+    cells = int(np.clip(math.sqrt(len(judged) / _PER_CELL), *_CELLS)) if scattered else _MOST_STEPS
+    for k, variable in enumerate(variables):
+        if scattered or len(axes[k]) > cells:
+            axes[k] = np.array([variable.at((cell + 0.5) / cells) for cell in range(cells)])
+    # Every design belongs to the cell of the axes' nearest values.
+    i, j = (np.searchsorted((a[1:] + a[:-1]) / 2, column) for a, column in zip(axes, columns, strict=True))
+    shape = (len(axes[1]), len(axes[0]))
+    best = np.full(shape, -1)
     # Of several designs the last one written stays: failed ones first, then from the worst to the best.
     order = np.concatenate([np.flatnonzero(~judged.works), judged.best_first[::-1]])
-    best[cell[order]] = order
-    shape = (len(axes[1]), len(axes[0]))
-    used = np.where(best >= 0, best, 0)
-    works = (best >= 0) & judged.works[used]
-    values = {name: np.where(works, judged.figure(name)[used], np.nan).reshape(shape) for name in figures}
-    texts = [judged.failures[k] if k >= 0 else "" for k in best]
-    reasons = _reasons(judged, values, np.array(texts, dtype=object).reshape(shape))
-    others = [words_of(name) for name in judged.study.free() if name not in names]
-    caption = (
-        ""
-        if alone
-        else (
+    best[j[order], i[order]] = order
+    works = (best >= 0) & judged.works[best]
+    values = {name: np.where(works, judged.figure(name)[best], np.nan) for name in figures}
+    failures = np.where(best >= 0, np.array(judged.failures, dtype=object)[best], "")
+    caption = ""
+    if others := [words_of(name) for name in free if name not in names]:
+        caption = (
             f"{listed(others).capitalize()} also vary: each place shows the design there that misses the constraints "
             f"least and then has the best {words_of(judged.study.objectives[0].figure)}."
         )
-    )
-    return Map(axes[0], axes[1], values, reasons, smooth=smooth, dots=not smooth, caption=caption)
+    reasons = _reasons(judged, values, failures)
+    return Map(axes[0], axes[1], values, reasons, smooth=not scattered, dots=scattered, caption=caption)
 
 
-def _nearest(axis: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Places of the axis's nearest values."""
-    between = (axis[1:] + axis[:-1]) / 2
-    return np.searchsorted(between, np.asarray(values, dtype=float))
-
-
-def _interpolated(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None:
-    variables = [judged.study.variables[name] for name in (x, y)]
-    places = np.column_stack(
-        [share_of(variable, judged.columns[name]) for variable, name in zip(variables, (x, y), strict=True)]
-    )
+def _interpolated(
+    judged: Judged, variables: Sequence[Variable], places: np.ndarray, figures: Sequence[str]
+) -> Map | None:
+    """The map between designs at ``places`` (N, 2), shares of the variables' ranges."""
     shares = np.linspace(0, 1, _NODES)
     nodes = np.stack(np.meshgrid(shares, shares), axis=-1)
     try:
@@ -320,24 +275,25 @@ def _interpolated(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map
     if not np.isfinite(found[..., 0]).any():
         return None
     values = {name: found[..., k] for k, name in enumerate(figures)}
-    texts = np.array(judged.failures, dtype=object)[nearest]
+    reasons = _reasons(judged, values, np.array(judged.failures, dtype=object)[nearest])
     axes = [np.array([variable.at(share) for share in shares]) for variable in variables]
     caption = f"Interpolated linearly between {int(judged.works.sum()):,} designs (dots); white: too far from any."
-    return Map(axes[0], axes[1], values, _reasons(judged, values, texts), smooth=True, dots=True, caption=caption)
+    return Map(*axes, values, reasons, smooth=True, dots=True, caption=caption)
 
 
 def _reasons(judged: Judged, values: dict[str, np.ndarray], failures: np.ndarray) -> np.ndarray:
     """What is said of places that do not do: why designs fail there, or which constraints they miss."""
-    reasons = np.where(failures.astype(bool), failures, "").astype(object)
+    reasons = failures.astype(object)
     bounded = [name for name in judged.study.constraints if name in values]
     for place in np.ndindex(reasons.shape):
         if not reasons[place] and bounded:
-            reasons[place] = "; ".join(misses(judged.study, {name: float(values[name][place]) for name in bounded}))
+            row = {name: float(values[name][place]) for name in bounded}
+            reasons[place] = "; ".join(text for text, _ in misses(judged.study, row).values())
     return reasons
 
 
 @_plain_text
-def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Chart[Figure] | None:
+def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static | None:
     """The figures over two variables beside each other; None where the designs span no area."""
     figures = shown_figures(judged)
     found = map_of(judged, x, y, figures)
@@ -358,19 +314,20 @@ def contours(judged: Judged, marked: Sequence[Point], x: str, y: str) -> Chart[F
         axes.grid(visible=False)
         axes.set(xlabel=label_of(x), ylabel="" if number % _PANEL_COLUMNS else label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
-        axes.set(xlim=_with_margin(variables[0]), ylim=_with_margin(variables[1]))
+        # Designs on the border of the range are seen wholly.
+        xlim, ylim = ((float(v.at(-_MARGIN)), float(v.at(1 + _MARGIN))) for v in variables)
+        axes.set(xlim=xlim, ylim=ylim)
     legend_below(figure)
     ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
-    outside = [p.label for p in marked if not all(low <= p.value(name) <= high for name, (low, high) in ends.items())]
+    outside = [
+        one.label
+        for one in marked
+        if not all(low <= one.design.number_of(name) <= high for name, (low, high) in ends.items())
+    ]
     beyond = f" Outside the ranges: {listed(outside)}." if outside else ""
     missed = "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
     parts = [found.caption, missed if (found.reasons != "").any() else "", beyond]
-    return Chart(figure, " ".join(part.strip() for part in parts if part))
-
-
-def _with_margin(variable: Variable) -> tuple[float, float]:
-    """Ends of an axis, a little beyond the range so that designs on its border are seen wholly."""
-    return float(variable.at(-_MARGIN)), float(variable.at(1 + _MARGIN))
+    return figure, " ".join(part.strip() for part in parts if part)
 
 
 def _fill(axes: Axes, found: Map, name: str) -> None:
@@ -392,7 +349,7 @@ def _fill(axes: Axes, found: Map, name: str) -> None:
         drawn = axes.pcolormesh(found.x, found.y, values, norm=norm, shading="nearest", rasterized=True)
     ticks = np.geomspace(low, high, 5).tolist() if log else None
     bar = axes.figure.colorbar(drawn, ax=axes, ticks=ticks)
-    if ticks is not None:
+    if ticks:
         bar.set_ticks(ticks, labels=[number_text(tick, 2) for tick in ticks], minor=False)
         bar.ax.minorticks_off()
 
@@ -421,13 +378,12 @@ def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
 
 
 @_plain_text
-def verification_chart(found: Agreement) -> Chart[Figure] | None:
+def verification_chart(found: Agreement) -> Static | None:
     """Scatter as predicted and as rendered, and the systematic error, over Z."""
     if not found.z_mm:
         return None
     figure, (scatter, error) = new_figure(9.6, 3.2, columns=2)
-    z, *values = (np.array(values) for values in (found.z_mm, found.predicted_mm, found.rendered_mm, found.error_mm))
-    predicted, rendered, off = values
+    z, predicted, rendered, off = map(np.array, (found.z_mm, found.predicted_mm, found.rendered_mm, found.error_mm))
     scatter.plot(z, 1e3 * predicted, "o--", markersize=4, label="predicted by formulas")
     scatter.plot(z, 1e3 * rendered, "o-", color=RED, markersize=4, label="rendered and measured")
     error.plot(z, 1e3 * off, "o-", color=INK, markersize=4)
@@ -436,8 +392,7 @@ def verification_chart(found: Agreement) -> Chart[Figure] | None:
     scatter.set_ylim(bottom=0)
     error.set(xlabel="Z from the stand-off (mm)", ylabel="systematic error (µm)")
     legend_below(figure)
-    caption = "Left: standard deviation of the points along Z. Right: their mean distance from the true plane."
-    return Chart(figure, caption)
+    return figure, "Left: standard deviation of the points along Z. Right: their mean distance from the true plane."
 
 
 # --- the Pareto front -------------------------------------------------------------------------------------------------
@@ -462,7 +417,7 @@ def _varies(judged: Judged, name: str) -> bool:
     return len(values) > 1 and float(np.ptp(values)) > 1e-9 * float(np.abs(values).max())
 
 
-def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Chart[go.Figure] | None:
+def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None:
     """All designs that work over two figures, and the front of those that meet the constraints."""
     (x, x_sign), (y, y_sign) = trade_off(judged)
     values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
@@ -472,41 +427,47 @@ def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Chart[go.Figure] | 
     front = pareto(np.where((judged.of_interest & known)[:, None], values, np.nan))
     shown = sample(known, front, MOST_POINTS)
     figure = go.Figure()
-    labels = [escaped(label_of(name)) for name in (x, y)]
+    labels = [_escaped(label_of(name)) for name in (x, y)]
 
-    def add(places: np.ndarray, name: str, *, gl: bool = False, **style: object) -> None:
-        at = {"x": rounded(judged.figure(x)[places]), "y": rounded(judged.figure(y)[places])}
-        figure.add_trace((go.Scattergl if gl else go.Scatter)(**at, name=name, **style))
+    def at(places: np.ndarray) -> dict[str, object]:
+        return {axis: rounded(judged.figure(name)[places]) for axis, name in (("x", x), ("y", y))}
 
     for name, chosen, colour in (
         ("misses a constraint", shown & ~judged.feasible, "#b3bcc6"),
         ("meets all constraints", shown & judged.feasible & ~front, BLUE),
     ):
-        if chosen.any():
-            add(
-                places := np.flatnonzero(chosen),
-                name,
-                gl=len(places) > _IN_SVG,
+        if len(places := np.flatnonzero(chosen)):
+            trace = (go.Scattergl if len(places) > _IN_SVG else go.Scatter)(
+                **at(places),
+                name=name,
                 mode="markers",
                 marker={"color": colour, "size": 4 if shown.sum() > _FEW else 7, "opacity": 0.55},
                 customdata=judged.columns["design"][places].tolist(),
                 hovertemplate=f"design %{{customdata}}<br>{labels[0]}: %{{x}}<br>{labels[1]}: %{{y}}"
                 f"<extra>{name}</extra>",
             )
+            figure.add_trace(trace)
     order = np.flatnonzero(front)[np.argsort(values[front, 0])]
-    add(
-        order,
-        f"Pareto front ({len(order):,} of the designs)",
+    names = list(dict.fromkeys([*judged.study.free(), x, y]))
+    figure.add_scatter(
+        **at(order),
+        name=f"Pareto front ({len(order):,} of the designs)",
         mode="lines+markers",
         line={"color": GREEN, "width": 2},
         marker={"size": 6, "color": GREEN},
-        text=hover_texts(judged, order, x, y),
+        text=[
+            "<br>".join(
+                [f"design {judged.columns['design'][place]}"]
+                + [_escaped(f"{words_of(name)}: {judged.text(name, place)}") for name in names]
+            )
+            for place in order
+        ],
         hovertemplate="%{text}<extra></extra>",
     )
     axis = {"gridcolor": FAINT, "linecolor": INK, "ticks": "outside", "zeroline": False, "automargin": True}
     ends, axes = [], []
     for name, label, distance in zip((x, y), labels, (10, 12), strict=True):
-        numbers = np.append(judged.figure(name)[known], [point.value(name) for point in marked])
+        numbers = np.append(judged.figure(name)[known], [one.design.number_of(name) for one in marked])
         ends.append((float(np.nanmin(numbers)), float(np.nanmax(numbers))))
         log = _LOG_AXIS if 0 < ends[-1][0] * _WIDE_RANGE < ends[-1][1] else {}
         axes.append(axis | {"title": {"text": label, "standoff": distance}} | log)
@@ -523,53 +484,49 @@ def pareto_chart(judged: Judged, marked: Sequence[Point]) -> Chart[go.Figure] | 
         separators=". ",
         plot_bgcolor="white",
     )
-    _add_marked(figure, marked, x, y, middle=sum(map(math.log10, ends[0]) if "type" in axes[0] else ends[0]) / 2)
+    logs = ["type" in axis for axis in axes]
+    _add_marked(figure, marked, (x, y), logs, middle=sum(map(math.log10, ends[0]) if logs[0] else ends[0]) / 2)
     better = " and ".join(
         f"{'less' if sign > 0 else 'more'} {words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
     )
     thin = f" {int(shown.sum()):,} of {int(known.sum()):,} designs are drawn." if shown.sum() < known.sum() else ""
     none = "" if judged.feasible.any() else " None meets all constraints: the front is that of all that work."
     more = " Further objectives are left out here." if len(judged.study.objectives) > 2 else ""
-    return Chart(figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}")
+    return figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}"
 
 
-def _add_marked(figure: go.Figure, points: Sequence[Point], x: str, y: str, *, middle: float) -> None:
+def _add_marked(
+    figure: go.Figure, marked: Sequence[Marked], names: tuple[str, str], logs: Sequence[bool], *, middle: float
+) -> None:
     """Add marked designs with their labels, which stand towards the ``middle`` of the x axis."""
-    layout: Any = figure.layout
-    logs = [axis.type == "log" for axis in (layout.xaxis, layout.yaxis)]
-    for point in points:
-        at, label = [point.value(x), point.value(y)], escaped(point.label)
+    for number, (one, colour) in enumerate(_coloured(marked)):
+        at, label = [one.design.number_of(name) for name in names], _escaped(one.label)
         if not all(map(math.isfinite, at)):
             continue
         places = [math.log10(value) if log else value for value, log in zip(at, logs, strict=True)]
         left = places[0] > middle
-        marker = {"symbol": _SYMBOLS[point.number % len(_SYMBOLS)][0], "size": 15 if point.chosen else 11}
+        marker = {"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": 15 if one is marked[-1] else 11}
         figure.add_scatter(
             x=rounded(at[:1]),
             y=rounded(at[1:]),
             mode="markers",
             showlegend=False,
             name=label,
-            marker=marker | {"color": point.colour, "line": {"color": "white", "width": 1.5}},
-            hovertemplate=f"<b>{label}</b><br>{escaped(label_of(x))}: %{{x}}<br>%{{y}}<extra></extra>",
+            marker=marker | {"color": colour, "line": {"color": "white", "width": 1.5}},
+            hovertemplate=f"<b>{label}</b><br>{_escaped(label_of(names[0]))}: %{{x}}<br>%{{y}}<extra></extra>",
         )
         figure.add_annotation(
-            {"x": places[0], "y": places[1], "ax": -30 if left else 30, "ay": _AWAY[point.number % len(_AWAY)]},
+            {"x": places[0], "y": places[1], "ax": -30 if left else 30, "ay": _AWAY[number % len(_AWAY)]},
             text=f"<b>{label}</b>",
             xanchor="right" if left else "left",
-            arrowcolor=point.colour,
+            arrowcolor=colour,
             arrowwidth=1.2,
             arrowhead=0,
             standoff=7,
             bgcolor="rgba(255,255,255,0.88)",
             borderpad=2,
-            font={"color": point.colour, "size": 12.5},
+            font={"color": colour, "size": 12.5},
         )
-
-
-def escaped(text: str) -> str:
-    """Text in which plotly finds no tags."""
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
@@ -583,36 +540,18 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
     return chosen
 
 
-def hover_texts(judged: Judged, places: np.ndarray, *figures: str) -> list[str]:
-    """What is said of designs on hover: number, values of what is free, and figures."""
-    names = list(dict.fromkeys([*judged.study.free(), *figures]))
-    return [
-        "<br>".join(
-            [f"design {judged.columns['design'][place]}"]
-            + [escaped(f"{words_of(name)}: {judged.text(name, place)}") for name in names]
-        )
-        for place in places
-    ]
-
-
-# --- all at once ------------------------------------------------------------------------------------------------------
-
-
-def parallel_chart(judged: Judged) -> Chart[go.Figure] | None:
+def parallel_chart(judged: Judged) -> Interactive | None:
     """Every design that meets the constraints as a line over all that is free, wanted and bounded."""
     if not judged.feasible.any():
         return None
-    chosen = sample(judged.feasible, judged.front, MOST_LINES)
-    places = np.flatnonzero(chosen)
-    figures = [o.figure for o in judged.study.objectives] + list(judged.study.constraints)
-    names = list(dict.fromkeys([*judged.study.free(), *figures]))[:_MOST_DIMENSIONS]
-    dimensions = [_dimension(judged, name, places) for name in names]
+    places = np.flatnonzero(sample(judged.feasible, judged.front, MOST_LINES))
+    names = list(dict.fromkeys([*judged.study.free(), *judged.study.wanted()]))[:_MOST_DIMENSIONS]
     objective = judged.study.objectives[0]
     colours = judged.figure(objective.figure)[places]
     low, high = float(colours.min()), float(np.quantile(colours, 0.95))
     figure = go.Figure(
         go.Parcoords(
-            dimensions=dimensions,
+            dimensions=[_dimension(judged, name, places) for name in names],
             labelangle=-12,
             labelside="top",
             labelfont={"size": 12},
@@ -625,20 +564,20 @@ def parallel_chart(judged: Judged) -> Chart[go.Figure] | None:
                 "cmin": low,
                 "cmax": high if high > low else low + max(abs(low), 1e-9),
                 "reversescale": objective.goal == "maximise",
-                "colorbar": {"title": {"text": escaped(label_of(objective.figure)), "side": "right"}, "thickness": 14},
+                "colorbar": {"title": {"text": _escaped(label_of(objective.figure)), "side": "right"}, "thickness": 14},
             },
         )
     )
     figure.update_layout(_LAYOUT, height=470, margin={"l": 80, "r": 40, "t": 110, "b": 30}, font_size=12)
     total = int(judged.feasible.sum())
     count = f"{len(places):,} of {total:,} designs" if len(places) < total else f"All {total:,} designs"
-    return Chart(figure, f"{count} that meet all constraints. Drag along an axis to keep only what passes there.")
+    return figure, (f"{count} that meet all constraints. Drag along an axis to keep only what passes there.")
 
 
 def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, object]:
     """A parallel axis: choices and laser classes by name, else numbers."""
     values, variable = judged.columns[name][places], judged.study.free().get(name)
-    label = escaped(label_of(name))
+    label = _escaped(label_of(name))
     if variable is not None and variable.values is not None:
         options = list(variable.values)
         # Ticks hold plain text, in which nothing is a tag.

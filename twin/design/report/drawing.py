@@ -297,16 +297,11 @@ _LETTER_PX = 6.7
 """Mean width of a letter."""
 
 
-@dataclass(frozen=True, eq=False)
-class Drawing:
-    """Side and front view in one figure, and whether the other design is drawn behind."""
+def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> tuple[Figure, bool]:
+    """Draw a design's views beside each other at one scale, another design dashed behind them where it fits.
 
-    figure: Figure
-    with_other: bool
-
-
-def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> Drawing:
-    """Draw a design's views beside each other at one scale, another design dashed behind them where it fits."""
+    The figure, and whether the other design is drawn.
+    """
     if other is not None and not (_fits(side, other[0]) and _fits(front, other[1])):
         other = None
     behind_side, behind_front = other or (None, None)
@@ -323,7 +318,7 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
     _draw_side(_Pen(axes, px, np.zeros(2)), side, behind_side, low, low + size)
     shift = np.array([low[0] + size[0] + _BETWEEN * px, low[1]]) - front_low
     _draw_front(_Pen(axes, px, shift), front, behind_front, right=float(front_low[0] + front_size[0]))
-    return Drawing(figure, other is not None)
+    return figure, other is not None
 
 
 def _box(*views: SideView | FrontView | None) -> tuple[np.ndarray, np.ndarray]:

@@ -5,23 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-import plotly.graph_objects as go
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 import uwlts
 from twin.design.description import Study
 from twin.design.designs import Columns, Marked
-from twin.design.report.charts import (
-    Chart,
-    Point,
-    bars,
-    contours,
-    curves,
-    parallel_chart,
-    pareto_chart,
-    verification_chart,
-)
+from twin.design.report.charts import Static, bars, contours, curves, parallel_chart, pareto_chart, verification_chart
 from twin.design.report.drawing import draw, views_of
 from twin.design.report.tables import (
     Judged,
@@ -35,7 +24,7 @@ from twin.design.report.tables import (
 )
 from twin.design.verification import Agreement
 from uwlts.model.errors import Error
-from uwlts.report.page_toolkit import FigureCollector, InteractiveFigure, render_page, svg_of
+from uwlts.report.page_toolkit import FigureCollector, render_page, svg_of
 
 _BEST = 20
 """Designs in the table of the best."""
@@ -76,12 +65,9 @@ def page_text(
         The columns are of another study.
     """
     judged, collected = Judged(study, columns), FigureCollector()
-    points = [Point(one.label, one.design.table(), number, one is marked[-1]) for number, one in enumerate(marked)]
-    over_free_title, over_free = _over_what_is_free(judged, points)
-    chosen = None
-    if marked:
-        compared = None if len(marked) == 1 else (marked[0].label, marked[0].design.table())
-        chosen = tiles(study, marked[-1].sensor, marked[-1].design.table(), compared=compared)
+    over_free_title, over_free = _over_what_is_free(judged, marked)
+    nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
+    pareto, parallel = pareto_chart(judged, marked), parallel_chart(judged)
     return render_page(
         "twin.design.report",
         "template.html.j2",
@@ -90,29 +76,25 @@ def page_text(
         introduction=introduction(judged),
         notes=list(notes),
         label=marked[-1].label if marked else "",
-        chosen=chosen,
+        chosen=tiles(study, marked[-1], marked[0] if len(marked) > 1 else None) if marked else None,
         drawing=_drawing(study, marked),
         over_free=over_free,
         over_free_title=over_free_title,
-        pareto=_interactive(collected, pareto_chart(judged, points)),
-        parallel=_interactive(collected, parallel_chart(judged)),
-        nothing=_nothing(judged),
+        pareto=pareto and collected.add(*pareto),
+        parallel=parallel and collected.add(*parallel),
+        nothing=nothing if len(judged) else "No design has been judged.",
         rendered=agreement_rows(agreements),
         verdicts=[(found, agreement_text(study, found), _shown(verification_chart(found))) for found in agreements],
         best=_best(judged),
-        failures=[(name, f"{count:,}") for name, count in judged.failure_counts()],
-        misses=[(name, f"{count:,}") for name, count in judged.miss_counts()] if len(judged) else [],
+        failures=judged.failure_counts(),
+        misses=judged.miss_counts(),
         working=int(judged.works.sum()),
         version=uwlts.__version__,
     )
 
 
-def _interactive(collected: FigureCollector, drawn: Chart[go.Figure] | None) -> InteractiveFigure | None:
-    return None if drawn is None else collected.add(drawn.figure, drawn.caption)
-
-
-def _shown(drawn: Chart[Figure] | None) -> tuple[Markup, str] | None:
-    return None if drawn is None else (svg_of(drawn.figure), drawn.caption)
+def _shown(drawn: Static | None) -> tuple[Markup, str] | None:
+    return drawn and (svg_of(drawn[0]), drawn[1])
 
 
 def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str]:
@@ -128,35 +110,30 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
     if base is not chosen:
         with suppress(Error):
             other = views_of(base.sensor, study.medium_of(base.sensor))
-    drawing = draw(*views, other)
-    behind = f" Dashed grey behind: {base.label}." if drawing.with_other else ""
-    return svg_of(drawing.figure), _DRAWN + behind
+    figure, with_other = draw(*views, other)
+    return svg_of(figure), _DRAWN + (f" Dashed grey behind: {base.label}." if with_other else "")
 
 
-def _over_what_is_free(judged: Judged, points: Sequence[Point]) -> tuple[str, tuple[Markup, str] | None]:
+def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:
     """Title of the chart that suits what is free, and the chart; None where no design works."""
-    ranges = [name for name, variable in judged.study.variables.items() if variable.values is None]
-    works = judged.works.any()
-    if len(ranges) >= 2:
-        title = f"Figures over {words_of(ranges[0])} and {words_of(ranges[1])}"
-        return title, _shown(contours(judged, points, ranges[0], ranges[1]) if works else None)
-    if ranges:
-        return f"Figures over {words_of(ranges[0])}", _shown(curves(judged, points, ranges[0]) if works else None)
-    return "Figures of the choices", _shown(bars(judged) if works else None)
-
-
-def _nothing(judged: Judged) -> str:
-    """Why there are no charts, "" where there are."""
-    if not len(judged):
-        return "No design has been judged."
-    return "" if judged.works.any() else "None of the designs works: see the reasons below."
+    ranges = [name for name, variable in judged.study.variables.items() if variable.values is None][:2]
+    title = f"Figures over {' and '.join(map(words_of, ranges))}" if ranges else "Figures of the choices"
+    if not judged.works.any():
+        return title, None
+    match ranges:
+        case [x, y]:
+            return title, _shown(contours(judged, marked, x, y))
+        case [x]:
+            return title, _shown(curves(judged, marked, x))
+        case _:
+            return title, _shown(bars(judged))
 
 
 def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
     """Head and rows of the table of the best designs."""
     study = judged.study
-    figures = [o.figure for o in study.objectives] + list(study.constraints)
-    figures += ["sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class"]
+    more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class")
+    figures = dict.fromkeys([*study.wanted(), *more])
     names = list(dict.fromkeys([*study.free(), *(name for name in figures if name in judged.columns)]))
     missed = not judged.feasible.any()
     rows = [

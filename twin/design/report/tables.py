@@ -12,47 +12,14 @@ from functools import cached_property
 import numpy as np
 
 from twin.design.choice import pareto
-from twin.design.description import Objective, Study, Value, Variable
-from twin.design.figures import CLASS_NAMES
+from twin.design.description import Study, Value, Variable
+from twin.design.designs import Marked
+from twin.design.figures import CLASS_NAMES, FIGURES
 from twin.design.verification import Agreement
 from uwlts.model.errors import EvaluationError
-from uwlts.model.sensor import Sensor
 from uwlts.report.page_toolkit import Tile
 
 MISSING = "\N{EN DASH}"
-
-FIGURE_NAMES: dict[str, tuple[str, str]] = {
-    "sigma_x_mm": ("σ X, by the stage", "mm"),
-    "sigma_y_mm": ("σ Y, largest in the volume", "mm"),
-    "sigma_z_mm": ("σ Z, largest in the volume", "mm"),
-    "sigma_z_rms_mm": ("σ Z, rms over the volume", "mm"),
-    "sigma_z_near_mm": ("σ Z at the near end", "mm"),
-    "sigma_z_middle_mm": ("σ Z in the middle", "mm"),
-    "sigma_z_far_mm": ("σ Z at the far end", "mm"),
-    "depth_per_px_mm": ("depth per pixel", "mm/px"),
-    "along_per_px_mm": ("length along the stripe per pixel", "mm/px"),
-    "coverage": ("share of the volume in reach", ""),
-    "standoff_mm": ("stand-off", "mm"),
-    "near_mm": ("near end of the volume", "mm"),
-    "far_mm": ("far end of the volume", "mm"),
-    "depth_mm": ("depth of the volume", "mm"),
-    "line_near_mm": ("line length at the near end", "mm"),
-    "line_mm": ("line length in the middle", "mm"),
-    "line_far_mm": ("line length at the far end", "mm"),
-    "section_cm2": ("area of the sheet in the volume", "cm²"),
-    "occlusion_deg": ("occlusion angle, largest", "°"),
-    "signal_e": ("faintest signal", "e⁻"),
-    "exposure_ms": ("exposure", "ms"),
-    "required_ms": ("exposure required", "ms"),
-    "stripe_px": ("width of the stripe's image (σ)", "px"),
-    "blur_px": ("the lens's blur (σ)", "px"),
-    "centre_px": ("σ of the stripe's centre", "px"),
-    "speckle_limit_mm": ("speckle limit of Z", "mm"),
-    "laser_class": ("laser class", ""),
-    "window_mm": ("window thickness needed", "mm"),
-    "baseline_mm": ("width of the sensor", "mm"),
-}
-"""Words and unit of every figure of merit."""
 
 _WHOLE = {
     "width_px": ("image width", "px"),
@@ -89,17 +56,14 @@ _UNITS = {
 
 def words_and_unit(name: str) -> tuple[str, str]:
     """A figure's, a path's or a choice's name in words, and its unit ("" if it has none)."""
-    if name in FIGURE_NAMES:
-        return FIGURE_NAMES[name]
+    if name in FIGURES:
+        return FIGURES[name]
     *parents, key = name.split(".")
     if not parents:
         return key.replace("_", " "), ""
-    if key in _WHOLE:
-        words, unit = _WHOLE[key]
-    else:
-        ending = next((ending for ending in _UNITS if key.endswith(ending)), "")
-        words, unit = key.removesuffix(ending).replace("_", " "), _UNITS.get(ending, "")
-    return " ".join([*(parent.replace("_", " ") for parent in parents), words]), unit
+    ending = next((ending for ending in _UNITS if key.endswith(ending)), "")
+    words, unit = _WHOLE.get(key, (key.removesuffix(ending), _UNITS.get(ending, "")))
+    return " ".join([*parents, words]).replace("_", " "), unit
 
 
 def words_of(name: str) -> str:
@@ -143,11 +107,6 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
     if not unit or not of or text == MISSING:
         return text
     return text + (of if of == "°" else "\N{NO-BREAK SPACE}" + of)
-
-
-def goal_text(objective: Objective) -> str:
-    """An objective in words."""
-    return f"{'smallest' if objective.goal == 'minimise' else 'largest'} {words_of(objective.figure)}"
 
 
 def listed(words: Sequence[str]) -> str:
@@ -230,17 +189,17 @@ class Judged:
         """A design's value in words, with its unit."""
         return value_text(name, self.columns[name][place : place + 1].tolist()[0])
 
-    def failure_counts(self) -> list[tuple[str, int]]:
+    def failure_counts(self) -> list[tuple[str, str]]:
         """Why designs cannot work, without the numbers, and how many; the most frequent first."""
-        return Counter(without_numbers(text) for text in self.failures if text).most_common()
+        counts = Counter(without_numbers(text) for text in self.failures if text)
+        return [(text, f"{count:,}") for text, count in counts.most_common()]
 
-    def miss_counts(self) -> list[tuple[str, int]]:
+    def miss_counts(self) -> list[tuple[str, str]]:
         """Constraints in words, and how many of the working designs miss each."""
-        counts = []
-        for name, sign, bound in bounds_of(self.study):
-            missed = sign * (self.figure(name)[self.works] - bound) > 0
-            counts.append((bound_text(name, sign, bound), int(missed.sum())))
-        return counts
+        return [
+            (bound_text(name, sign, bound), f"{(sign * (self.figure(name)[self.works] - bound) > 0).sum():,}")
+            for name, sign, bound in bounds_of(self.study)
+        ]
 
 
 def bounds_of(study: Study) -> list[tuple[str, int, float]]:
@@ -255,17 +214,21 @@ def bounds_of(study: Study) -> list[tuple[str, int, float]]:
 
 def bound_text(name: str, sign: int, bound: float) -> str:
     """A bound in words."""
-    return f"{words_of(name)} {'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
+    return f"{words_of(name)} {_limit(name, sign, bound)}"
 
 
-def misses(study: Study, row: Mapping[str, Value | None]) -> list[str]:
-    """Which constraints a design misses, in words."""
-    found = []
+def _limit(name: str, sign: int, bound: float) -> str:
+    return f"{'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
+
+
+def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, tuple[str, str]]:
+    """Figures of which a design misses a bound, each with the miss in words and with the bound alone."""
+    found = {}
     for name, sign, bound in bounds_of(study):
-        value = _number(row, name)
-        if sign * (value - bound) > 0:
-            limit = f"{'at most' if sign > 0 else 'at least'} {value_text(name, bound)} is asked"
-            found.append(f"{words_of(name)} is {value_text(name, value)}, {limit}")
+        value = row.get(name)
+        if isinstance(value, int | float) and sign * (value - bound) > 0:
+            asked = f"{_limit(name, sign, bound)} is asked"
+            found[name] = f"{words_of(name)} is {value_text(name, value)}, {asked}", asked
     return found
 
 
@@ -275,6 +238,7 @@ _CHOSEN = {
     "sobol": "by a Sobol sequence",
     "optimise": "proposed by an optimiser (NSGA-II)",
 }
+_GOALS = {"minimise": "smallest", "maximise": "largest"}
 _FOLLOW = {
     "focus": "the lens is focused on it",
     "waist": "the laser is focused on it",
@@ -284,19 +248,18 @@ _FOLLOW = {
 
 def introduction(judged: Judged) -> list[tuple[str, str]]:
     """What was asked and how many designs were judged, by key words."""
-    study, feasible, works = judged.study, int(judged.feasible.sum()), int(judged.works.sum())
-    base = study.sensor
+    study, bounds = judged.study, bounds_of(judged.study)
     facts = [
-        ("base sensor", f"{base.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
+        ("base sensor", f"{study.sensor.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
         ("free", "; ".join(_range_text(name, variable) for name, variable in study.free().items())),
-        ("wanted", "; ".join(goal_text(objective) for objective in study.objectives)),
+        ("wanted", "; ".join(f"{_GOALS[wanted.goal]} {words_of(wanted.figure)}" for wanted in study.objectives)),
     ]
-    if bounds := bounds_of(study):
+    if bounds:
         facts.append(("constraints", "; ".join(bound_text(*bound) for bound in bounds)))
     if study.follow:
         facts.append(("at each stand-off", listed([_FOLLOW[name] for name in study.follow])))
-    counted = f"{len(judged):,} judged, {_CHOSEN[study.sampling.kind]}; {works:,} work"
-    facts.append(("designs", counted + (f", {feasible:,} meet all constraints" if bounds_of(study) else "")))
+    counted = f"{len(judged):,} judged, {_CHOSEN[study.sampling.kind]}; {judged.works.sum():,} work"
+    facts.append(("designs", counted + (f", {judged.feasible.sum():,} meet all constraints" if bounds else "")))
     return facts
 
 
@@ -310,54 +273,37 @@ def _range_text(name: str, variable: Variable) -> str:
 _ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
 
 
-def tiles(
-    study: Study,
-    sensor: Sensor,
-    row: Mapping[str, Value | None],
-    *,
-    compared: tuple[str, Mapping[str, Value | None]] | None,
-) -> list[Tile]:
-    """What is free, what is wanted, and what else decides, of a design; beside that of another one (label, row)."""
-    missed = {text.split(" is ")[0]: text for text in misses(study, row)}
+def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
+    """Everything free, wanted and otherwise decisive of the chosen design, beside the values of another one."""
+    row, missed = chosen.design.table(), misses(study, chosen.design.table())
+    label, other = ("", {}) if compared is None else (compared.label, compared.design.table())
+    window, needed = chosen.sensor.camera.window, chosen.design.number_of("window_mm")
 
     def tile(name: str, *, accent: bool = False, note: str = "") -> Tile:
-        notes = [note] if note else []
-        if words_of(name) in missed:
-            notes.append(f"misses its bound: {missed[words_of(name)].rpartition(', ')[2]}")
-        if name.startswith("sigma_z_") and value_text(name, row.get(name)) == MISSING:
-            notes.append("camera or laser do not reach it")
-        if compared is not None:
-            other = value_text(name, compared[1].get(name))
-            notes += [f"{compared[0]}: {other}"] if other not in (MISSING, compared[0], "base") else []
-        return Tile(words_of(name), value_text(name, row.get(name)), "\n".join(notes), accent)
+        text, beside = value_text(name, row.get(name)), value_text(name, other.get(name))
+        notes = (
+            note,
+            f"misses its bound: {missed[name][1]}" if name in missed else "",
+            "camera or laser do not reach it" if name.startswith("sigma_z_") and text == MISSING else "",
+            f"{label}: {beside}" if beside not in (MISSING, label, "base") else "",
+        )
+        return Tile(words_of(name), text, "\n".join(filter(None, notes)), accent)
 
-    found = [tile(name, accent=True) for name in study.free()]
     objectives = [objective.figure for objective in study.objectives]
+    others = [name for name in dict.fromkeys([*_ALWAYS_SHOWN, *study.constraints]) if name not in objectives]
+    found = [tile(name, accent=True) for name in study.free()]
     found += [tile(name, accent=True, note="an objective") for name in objectives]
-    others = [*_ALWAYS_SHOWN, *study.constraints]
-    found += [tile(name) for name in dict.fromkeys(others) if name not in objectives]
-    required, used = (_number(row, name) for name in ("required_ms", "exposure_ms"))
+    found += [tile(name) for name in others]
+    required, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
     darker = f"the wanted brightness takes {value_text('required_ms', required)}" if required > 1.001 * used else ""
-    for name, note in (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1")):
-        if name not in (*objectives, *others):
-            found.append(tile(name, note=note))
-    return found + ([_window_tile(study, sensor, row)] if "window_mm" not in objectives else [])
-
-
-def _number(row: Mapping[str, Value | None], name: str) -> float:
-    """A number of a row, NaN where it is missing."""
-    value = row.get(name)
-    return math.nan if value is None or isinstance(value, str) else value
-
-
-def _window_tile(study: Study, sensor: Sensor, row: Mapping[str, Value | None]) -> Tile:
-    """The window's thickness and the one it needs."""
-    window, needed = sensor.camera.window, _number(row, "window_mm")
-    if not window.mounted:
-        return Tile("camera's window", "none")
-    text = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m"
-    thin = " – too thin" if needed > window.thickness_mm else ""
-    return Tile("camera's window", value_text("window_mm", window.thickness_mm), text + thin)
+    last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"))
+    found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
+    if "window_mm" not in objectives:
+        thin = " – too thin" if needed > window.thickness_mm else ""
+        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}"
+        text = value_text("window_mm", window.thickness_mm)
+        found.append(Tile("camera's window", *((text, note) if window.mounted else ("none",))))
+    return found
 
 
 def agreement_text(study: Study, found: Agreement) -> str:
@@ -388,19 +334,15 @@ def agreement_rows(agreements: Sequence[Agreement]) -> list[list[str]]:
     """Rows of the table of what was rendered."""
     rows = []
     for found in agreements:
-        errors = [abs(value) for value in found.error_mm if math.isfinite(value)]
+        largest = max((abs(value) for value in found.error_mm if math.isfinite(value)), default=math.nan)
         lines = found.line_mm
+        verdict = "failed" if found.failure else "agree" if found.agrees else "DISAGREE"
+        exposures = found.predicted_exposure_ms, found.exposure_ms
         rows.append(
-            [
-                found.label,
-                str(found.design) if found.design >= 0 else MISSING,
-                "failed" if found.failure else "agree" if found.agrees else "DISAGREE",
-                number_text(found.ratio, 3),
-                number_text(1e3 * max(errors)) if errors else MISSING,
-                f"{number_text(min(lines))} to {number_text(max(lines))}" if lines else MISSING,
-                value_text("exposure_ms", found.predicted_exposure_ms, unit=False),
-                value_text("exposure_ms", found.exposure_ms, unit=False),
-                number_text(found.seconds, 3),
-            ]
+            [found.label, str(found.design) if found.design >= 0 else MISSING, verdict, number_text(found.ratio, 3)]
+            + [number_text(1e3 * largest)]
+            + [f"{number_text(min(lines))} to {number_text(max(lines))}" if lines else MISSING]
+            + [value_text("exposure_ms", exposure, unit=False) for exposure in exposures]
+            + [number_text(found.seconds, 3)]
         )
     return rows
