@@ -35,14 +35,18 @@ _HOUSING_MM, _WALL_MM, _BARE_FRONT_MM, _BARE_HALF_MM = 42.0, 5.0, 12.0, 15.0
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """Camera or laser from one side: origin (2,), the window's corners (4, 2) or None, the housing's (4, 2), mm.
+    """Camera or laser from one side, in mm: origin (2,), corners of window, (4, 2) or (0, 2), and housing (4, 2).
 
     Only origin and window are to scale: the description does not know the housing.
     """
 
     origin: np.ndarray
-    window: np.ndarray | None
+    window: np.ndarray
     housing: np.ndarray
+
+    def outline(self) -> np.ndarray:
+        """The housing as a closed line (5, 2)."""
+        return np.vstack([self.housing, self.housing[:1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +71,13 @@ class SideView:
     outer_mm: float
     angle_rad: float
 
-    def points(self) -> np.ndarray:
-        """All finite points (N, 2) of the view."""
-        return _finite(_corners(self.camera), _corners(self.laser), *self.edges, self.sheet, self.volume)
+    def outlines(self) -> list[np.ndarray]:
+        """Lines (K, 2) that show the design behind another one."""
+        return [*self.edges, self.sheet, self.camera.outline(), self.laser.outline(), self.volume]
+
+    def extent(self) -> list[np.ndarray]:
+        """All points (K, 2) that must be in the picture."""
+        return [*self.outlines(), self.camera.window, self.laser.window]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +95,13 @@ class FrontView:
     lines: np.ndarray
     region: np.ndarray
 
-    def points(self) -> np.ndarray:
-        """All finite points (N, 2) of the view."""
-        return _finite(_corners(self.laser), *self.fan, *self.lines, self.region)
+    def outlines(self) -> list[np.ndarray]:
+        """Lines (K, 2) that show the design behind another one."""
+        return [*self.fan, *self.lines, self.laser.outline()]
+
+    def extent(self) -> list[np.ndarray]:
+        """All points (K, 2) that must be in the picture."""
+        return [*self.outlines(), self.laser.window, self.region]
 
 
 def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
@@ -112,13 +124,13 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
         return start + ((depths - crossing) / pose.axis[2])[:, None] * pose.axis
 
     # Camera and laser are modules of one kind: a frame with z along the axis, and perhaps a window.
-    seeing = _mounted(sensor, camera.window, medium, np.zeros(3), np.eye(3))
+    seeing = _Mounted.of(sensor, camera.window, medium, np.zeros(3), np.eye(3))
     frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
-    lighting = _mounted(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
+    lighting = _Mounted.of(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
     lens = Lens.of(camera)
-    reach = _reach(sensor, p, float((start - pose.origin_mm) @ pose.fan))
-    near, far = outer + reach.depths_mm[[0, -1]]
-    reached = np.isfinite(reach.low_mm)
+    depths, low, high, shown, line = _reach(sensor, p, float((start - pose.origin_mm) @ pose.fan))
+    near, far = outer + depths[[0, -1]]
+    reached = np.isfinite(low)
 
     end = pose.origin_mm + _BEYOND * ((on_sheet(np.array([far]))[0] - pose.origin_mm) @ pose.axis) * pose.axis
     angles = np.array([0.0, p.lit_from_rad.item(), p.lit_to_rad.item()])[:, None]
@@ -129,35 +141,30 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
     side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
     ahead = np.array([0.0, 0.0, 1.0])
-    seen = on_sheet(outer + reach.depths_mm[reached][[0, -1]]) @ side_axes.T if reached.any() else None
+    border = directions_of(lens, _border_towards(camera, across))
     side = SideView(
         camera=seeing.seen_along(side_axes, 0.0),
         laser=lighting.seen_along(side_axes, 0.0),
         pupil_mm=camera.focal_length_mm / camera.f_number,
         baseline_mm=math.hypot(*pose.origin_mm[:2]),
-        edges=tuple(
-            seeing.rays(directions_of(lens, _border_towards(camera, across)), far * _BEYOND * ahead, ahead)
-            @ side_axes.T
-        ),
+        edges=tuple(seeing.rays(border, far * _BEYOND * ahead, ahead) @ side_axes.T),
         sheet=axis @ side_axes.T,
         volume=on_sheet(np.array([near, far])) @ side_axes.T,
-        in_view=seen,
+        in_view=on_sheet(outer + depths[reached][[0, -1]]) @ side_axes.T if reached.any() else None,
         crossing=np.array([0.0, crossing]),
         outer_mm=outer,
         angle_rad=math.atan2(abs(pose.normal[2]), sideways),
     )
 
     front_axes = np.stack([pose.fan, pose.axis])
-    heights, shown = (
-        (on_sheet(outer + depths) - pose.origin_mm) @ pose.axis for depths in (reach.depths_mm, reach.shown_mm)
-    )
-    low, high = (np.stack([y, heights], axis=1)[reached] for y in (reach.low_mm, reach.high_mm))
+    heights, shown = ((on_sheet(outer + at) - pose.origin_mm) @ pose.axis for at in (depths, shown))
+    low, high = (np.stack([y, heights], axis=1)[reached] for y in (low, high))
     borders = [seeing.rays(directions_of(lens, s), pose.origin_mm, pose.normal)[:, -1] for s in _image_sides(camera)]
     front = FrontView(
         laser=lighting.seen_along(front_axes, pose.origin_mm),
         fan=tuple((edge - pose.origin_mm) @ front_axes.T for edge in fan),
         borders=tuple((border - pose.origin_mm) @ front_axes.T for border in borders),
-        lines=np.stack([reach.line_mm, np.repeat(shown[:, None], 2, axis=1)], axis=2),
+        lines=np.stack([line, np.repeat(shown[:, None], 2, axis=1)], axis=2),
         region=np.concatenate([low, high[::-1]]),
     )
     return side, front
@@ -178,20 +185,12 @@ def _crossing_mm(pose: LaserPose, outer: float) -> float:
     return depth
 
 
-@dataclass(frozen=True, eq=False)
-class _Reach:
-    """Of N depths from the window: from where to where (N,) camera and laser reach, from the laser's axis; NaN where
-    they reach nothing. Of the three depths to show: ends (3, 2) of the line."""
+def _reach(sensor: Sensor, p: Parameters, aside: float) -> tuple[np.ndarray, ...]:
+    """N depths of the volume from the window, and from where to where (N,) camera and laser reach there, in mm from the
+    laser's axis, NaN where they reach nothing; three depths to show, and the ends (3, 2) of the line there.
 
-    depths_mm: np.ndarray
-    low_mm: np.ndarray
-    high_mm: np.ndarray
-    shown_mm: np.ndarray
-    line_mm: np.ndarray
-
-
-def _reach(sensor: Sensor, p: Parameters, aside: float) -> _Reach:
-    """Reach at the depths of the volume; ``aside`` is where Y = 0 lies, from the laser's axis."""
+    ``aside`` is where Y = 0 lies, from the laser's axis.
+    """
     places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
     depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
     with np.errstate(all="ignore"):
@@ -201,13 +200,10 @@ def _reach(sensor: Sensor, p: Parameters, aside: float) -> _Reach:
         line = field_of(np, p, shown, places[[0, -1]].reshape(1, 1, -1), reflectance=0.5).y_mm[0] + aside
     y, inside = (np.broadcast_to(values, (1, _DEPTHS, _PLACES))[0] for values in (f.y_mm + aside, f.in_view))
     reached = inside.any(axis=1)
-    return _Reach(
-        depths_mm=depths,
-        low_mm=np.where(reached, np.where(inside, y, np.inf).min(axis=1), np.nan),
-        high_mm=np.where(reached, np.where(inside, y, -np.inf).max(axis=1), np.nan),
-        shown_mm=shown.ravel(),
-        line_mm=np.where((np.diff(line) > 0) & (far > near)[0], line, np.nan),
-    )
+    low = np.where(reached, np.where(inside, y, np.inf).min(axis=1), np.nan)
+    high = np.where(reached, np.where(inside, y, -np.inf).max(axis=1), np.nan)
+    line = np.where((np.diff(line) > 0) & (far > near)[0], line, np.nan)
+    return depths, low, high, shown.ravel(), line
 
 
 # --- camera and laser -------------------------------------------------------------------------------------------------
@@ -215,13 +211,18 @@ def _reach(sensor: Sensor, p: Parameters, aside: float) -> _Reach:
 
 @dataclass(frozen=True, eq=False)
 class _Mounted:
-    """A module: its origin and axis in the camera frame, and its window with the opening's diameter, None without."""
+    """A module: its origin and axis in the camera frame, and its window, as described and where one is mounted."""
 
     origin: np.ndarray
     axis: np.ndarray
+    described: Window
     window: FlatWindow | None
-    aperture_mm: float
-    distance_mm: float
+
+    @classmethod
+    def of(cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
+        """A module whose frame, with z along its axis, ``rotation`` (3, 3) turns into the camera frame."""
+        flat = FlatWindow.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
+        return cls(origin, rotation[:, 2], window, flat)
 
     def rays(self, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Rays (N, K, 3) from the origin through the window on to a plane; NaN for a ray that does not get there."""
@@ -239,23 +240,18 @@ class _Mounted:
         forward = axes @ self.axis / np.linalg.norm(axes @ self.axis)
         sideways = np.array([forward[1], -forward[0]])
         place = axes @ (self.origin - about)
-        front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, None
+        front, half, corners = _BARE_FRONT_MM, _BARE_HALF_MM, np.empty((0, 2))
         if self.window is not None:
             normal = np.array(self.window.normal)
             seen = axes @ normal
-            along = np.array([seen[1], -seen[0]]) / np.linalg.norm(seen)
-            half, front = self.aperture_mm / 2, self.distance_mm
-            inner = self.origin + self.distance_mm * self.axis
+            half, front = self.described.aperture_diameter_mm / 2, self.described.distance_mm
+            along = half * (np.array([seen[1], -seen[0]]) / np.linalg.norm(seen))
+            inner = self.origin + front * self.axis
             inner, outer = (axes @ (face - about) for face in (inner, inner + self.window.thickness_mm * normal))
-            corners = np.array([inner - half * along, inner + half * along, outer + half * along, outer - half * along])
+            corners = np.array([inner - along, inner + along, outer + along, outer - along])
         side, back = (half + _WALL_MM) * sideways, _HOUSING_MM * forward
         head = place + front * forward
         return Module(place, corners, np.array([place - back - side, place - back + side, head + side, head - side]))
-
-
-def _mounted(sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
-    flat = FlatWindow.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
-    return _Mounted(origin, rotation[:, 2], flat, window.aperture_diameter_mm, window.distance_mm)
 
 
 def _image_sides(camera: Camera) -> list[np.ndarray]:
@@ -273,15 +269,6 @@ def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
         ends = [np.where(d > 0, most - centre, least - centre) / d for d in (across, -across)]
     lengths = [float(np.min(end[np.abs(across) > 1e-12])) for end in ends]
     return np.stack([centre + lengths[0] * across, centre - lengths[1] * across])
-
-
-def _corners(module: Module) -> np.ndarray:
-    return np.vstack([module.origin, module.housing, *([] if module.window is None else [module.window])])
-
-
-def _finite(*parts: np.ndarray) -> np.ndarray:
-    points = np.concatenate(parts)
-    return points[np.isfinite(points).all(axis=1)]
 
 
 # --- the drawing ------------------------------------------------------------------------------------------------------
@@ -323,7 +310,8 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
 
 def _box(*views: SideView | FrontView | None) -> tuple[np.ndarray, np.ndarray]:
     """Least coordinates and size of all points of views."""
-    points = np.concatenate([view.points() for view in views if view is not None])
+    points = np.concatenate([points for view in views if view is not None for points in view.extent()])
+    points = points[np.isfinite(points).all(axis=1)]
     return points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
 
 
@@ -354,16 +342,15 @@ class _Pen:
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8} if halo else None
         self.axes.text(x, y, words, rotation=turned, ha=ha, va="center", rotation_mode="anchor", bbox=box)
 
-    def behind(self, *lines: np.ndarray) -> None:
-        """Lines of another design."""
-        for line in lines:
+    def behind(self, view: SideView | FrontView | None) -> None:
+        """Another design."""
+        for line in view.outlines() if view else ():
             self.line(line, _BEHIND, 0.8, "--")
 
     def module(self, module: Module, name: str) -> None:
         """Housing, window, and name at the housing's back."""
         self.area(module.housing, "#e6eaef", 0.6, edge="#aab4c0")
-        if module.window is not None:
-            self.area(module.window, _GLASS, 0.4, edge=_GLASS)
+        self.area(module.window, _GLASS, 0.4, edge=_GLASS)
         back = module.housing[:2].mean(axis=0)
         ahead = module.housing[2:].mean(axis=0) - back
         place = back + 10 * self.px * ahead / max(np.hypot(*ahead), 1e-9)
@@ -389,8 +376,7 @@ def _draw_side(pen: _Pen, view: SideView, other: SideView | None, low: np.ndarra
     near, far = view.volume[:, 1].tolist()
     left, right = low[0] - 4 * px, high[0] + 4 * px
     pen.area(np.array([(left, near), (right, near), (right, far), (left, far)]), "#f1ecd9", 1.0)
-    if other is not None:
-        pen.behind(*other.edges, other.sheet, _closed(other.camera), _closed(other.laser), other.volume)
+    pen.behind(other)
     pen.area(np.concatenate([view.edges[0], view.edges[1][::-1]]), _BLUE, 0.1)
     for depth, name in ((near, "near"), (far, "far")):
         pen.line([(left, depth), (right, depth)], "#bda96b", 0.8)
@@ -434,8 +420,7 @@ def _draw_side(pen: _Pen, view: SideView, other: SideView | None, low: np.ndarra
 def _draw_front(pen: _Pen, view: FrontView, other: FrontView | None, *, right: float) -> None:
     """Draw the front view, with its labels right of ``right``."""
     px = pen.px
-    if other is not None:
-        pen.behind(*other.fan, *other.lines, _closed(other.laser))
+    pen.behind(other)
     pen.area(np.concatenate([view.fan[0], view.fan[1][::-1]]), _RED, 0.06)
     pen.area(view.region, _RED, 0.18)
     pen.module(view.laser, "laser")
@@ -451,10 +436,6 @@ def _draw_front(pen: _Pen, view: FrontView, other: FrontView | None, *, right: f
             x, y = line.max(axis=0)
             pen.line([(x, y), (right + 8 * px, y)], _THIN, 0.6)
             pen.text((right + 12 * px, y), f"{word} {number_text(float(np.ptp(line[:, 0])))} mm")
-
-
-def _closed(module: Module) -> np.ndarray:
-    return np.vstack([module.housing, module.housing[:1]])
 
 
 def _draw_angle(pen: _Pen, view: SideView) -> None:
