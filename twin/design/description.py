@@ -196,6 +196,15 @@ class Study(Description):
         """Figures of the objectives and of the constraints, in this order."""
         return list(dict.fromkeys([*(objective.figure for objective in self.objectives), *self.constraints]))
 
+    def bounds(self) -> list[tuple[str, int, float]]:
+        """All bounds: the figure, 1 for one from above and -1 for one from below, and the bound."""
+        return [
+            (name, sign, bound)
+            for name, constraint in self.constraints.items()
+            for sign, bound in ((-1, constraint.least), (1, constraint.most))
+            if bound is not None
+        ]
+
     def medium_of(self, sensor: Sensor) -> Medium:
         """The study's medium of a sensor."""
         return sensor.medium(self.medium)

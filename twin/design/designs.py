@@ -49,6 +49,10 @@ class EvaluatedDesign:
         ends = {"violation": self.violation, "failure": self.failure}
         return {"design": self.number} | self.values | self.figures | ends
 
+    def again(self) -> Design:
+        """The design alone, to be evaluated again."""
+        return Design(self.number, {name: value for name, value in self.values.items() if value is not None})
+
     def number_of(self, name: str) -> float:
         """A number by the name of its column, NaN where the design has none."""
         value = self.table().get(name)
@@ -165,12 +169,10 @@ def row_of(columns: Columns, place: int) -> EvaluatedDesign:
 def violations(study: Study, figures: Figures) -> np.ndarray:
     """By how much designs (N,) miss the constraints together, in parts of the bounds; 0 where all hold."""
     total = np.zeros(len(figures.coverage))
-    for name, bounds in study.constraints.items():
+    for name, sign, bound in study.bounds():
         values = getattr(figures, name)
-        for sign, bound in ((-1.0, bounds.least), (1.0, bounds.most)):
-            if bound is not None:
-                missed = np.where(np.isnan(values), math.inf, sign * (values - bound))
-                total += np.maximum(missed, 0.0) / (abs(bound) or 1.0)
+        missed = np.where(np.isnan(values), math.inf, sign * (values - bound))
+        total += np.maximum(missed, 0.0) / (abs(bound) or 1.0)
     return total
 
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin.design.choice import pareto
+from twin.design.choice import Judged, pareto
 from twin.design.description import Study, load_study
 from twin.design.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of
 from twin.design.figures import FIGURES, figures_of
@@ -20,7 +20,6 @@ from twin.design.report.charts import bars, curves, map_of, parallel_chart, pare
 from twin.design.report.drawing import views_of
 from twin.design.report.page import page_text
 from twin.design.report.tables import (
-    Judged,
     agreement_text,
     label_of,
     misses,

@@ -19,19 +19,18 @@ from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, KDTree, QhullError
 
-from twin.design.choice import pareto
+from twin.design.choice import Judged, pareto
 from twin.design.description import Variable
 from twin.design.designs import Marked
 from twin.design.figures import CLASS_NAMES
 from twin.design.report.tables import (
-    Judged,
     bound_text,
-    bounds_of,
     label_of,
     listed,
     misses,
     number_text,
     rounded,
+    text_at,
     value_text,
     words_of,
 )
@@ -123,13 +122,13 @@ def _coloured(marked: Sequence[Marked]) -> list[tuple[Marked, str]]:
 
 
 def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None:
-    for bounded, _, bound in bounds_of(judged.study):
+    for bounded, _, bound in judged.study.bounds():
         if bounded == name:
             draw(bound, color=RED, linewidth=1.2, linestyle="--")
 
 
 def _dashed(judged: Judged) -> str:
-    return "Dashed: bounds." if bounds_of(judged.study) else ""
+    return "Dashed: bounds." if judged.study.bounds() else ""
 
 
 # --- curves and bars --------------------------------------------------------------------------------------------------
@@ -162,7 +161,7 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
 
 
 def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
-    return ", ".join(judged.text(name, place) for name in names)
+    return ", ".join(text_at(judged, name, place) for name in names)
 
 
 def _first_at(judged: Judged, x: str, places: np.ndarray, *, best: bool) -> np.ndarray:
@@ -366,7 +365,7 @@ def _shade(axes: Axes, found: Map) -> None:
 
 def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
     """Draw the lines on which constraints are just met."""
-    for (name, sign, bound), colour in zip(bounds_of(judged.study), _LIMITS * 10, strict=False):
+    for (name, sign, bound), colour in zip(judged.study.bounds(), _LIMITS * 10, strict=False):
         values = found.values.get(name, np.empty(0))
         level = bound + sign * _BESIDE * (abs(bound) or 1.0)
         if min(values.shape) > 1 and (values < level).any() and (values > level).any():
@@ -458,7 +457,7 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         text=[
             "<br>".join(
                 [f"design {judged.columns['design'][place]}"]
-                + [_escaped(f"{words_of(name)}: {judged.text(name, place)}") for name in names]
+                + [_escaped(f"{words_of(name)}: {text_at(judged, name, place)}") for name in names]
             )
             for place in order
         ],
@@ -544,7 +543,7 @@ def parallel_chart(judged: Judged) -> Interactive | None:
     """Every design that meets the constraints as a line over all that is free, wanted and bounded."""
     if not judged.feasible.any():
         return None
-    places = np.flatnonzero(sample(judged.feasible, judged.front, MOST_LINES))
+    places = np.flatnonzero(sample(judged.feasible, judged.front(judged.of_interest), MOST_LINES))
     names = list(dict.fromkeys([*judged.study.free(), *judged.study.wanted()]))[:_MOST_DIMENSIONS]
     objective = judged.study.objectives[0]
     colours = judged.figure(objective.figure)[places]

@@ -8,18 +8,20 @@ from contextlib import suppress
 from markupsafe import Markup
 
 import uwlts
+from twin.design.choice import Judged
 from twin.design.description import Study
 from twin.design.designs import Columns, Marked
 from twin.design.report.charts import Static, bars, contours, curves, parallel_chart, pareto_chart, verification_chart
 from twin.design.report.drawing import draw, views_of
 from twin.design.report.tables import (
-    Judged,
     agreement_rows,
     agreement_text,
+    failure_counts,
     introduction,
     label_of,
+    miss_counts,
+    text_at,
     tiles,
-    value_text,
     words_of,
 )
 from twin.design.verification import Agreement
@@ -44,25 +46,11 @@ def page_text(
     agreements: Sequence[Agreement],
     notes: Sequence[str] = (),
 ) -> str:
-    """The page of a study as HTML.
+    """The page of a study as HTML, from all its judged designs (none where ``columns`` is empty).
 
-    Parameters
-    ----------
-    study
-        The study.
-    columns
-        All judged designs, as `twin.design.screening.read_parts` gives them; empty where there are none.
-    marked
-        Designs to point out, the chosen one last.
-    agreements
-        Comparison of formulas and rendering of each rendered design.
-    notes
-        Sentences for the page's head.
-
-    Raises
-    ------
-    EvaluationError
-        The columns are of another study.
+    ``marked`` are designs to point out, the chosen one last; ``agreements`` compare formulas and rendering of each
+    rendered design, ``notes`` are sentences for the page's head. EvaluationError where the columns are of another
+    study.
     """
     judged, collected = Judged(study, columns), FigureCollector()
     over_free_title, over_free = _over_what_is_free(judged, marked)
@@ -86,8 +74,8 @@ def page_text(
         rendered=agreement_rows(agreements),
         verdicts=[(found, agreement_text(study, found), _shown(verification_chart(found))) for found in agreements],
         best=_best(judged),
-        failures=judged.failure_counts(),
-        misses=judged.miss_counts(),
+        failures=failure_counts(judged),
+        misses=miss_counts(judged),
         working=int(judged.works.sum()),
         version=uwlts.__version__,
     )
@@ -138,7 +126,7 @@ def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
     missed = not judged.feasible.any()
     rows = [
         [str(judged.columns["design"][place])]
-        + [value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=False) for name in names]
+        + [text_at(judged, name, place, unit=False) for name in names]
         + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
         for place in (judged.best_first[:_BEST] if len(judged) else [])
     ]

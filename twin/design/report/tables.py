@@ -6,17 +6,14 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from twin.design.choice import pareto
+from twin.design.choice import Judged
 from twin.design.description import Study, Value, Variable
 from twin.design.designs import Marked
 from twin.design.figures import CLASS_NAMES, FIGURES
 from twin.design.verification import Agreement
-from uwlts.model.errors import EvaluationError
 from uwlts.report.page_toolkit import Tile
 
 MISSING = "\N{EN DASH}"
@@ -125,90 +122,22 @@ def without_numbers(text: str) -> str:
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", text)
 
 
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A study and the columns of its judged designs, as `twin.design.results.read_parts` gives them."""
-
-    study: Study
-    columns: Mapping[str, np.ndarray]
-
-    def __post_init__(self) -> None:
-        expected = ["design", "violation", "failure", *self.study.free(), *(o.figure for o in self.study.objectives)]
-        if self.columns and (missing := [name for name in expected if name not in self.columns]):
-            raise EvaluationError(
-                f"the results have no {', '.join(missing)}, but {', '.join(self.columns)}: they are of another study"
-            )
-
-    def __len__(self) -> int:
-        return len(self.columns["design"]) if self.columns else 0
-
-    def figure(self, name: str) -> np.ndarray:
-        """A figure of all designs, (N,) float; NaN where it is unknown."""
-        if name not in self.columns:
-            return np.full(len(self), np.nan)
-        return np.asarray(self.columns[name], dtype=np.float64)
-
-    def cost(self, place: int = 0) -> np.ndarray:
-        """An objective of all designs, (N,), turned so that smaller is better."""
-        objective = self.study.objectives[place]
-        return self.figure(objective.figure) * (1 if objective.goal == "minimise" else -1)
-
-    @cached_property
-    def failures(self) -> list[str]:
-        """Why designs cannot work, "" for those that do."""
-        return [text or "" for text in self.columns["failure"].tolist()] if self.columns else []
-
-    @cached_property
-    def works(self) -> np.ndarray:
-        """Designs (N,) that work and whose first objective is known."""
-        return np.array([not text for text in self.failures], dtype=bool) & np.isfinite(self.cost())
-
-    @cached_property
-    def feasible(self) -> np.ndarray:
-        """Designs (N,) that work and meet all constraints."""
-        return self.works & (self.figure("violation") <= 0)
-
-    @cached_property
-    def best_first(self) -> np.ndarray:
-        """Places of the designs that work: those that miss the constraints least, then those of the best objective."""
-        order = np.lexsort((self.cost(), self.figure("violation")))
-        return order[self.works[order]]
-
-    @cached_property
-    def front(self) -> np.ndarray:
-        """Designs (N,) that no other of those that count beats in all objectives, see `of_interest`."""
-        values = np.column_stack([self.cost(k) for k in range(len(self.study.objectives))])
-        return pareto(np.where(self.of_interest[:, None], values, np.nan))
-
-    @property
-    def of_interest(self) -> np.ndarray:
-        """Designs (N,) that meet all constraints, or all that work if none does."""
-        return self.feasible if self.feasible.any() else self.works
-
-    def text(self, name: str, place: int) -> str:
-        """A design's value in words, with its unit."""
-        return value_text(name, self.columns[name][place : place + 1].tolist()[0])
-
-    def failure_counts(self) -> list[tuple[str, str]]:
-        """Why designs cannot work, without the numbers, and how many; the most frequent first."""
-        counts = Counter(without_numbers(text) for text in self.failures if text)
-        return [(text, f"{count:,}") for text, count in counts.most_common()]
-
-    def miss_counts(self) -> list[tuple[str, str]]:
-        """Constraints in words, and how many of the working designs miss each."""
-        return [
-            (bound_text(name, sign, bound), f"{(sign * (self.figure(name)[self.works] - bound) > 0).sum():,}")
-            for name, sign, bound in bounds_of(self.study)
-        ]
+def text_at(judged: Judged, name: str, place: int, *, unit: bool = True) -> str:
+    """A design's value in words, with its unit."""
+    return value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=unit)
 
 
-def bounds_of(study: Study) -> list[tuple[str, int, float]]:
-    """All bounds: the figure, 1 for one from above and -1 for one from below, and the bound."""
+def failure_counts(judged: Judged) -> list[tuple[str, str]]:
+    """Reasons why designs cannot work, without the numbers, and how many; the most frequent first."""
+    counts = Counter(without_numbers(text) for text in judged.failures if text)
+    return [(text, f"{count:,}") for text, count in counts.most_common()]
+
+
+def miss_counts(judged: Judged) -> list[tuple[str, str]]:
+    """Constraints in words, and how many of the working designs miss each."""
     return [
-        (name, sign, bound)
-        for name, constraint in study.constraints.items()
-        for sign, bound in ((-1, constraint.least), (1, constraint.most))
-        if bound is not None
+        (bound_text(name, sign, bound), f"{(sign * (judged.figure(name)[judged.works] - bound) > 0).sum():,}")
+        for name, sign, bound in judged.study.bounds()
     ]
 
 
@@ -224,7 +153,7 @@ def _limit(name: str, sign: int, bound: float) -> str:
 def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, tuple[str, str]]:
     """Figures of which a design misses a bound, each with the miss in words and with the bound alone."""
     found = {}
-    for name, sign, bound in bounds_of(study):
+    for name, sign, bound in study.bounds():
         value = row.get(name)
         if isinstance(value, int | float) and sign * (value - bound) > 0:
             asked = f"{_limit(name, sign, bound)} is asked"
@@ -248,7 +177,7 @@ _FOLLOW = {
 
 def introduction(judged: Judged) -> list[tuple[str, str]]:
     """What was asked and how many designs were judged, by key words."""
-    study, bounds = judged.study, bounds_of(judged.study)
+    study, bounds = judged.study, judged.study.bounds()
     facts = [
         ("base sensor", f"{study.sensor.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
         ("free", "; ".join(_range_text(name, variable) for name, variable in study.free().items())),
