@@ -16,7 +16,6 @@ from twin.design.geometry import (
     Vector,
     across_mm,
     added,
-    degrees,
     direction_outside,
     dot,
     path_to,
@@ -73,7 +72,7 @@ def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff, outer = standoff_mm(pose), p.outer_mm(xp)
-    other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
+    other = p.across((p.width_px, p.height_px))
     ends = []
     for edge in (-0.5, other - 0.5):
         inverse = 1 / standoff
@@ -106,8 +105,8 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     def at(y: Array) -> Vector:
         return added(middle, scaled(pose.fan, y))
 
-    side = p.along_width * p.width_px + (1 - p.along_width) * p.height_px
-    other = p.along_width * p.height_px + (1 - p.along_width) * p.width_px
+    side = p.along((p.width_px, p.height_px))
+    other = p.across((p.width_px, p.height_px))
     ends = []
     for edge in (-0.5, side - 0.5):
         y = 0.0 * z
@@ -300,7 +299,7 @@ def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, wate
         line_mm=line[:, middle],
         line_far_mm=line[:, -1],
         section_cm2=0.01 * np.trapezoid(line, f["z_mm"][:, :, 0], axis=1),
-        occlusion_deg=degrees(worst("occlusion_rad")),
+        occlusion_deg=np.degrees(worst("occlusion_rad")),
         signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
         exposure_ms=f["exposure_ms"][:, 0, 0],
         required_ms=f["required_ms"][:, 0, 0],

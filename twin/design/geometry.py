@@ -8,7 +8,6 @@ other.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -295,14 +294,3 @@ def pixels_per_mm(view: Seen, window: FlatWindow, along: Vector) -> tuple[Array,
     da, db = slopes_per_mm(view, window, along)
     xa, xb, ya, yb = view.jacobian
     return xa * da + xb * db, ya * da + yb * db
-
-
-def window_normal(xp: ModuleType, *, tilt_x_rad: Array, tilt_y_rad: Array) -> Vector:
-    """Unit normal in the module's frame, as `uwlts.model.sensor.Window.normal`."""
-    cosine = xp.cos(tilt_x_rad)
-    return cosine * xp.sin(tilt_y_rad), -xp.sin(tilt_x_rad), cosine * xp.cos(tilt_y_rad)
-
-
-def degrees(angle: Array) -> Array:
-    """An angle in rad in degrees."""
-    return angle * (180 / math.pi)

@@ -12,22 +12,11 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.design.geometry import (
-    Array,
-    FlatWindow,
-    Lens,
-    Pose,
-    Vector,
-    dot,
-    path_to,
-    pose_at,
-    standoff_mm,
-    window_normal,
-)
+from twin.design.geometry import Array, FlatWindow, Lens, Pose, Vector, dot, path_to, pose_at, standoff_mm
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.model.errors import DescriptionError
 from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Laser, Medium, Sensor, Window
+from uwlts.model.sensor import Medium, Sensor, Window
 
 Follow = Literal["focus", "waist", "volume"]
 
@@ -105,19 +94,15 @@ class Parameters:
     def pose(self, xp: ModuleType) -> Pose:
         """Pose of the laser in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
-        by_angle = pose_at(
-            xp, baseline_mm=self.baseline_mm, angle_rad=self.angle_rad, roll_rad=self.roll_rad, towards=towards
-        )
+        baseline, angle, roll = self.baseline_mm, self.angle_rad, self.roll_rad
+        by_angle = pose_at(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
         if not np.isfinite(self.placed[0][0]).any():
             return by_angle
         if xp is not np:
             return Pose(*self.placed)
-        vectors = (by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal)
-        chosen = [
-            tuple(np.where(np.isfinite(given), given, found) for given, found in zip(own, found_vector, strict=True))
-            for own, found_vector in zip(self.placed, vectors, strict=True)
-        ]
-        return Pose(*chosen)
+        vectors = by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal
+        pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
+        return Pose(*(tuple(np.where(np.isfinite(own), own, other) for own, other in pair) for pair in pairs))
 
     def along(self, pixels: tuple[Array, Array]) -> Array:
         """The one of a pair for x and y that belongs to the pixel along the stripe."""
@@ -131,21 +116,21 @@ class Parameters:
         """The camera's lens."""
         return Lens(self.focal_mm / self.pixel_mm, *self.principal_px, *self.distortion)
 
+    def _normal(self, xp: ModuleType) -> Vector:
+        """Unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""
+        cosine = xp.cos(self.window_tilt_x_rad)
+        tilt_y = self.window_tilt_y_rad
+        return cosine * xp.sin(tilt_y), -xp.sin(self.window_tilt_x_rad), cosine * xp.cos(tilt_y)
+
     def window(self, xp: ModuleType) -> FlatWindow:
         """The camera's window; unmounted one of no thickness in the pupil, with nothing but air behind it."""
-        normal = window_normal(xp, tilt_x_rad=self.window_tilt_x_rad, tilt_y_rad=self.window_tilt_y_rad)
-        return FlatWindow(
-            normal,
-            self.window_mounted * self.window_distance_mm * normal[2],
-            self.window_mounted * self.window_thickness_mm,
-            self.window_index,
-            self.medium_index,
-        )
+        normal, mounted = self._normal(xp), self.window_mounted
+        distance, thickness = mounted * self.window_distance_mm * normal[2], mounted * self.window_thickness_mm
+        return FlatWindow(normal, distance, thickness, self.window_index, self.medium_index)
 
     def outer_mm(self, xp: ModuleType) -> Array:
         """Depth on the camera's axis from which the volume counts: of the window's outer face, mounted or not."""
-        normal = window_normal(xp, tilt_x_rad=self.window_tilt_x_rad, tilt_y_rad=self.window_tilt_y_rad)
-        return self.window_distance_mm + self.window_thickness_mm / normal[2]
+        return self.window_distance_mm + self.window_thickness_mm / self._normal(xp)[2]
 
     def laser_window(self, axis: Vector) -> FlatWindow:
         """The laser's window, taken as square to its axis."""
@@ -217,14 +202,8 @@ def _columns(values: Sequence[Array]) -> Array:
 def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     """Parameters of one sensor in a medium, as plain numbers.
 
-    Raises
-    ------
-    DescriptionError
-        A window is left out although the medium is not air.
-    RangeError
-        A wavelength lies outside the tables of a medium or glass.
-    DesignError
-        A laser placed by its axis has no sheet.
+    DescriptionError where a window is left out although the medium is not air, RangeError for a wavelength outside the
+    tables of a medium or glass, DesignError for a laser placed by its axis that has no sheet.
     """
     camera, laser, detector, exposure = sensor.camera, sensor.laser, sensor.detector, sensor.exposure
     window, wavelength = camera.window, laser.wavelength_nm
@@ -233,15 +212,18 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
     glass, laser_glass = (w.index(wavelength) if w.mounted else 1.0 for w in (window, laser.window))
     by_axis = laser.origin_mm is not None
-    unplaced: Vector = (math.nan, math.nan, math.nan)
-    placed = unplaced, unplaced, unplaced, unplaced
+    placed: tuple[Vector, ...] = ((math.nan,) * 3,) * 4
     if by_axis:
         pose = laser_pose(sensor)
-        placed = _vector(pose.origin_mm), _vector(pose.axis), _vector(pose.fan), _vector(pose.normal)
+        placed = tuple(tuple(v.tolist()) for v in (pose.origin_mm, pose.axis, pose.fan, pose.normal))
     table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
-    d, angle = camera.distortion, laser.triangulation_angle_deg
+    d, angle, speckle = camera.distortion, laser.triangulation_angle_deg, 1.0
+    if laser.linewidth_nm > 0:
+        # The contrast that the line width leaves on a diffuse surface.
+        light = {"linewidth_nm": laser.linewidth_nm, "wavelength_nm": wavelength, "index": index}
+        speckle = coherence(_DIFFUSE_ROUGHNESS_UM, **light)
     numbers = {
         "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
         "angle_rad": math.nan if by_axis or angle is None else math.radians(angle),
@@ -289,35 +271,24 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "exposure_level": exposure.auto_level,
         "longest_ms": exposure.longest_ms,
         "ambient_w_per_mm2": 1e-6 * sensor.lamp.ambient_w_per_m2,
-        "speckle_coherence": _coherence(laser, index),
+        "speckle_coherence": speckle,
         "stage_resolution_mm": sensor.stage.resolution_mm,
         "near_mm": sensor.volume.near_mm,
         "far_mm": sensor.volume.far_mm,
     }
-    nodes = _normalised(table) if table else ((0.0, 0.0),)
+    # Powers per rad that integrate to 1.
+    angles, powers = (
+        np.radians([a for a, _ in table or ((0.0, 0.0),)]),
+        np.array([p for _, p in table or ((0.0, 0.0),)]),
+    )
+    powers = powers / np.trapezoid(powers, angles) if table else powers
     return Parameters(
         **{name: float(value) for name, value in numbers.items()},
         placed=placed,
         principal_px=camera.principal_point(),
         distortion=(d.k1, d.k2, d.k3, d.p1, d.p2),
-        fan_nodes_rad=tuple(float(angle) for angle, _ in nodes),
-        fan_powers=tuple(float(power) for _, power in nodes),
-    )
-
-
-def _vector(values: np.ndarray) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def _coherence(laser: Laser, index: float) -> float:
-    """Speckle contrast that a laser's line width leaves on a diffuse surface."""
-    if laser.linewidth_nm <= 0:
-        return 1.0
-    return float(
-        coherence(
-            _DIFFUSE_ROUGHNESS_UM, linewidth_nm=laser.linewidth_nm, wavelength_nm=laser.wavelength_nm, index=index
-        )
+        fan_nodes_rad=tuple(angles.tolist()),
+        fan_powers=tuple(powers.tolist()),
     )
 
 
@@ -325,12 +296,6 @@ def _passes(window: Window, glass: float, medium: float) -> float:
     """Share of light that passes both faces and the glass, square to them (Fresnel; Beer and Lambert)."""
     faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - medium) / (glass + medium)) ** 2)
     return faces * math.exp(-(window.absorption_per_mm() * window.thickness_mm * window.mounted))
-
-
-def _normalised(table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-    """Angles in rad and powers per rad that integrate to 1."""
-    angles, powers = np.radians([a for a, _ in table]), np.array([p for _, p in table])
-    return tuple(zip(angles, powers / np.trapezoid(powers, angles), strict=True))
 
 
 @cache

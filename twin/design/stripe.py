@@ -59,7 +59,8 @@ def stripe_at(
     whose standard deviation in one direction is R / 2; a pupil offset b shifts the image by b / a - ds/dP b, a being
     the focus distance and ds/dP how the image moves with the point. Light that the medium scatters counts as lost.
     """
-    across = tuple(p.along_width * y + (1 - p.along_width) * x for x, y in _image_rows(view))
+    xa, xb, ya, yb = view.jacobian
+    across = p.across((xa, ya)), p.across((xb, yb))
     from_laser = added(point, scaled(pose.origin, -1.0))
     away = xp.sqrt(dot(from_laser, from_laser))
     rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
@@ -139,12 +140,6 @@ def exposure_ms(xp: ModuleType, p: Parameters, brightest_e_per_ms: Array) -> tup
     if xp is np:
         return required, np.where(np.isnan(p.exposure_ms), automatic, p.exposure_ms)
     return required, automatic if math.isnan(p.exposure_ms) else p.exposure_ms
-
-
-def _image_rows(view: Seen) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Pairs of x's and y's derivative, by the first and the second slope."""
-    xa, xb, ya, yb = view.jacobian
-    return (xa, ya), (xb, yb)
 
 
 def _lit(xp: ModuleType, p: Parameters, angle: Array) -> Array:

@@ -38,16 +38,11 @@ class LineOfSight:
         wavelength = sensor.laser.wavelength_nm
         index, pose = medium.refractive_index(wavelength), camera_from_object(sensor)
         sine = math.sin(math.radians(sensor.laser.fan_angle_deg / 2)) / index
-        return cls(
-            camera=sensor.camera,
-            index=index,
-            window=FlatWindow.of(sensor.camera.window, medium, wavelength, np.eye(3))
-            if sensor.camera.window.mounted
-            else FlatWindow((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0),
-            pose=pose,
-            laser_mm=(laser_pose(sensor).origin_mm - pose[:3, 3]) @ pose[:3, :3],
-            fan_slope=sine / math.sqrt(1 - sine**2),
-        )
+        laser_mm = (laser_pose(sensor).origin_mm - pose[:3, 3]) @ pose[:3, :3]
+        window = FlatWindow((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
+        if sensor.camera.window.mounted:
+            window = FlatWindow.of(sensor.camera.window, medium, wavelength, np.eye(3))
+        return cls(sensor.camera, index, window, pose, laser_mm, sine / math.sqrt(1 - sine**2))
 
     def depth_mm(self, z: Array) -> Array:
         """Depth along the camera's axis, from its pupil, of points on the laser's axis through the stand-off."""
@@ -69,10 +64,8 @@ class LineOfSight:
         x, y, z = self.pose[:3, :3] @ points.T + self.pose[:3, 3:]
         # The formulas hold beyond the window's outer face only.
         outside = (dot((x, y, z), window.normal) > window.outer_mm) & (z > 0)
-        image = seen(
-            np, Lens.of(camera), window, (np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3))
-        )
-        within = margin_px - 0.5
+        ahead = np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3)
+        image, within = seen(np, Lens.of(camera), window, ahead), margin_px - 0.5
         in_width = (image.x >= within) & (image.x <= camera.width_px - 1 - within)
         return outside & in_width & (image.y >= within) & (image.y <= camera.height_px - 1 - within)
 
@@ -167,36 +160,38 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
     Behind a window in a medium denser than air, the target stands in air before the sensor without its window, and the
     step standard in the medium. Where light is not refracted, the target alone calibrates the sensor as it is used.
 
-    Raises
-    ------
-    DescriptionError
-        The sensor has no such medium, or the reflectance is not from 0 to 1.
-    DesignError
-        The sensor cannot work in it, with the reason and numbers.
+    DescriptionError where the sensor has no such medium or the reflectance is not from 0 to 1, DesignError where the
+    sensor cannot work in it, with the reason and numbers.
     """
     of_use = sensor.medium(medium)
     near, far = measured_range(sensor, of_use)
     sight = LineOfSight.of(sensor, of_use)
-    y, length = _line_to_cover(sight, near, far)
-    standard = Recording("standard", sensor, _standard(medium, near, far, y, length, reflectance))
+    # The middle in Y of the line at the near end, and a length that covers it at the far end.
+    at_near, at_far = sight.line_mm(near), sight.line_mm(far)
+    y = float(at_near[0] + at_near[-1]) / 2
+    length = 2 * _OVERSIZE * float(max(at_far[-1] - y, y - at_far[0]))
+    plane = {"kind": "plate", "position_mm": (0.0, y, 0.0), "reflectance": reflectance}
+    plane |= {"width_mm": length, "height_mm": length}
+    motion = _travel(near, far, STANDARD_DEPTHS)
+    scene = _scene("Plane standard", medium, motion=motion, objects=[plane], artefact={"kind": "plane"})
+    standard = Recording("standard", sensor, scene)
     exposed = Exposure.model_validate(sensor.exposure.model_dump() | {"laser_ms": "auto", "lamp_ms": "auto"})
     calibrated = sensor.model_copy(update={"exposure": exposed})
     if not (sensor.camera.window.mounted and sight.index > 1 + 1e-6):
         return Recordings(_target(calibrated, medium, sight, near, far, y), None, standard)
     step = Recording("step", calibrated, _step(medium, near, far, y, length))
     in_air, air = _with_air(calibrated)
-    bare = LineOfSight.of(_without_window(in_air), in_air.medium(air))
+    window = in_air.camera.window.model_copy(update={"mounted": False})
+    camera = in_air.camera.model_copy(update={"window": window})
+    bare = LineOfSight.of(in_air.model_copy(update={"camera": camera}), in_air.medium(air))
     return Recordings(_target(in_air, air, bare, near, far, y), step, standard)
 
 
 def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     """Nearest and farthest Z in mm, OCS, in the measuring volume at which the camera sees the line, less a margin.
 
-    Raises
-    ------
-    DesignError
-        As `uwlts.model.placement.check_design`, or the laser shines back towards the camera, or the camera sees
-        nothing of what the laser lights in the volume.
+    DesignError as of `uwlts.model.placement.check_design`, and where the laser shines back towards the camera or the
+    camera sees nothing of what the laser lights in the volume.
     """
     standoff = check_design(sensor, medium).standoff_mm
     sight, volume = LineOfSight.of(sensor, medium), sensor.volume
@@ -217,18 +212,6 @@ def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     return float(lit[0] + margin), float(lit[-1] - margin)
 
 
-def _line_to_cover(sight: LineOfSight, near: float, far: float) -> tuple[float, float]:
-    """Middle in Y of the line at the near end of a depth range, and a length that covers it at the far end, mm."""
-    at_near, at_far = sight.line_mm(near), sight.line_mm(far)
-    y = float(at_near[0] + at_near[-1]) / 2
-    return y, 2 * _OVERSIZE * float(max(at_far[-1] - y, y - at_far[0]))
-
-
-def _without_window(sensor: Sensor) -> Sensor:
-    window = sensor.camera.window.model_copy(update={"mounted": False})
-    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
-
-
 def _with_air(sensor: Sensor) -> tuple[Sensor, str]:
     """The sensor with air among its media, and what it is called there."""
     for name, medium in sensor.media.items():
@@ -236,16 +219,6 @@ def _with_air(sensor: Sensor) -> tuple[Sensor, str]:
             return sensor, name
     name = "air" if "air" not in sensor.media else "air to calibrate in"
     return sensor.model_copy(update={"media": sensor.media | {name: Medium(kind="air")}}), name
-
-
-# --- standards in the medium of use -----------------------------------------------------------------------------------
-
-
-def _standard(medium: str, near: float, far: float, y: float, length: float, reflectance: float) -> Scene:
-    plate = {"kind": "plate", "position_mm": (0.0, y, 0.0), "reflectance": reflectance}
-    plate |= {"width_mm": length, "height_mm": length}
-    motion = _travel(near, far, STANDARD_DEPTHS)
-    return _scene("Plane standard", medium, motion=motion, objects=[plate], artefact={"kind": "plane"})
 
 
 def _step(medium: str, near: float, far: float, y: float, length: float) -> Scene:
@@ -261,9 +234,13 @@ def _step(medium: str, near: float, far: float, y: float, length: float) -> Scen
         }
         for side, front in ((-1, height / 2), (1, -height / 2))
     ]
-    artefact = {"kind": "step", "height_mm": height, "edge_mm": _EDGE * length}
-    travel = _travel(near + height / 2, far - height / 2, STEP_DEPTHS)
-    return _scene("Step standard", medium, motion=travel, objects=blocks, artefact=artefact)
+    return _scene(
+        "Step standard",
+        medium,
+        motion=_travel(near + height / 2, far - height / 2, STEP_DEPTHS),
+        objects=blocks,
+        artefact={"kind": "step", "height_mm": height, "edge_mm": _EDGE * length},
+    )
 
 
 def _travel(near: float, far: float, count: int) -> dict[str, object]:
@@ -276,27 +253,24 @@ def _scene(title: str, medium: str, **rest: object) -> Scene:
     return validated(Scene, {"title": title, "medium": medium} | rest, title)
 
 
-# --- the target -------------------------------------------------------------------------------------------------------
-
-
 def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: float, y: float) -> Recording:
     """A plate of circles square to Z, moved through the depths about a range at which its three marks are well seen.
 
     The marks stand about X = 0 and Y = ``y``; the stripe runs midway between two columns, over a plain ground.
-
-    Raises
-    ------
-    DesignError
-        The marks are well seen at no two depths.
+    DesignError where the marks are well seen at no two depths.
     """
     depths = np.linspace(_NEARER * sight.depth_mm(near), _FARTHER * sight.depth_mm(far), _DEPTHS_TRIED)
     sharp = depths[longest_run(sight.blur_px(depths) <= _LARGEST_BLUR_PX)]
-    # The circles' size follows from the range, the range at which the marks are wholly in view from their size.
+    # The circles' size follows from the range, the range at which the marks are wholly in view from their size. Circles
+    # are large enough in the image at all depths, seen from aslant and out of focus.
     roughly = _marks_in_view(sight, sharp, 0.0, y)
-    diameter = _circle_diameter(sight, roughly)
-    seen = sight.z_at(_marks_in_view(sight, roughly, diameter, y))
+    ends, aslant = roughly[[0, -1]], sight.pose[2, 2]
+    least = np.maximum(_SMALLEST_CIRCLE_PX / aslant, _CIRCLE_BLURS * sight.blur_px(ends)) * ends
+    usual = _CIRCLE_PX / aslant * math.sqrt(ends[0] * ends[1])
+    diameter = round(float(max(usual, *least)) / sight.camera.focal_length_px(), 4)
+    z = sight.z_at(_marks_in_view(sight, roughly, diameter, y))
     spacing = 2 * diameter
-    columns, rows = (math.ceil(side / spacing) for side in sight.half_target_mm(seen[-1], y))
+    columns, rows = (math.ceil(side / spacing) for side in sight.half_target_mm(z[-1], y))
     lattice = {
         "spacing_x_mm": spacing,
         "spacing_y_mm": spacing,
@@ -320,20 +294,16 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: f
     scene = _scene(
         "Circle target",
         medium,
-        motion=_travel(float(seen[0]), float(seen[-1]), TARGET_POSES) | {"lights": ("lamp", "laser")},
+        motion=_travel(float(z[0]), float(z[-1]), TARGET_POSES) | {"lights": ("lamp", "laser")},
         objects=[plate],
         target={"kind": "circles"} | lattice,
         window_mounted=sight.camera.window.mounted,
     )
-    return Recording("target", _with_volume(sensor, sight, seen), scene)
-
-
-def _with_volume(sensor: Sensor, sight: LineOfSight, z: np.ndarray) -> Sensor:
-    """The sensor with a volume that holds depths Z: air shows the image rows of its own volume at other depths."""
+    # Air shows the image rows of the sensor's volume at other depths: the volume must hold those.
     window = sensor.camera.window
     near, far = sight.depth_mm(z[[0, -1]]) - window.distance_mm - window.thickness_mm
     volume = Volume(near_mm=max(0.9 * near, 1e-3 * far), far_mm=1.1 * far)
-    return sensor.model_copy(update={"volume": volume})
+    return Recording("target", sensor.model_copy(update={"volume": volume}), scene)
 
 
 def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: float) -> np.ndarray:
@@ -354,11 +324,3 @@ def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: f
             f"{sight.camera.focus_distance_mm:g}), or change baseline, angle or focal length"
         )
     return seen
-
-
-def _circle_diameter(sight: LineOfSight, depths: np.ndarray) -> float:
-    """Diameter in mm of circles that are large enough in the image at all depths, seen from aslant and out of focus."""
-    ends, aslant = depths[[0, -1]], sight.pose[2, 2]
-    least = np.maximum(_SMALLEST_CIRCLE_PX / aslant, _CIRCLE_BLURS * sight.blur_px(ends)) * ends
-    usual = _CIRCLE_PX / aslant * math.sqrt(ends[0] * ends[1])
-    return round(float(max(usual, *least)) / sight.camera.focal_length_px(), 4)
