@@ -39,8 +39,8 @@ class Variable(Description):
 
     @model_validator(mode="after")
     def _range_or_values(self) -> Variable:
-        ends = (self.least, self.most)
-        if (self.values is None) == (None in ends) or (self.values is not None and any(e is not None for e in ends)):
+        given = [self.least is not None, self.most is not None, self.values is not None]
+        if given not in ([True, True, False], [False, False, True]):
             raise ValueError("give least and most, or values")
         if self.values is not None:
             if not self.values:
@@ -56,13 +56,7 @@ class Variable(Description):
         return self
 
     def ends(self) -> tuple[float, float]:
-        """Least and most value of a range.
-
-        Raises
-        ------
-        DescriptionError
-            The variable is a list of values.
-        """
+        """Least and most value of a range; DescriptionError where the variable is a list of values."""
         if self.least is None or self.most is None:
             raise DescriptionError(f"a variable with the values {self.values} has no least and most")
         return self.least, self.most
@@ -169,7 +163,7 @@ class Study(Description):
 
     @model_validator(mode="after")
     def _set_once(self) -> Study:
-        chosen = {path for options in self.choices.values() for option in options.values() for path in option}
+        chosen = self.chosen()
         if twice := sorted(set(self.variables) & chosen):
             raise ValueError(f"{twice[0]} is set by a variable and by a choice")
         for what, path in FOLLOWING.items():
@@ -181,12 +175,16 @@ class Study(Description):
 
     @model_validator(mode="after")
     def _not_too_many(self) -> Study:
-        count = math.prod(
-            variable.steps if variable.values is None else len(variable.values) for variable in self.free().values()
-        )
+        free = self.free().values()
+        count = math.prod(one.steps if one.values is None else len(one.values) for one in free)
         if self.sampling.kind == "grid" and count > MOST_DESIGNS:
             raise ValueError(f"a grid of {count:.3g} designs; at most {MOST_DESIGNS:g}: take fewer steps, or sobol")
         return self
+
+    def chosen(self) -> dict[str, None]:
+        """Paths that options of choices set, in order."""
+        options = (option for options in self.choices.values() for option in options.values())
+        return dict.fromkeys(path for option in options for path in option)
 
     def free(self) -> dict[str, Variable]:
         """All that is free, in order: variables, then choices by the names of their options."""
@@ -214,11 +212,7 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
     """Study by name (``baseline-angle``) or path; a sensor beside it is found by its file name.
 
     ``designs`` and ``verify`` replace the study's own; a study that is given as such is checked in the same way.
-
-    Raises
-    ------
-    DescriptionError
-        The study is not valid, or a path does not exist in the sensor's description.
+    DescriptionError where the study is not valid, or a path does not exist in the sensor's description.
     """
     if isinstance(study, Study):
         path, table = Path("the study"), study.model_dump()
@@ -234,29 +228,21 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
         table["verify"] = verify
     found = validated(Study, table, path)
     found.medium_of(found.sensor)
-    for option in (option for options in found.choices.values() for option in options.values()):
-        for name in option:
-            value_at(found.sensor, name, path)
+    for name in found.chosen():
+        value_at(found.sensor, name, path)
     counted = [name for name in found.variables if type(value_at(found.sensor, name, path)) is int]
     whole = {name: found.variables[name].model_copy(update={"whole": True}) for name in counted}
     return found.model_copy(update={"variables": found.variables | whole})
 
 
 def value_at(sensor: Sensor, name: str, source: str | Path = "the study") -> Value | None:
-    """Value at a path of a sensor's description.
-
-    Raises
-    ------
-    DescriptionError
-        The path does not exist in the description, or leads to a table.
-    """
+    """Value at a path of a sensor's description; DescriptionError where it does not exist or leads to a table."""
     found: object = sensor.model_dump()
     for key in name.split("."):
         if not isinstance(found, dict) or key not in found:
             there = ", ".join(map(str, found)) if isinstance(found, dict) else "nothing"
-            raise DescriptionError(
-                f"{source}: the sensor's description has no '{name}': there is no '{key}', but {there}"
-            )
+            missing = f"the sensor's description has no '{name}': there is no '{key}', but {there}"
+            raise DescriptionError(f"{source}: {missing}")
         found = found[key]
     if isinstance(found, dict):
         raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(map(str, found))}")

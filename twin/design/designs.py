@@ -69,13 +69,7 @@ class Marked:
 
 
 def sensor_of(study: Study, design: Design) -> Sensor:
-    """The design's sensor, before anything follows the stand-off.
-
-    Raises
-    ------
-    DescriptionError, RangeError
-        The values make no valid description.
-    """
+    """The design's sensor, before anything follows the stand-off; errors where the values make no description."""
     changes: dict[str, Value] = {}
     for name, value in design.values.items():
         changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
@@ -126,12 +120,8 @@ def judged(study: Study, designs: Sequence[Design]) -> Columns:
     columns["violation"] = np.full(len(designs), math.inf)
     if numbers:
         places = np.array(list(numbers))
-        figures, reasons = figures_of(
-            stacked(list(numbers.values())),
-            reflectance=study.reflectance,
-            water_depth_m=study.water_depth_m,
-            follow=study.follow,
-        )
+        options = {"reflectance": study.reflectance, "water_depth_m": study.water_depth_m, "follow": study.follow}
+        figures, reasons = figures_of(stacked(list(numbers.values())), **options)
         for place, reason in zip(places, reasons, strict=True):
             failures[place] = reason
         works = np.array([not reason for reason in reasons])
@@ -144,10 +134,7 @@ def judged(study: Study, designs: Sequence[Design]) -> Columns:
 def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
     """A sensor that is not one of the study's designs, evaluated; nothing in it follows the stand-off.
 
-    Raises
-    ------
-    DesignError
-        The sensor cannot work.
+    DesignError where the sensor cannot work.
     """
     numbers = parameters_of([sensor], [study.medium_of(sensor)])
     figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)

@@ -69,19 +69,15 @@ def rows_in(path: Path) -> int:
 def read_parts(folder: Path) -> Columns:
     """Columns of all designs of a folder, in the order of their numbers; empty where there are none.
 
-    Raises
-    ------
-    CaptureError
-        A part is damaged or foreign.
+    CaptureError where a part is damaged or foreign.
     """
     tables = []
     for path in parts(folder):
         try:
             tables.append(pq.read_table(path))
         except (pa.ArrowException, OSError) as error:
-            raise CaptureError(
-                f"{path} is damaged: {error}; remove it, and the sweep judges its designs anew"
-            ) from error
+            advice = "remove it, and the sweep judges its designs anew"
+            raise CaptureError(f"{path} is damaged: {error}; {advice}") from error
     if not tables:
         return {}
     try:
@@ -128,16 +124,13 @@ class Search:
         self._space = {name: _distribution(variable) for name, variable in study.free().items()}
         journal = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
         # Several machines must not propose the same designs: the seed is for the first of them only.
-        known = _NAME in optuna.get_all_study_names(journal)
-        sampler = optuna.samplers.NSGAIISampler(
-            population_size=_POPULATION, seed=None if known else study.sampling.seed
-        )
+        seed = None if _NAME in optuna.get_all_study_names(journal) else study.sampling.seed
         self._optuna = optuna.create_study(
             storage=journal,
-            sampler=sampler,
+            sampler=optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed),
             study_name=_NAME,
             load_if_exists=True,
-            directions=["minimize" if objective.goal == "minimise" else "maximize" for objective in study.objectives],
+            directions=[objective.goal.replace("ise", "ize") for objective in study.objectives],
         )
 
     def ask(self, count: int) -> list[Design]:
@@ -197,14 +190,8 @@ def judged_part(batch: Batch) -> bytes:
 def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda done, total: None) -> None:
     """Judge all designs of a study that are not judged yet, into parts below ``folder``.
 
-    Raises
-    ------
-    DescriptionError
-        The folder holds another study.
-    OutputError
-        A part cannot be written.
-    SetupError
-        The workers' cluster is gone.
+    DescriptionError where the folder holds another study, OutputError where a part cannot be written, SetupError where
+    the workers' cluster is gone.
     """
     keep_to_plan(study, folder)
     place = made_folder(folder / PARTS)
@@ -236,8 +223,7 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress =
 def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
     """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
     search = Search(study, folder)
-    known = read_parts(place)
-    if known:
+    if known := read_parts(place):
         search.report(known)
     total = study.sampling.designs
     # Other machines may add designs of their own.
@@ -245,10 +231,8 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
         progress(done, total)
         asked = search.ask(min(study.sampling.batch, total - done))
         share = -(-len(asked) // workers.count)
-        batches = [
-            Batch(study, tuple(asked[i : i + share]), asked[i].number, len(asked[i : i + share]))
-            for i in range(0, len(asked), share)
-        ]
+        shares = [tuple(asked[i : i + share]) for i in range(0, len(asked), share)]
+        batches = [Batch(study, designs, designs[0].number, len(designs)) for designs in shares]
         for batch, result in workers.completed(judged_part, batches):
             content = _content(batch, result)
             write_part(place, batch.first, content)
@@ -261,25 +245,23 @@ def _content(batch: Batch, result: bytes | Lost) -> bytes:
     """A part's content; of a batch whose worker died, all designs fail with the reason, until it is tried again."""
     if not isinstance(result, Lost):
         return result
-    designs = batch.all()
-    columns = judged(batch.study, [])
-    columns = {name: np.full(len(designs), np.nan) for name in columns} | {
-        "design": np.array([design.number for design in designs]),
-        "violation": np.full(len(designs), np.inf),
-        "failure": np.array([result.reason] * len(designs), dtype=object),
-    }
-    for name in batch.study.free():
-        columns[name] = np.array([design.values[name] for design in designs])
-    return as_part(columns)
+    designs, study = batch.all(), batch.study
+    columns = {name: np.full(len(designs), np.nan) for name in judged(study, [])}
+    columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
+    return as_part(
+        columns
+        | {
+            "design": np.array([design.number for design in designs]),
+            "violation": np.full(len(designs), np.inf),
+            "failure": np.array([result.reason] * len(designs), dtype=object),
+        }
+    )
 
 
 def keep_to_plan(study: Study, folder: Path) -> None:
     """Write down what a folder's study is, or make sure that it is the same.
 
-    Raises
-    ------
-    DescriptionError
-        The folder holds another study, or other files.
+    DescriptionError where the folder holds another study, or other files.
     """
     made_folder(folder)
     plan = json.loads(study.model_dump_json(exclude=set(_FREE_TO_CHANGE)))

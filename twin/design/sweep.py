@@ -18,7 +18,7 @@ import numpy as np
 import tomli_w
 
 from twin.design.choice import choose
-from twin.design.description import Study, Value, load_study
+from twin.design.description import Study, load_study
 from twin.design.designs import Columns, Marked
 from twin.design.report.page import page_text
 from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
@@ -40,17 +40,14 @@ class SweepResult:
 
     Attributes
     ----------
-    study : Study
     folder : Path
         Folder of report.html, designs.csv, summary.json and winner.toml.
     columns : dict of str to (N,) array
         All N designs: "design", the free values, the figures of merit (units in their names), "violation", "failure".
     marked : tuple of Marked
         Base sensor, best design and refined design, as far as they work and are better; the last is the winner.
-    agreements : tuple of Agreement
-        Comparison of formulas and rendering for each rendered design.
-    notes : tuple of str
-        Sentences on the choice.
+    agreements, notes
+        Comparison of formulas and rendering for each rendered design; sentences on the choice.
     """
 
     study: Study
@@ -75,8 +72,9 @@ class SweepResult:
         lines = ["{} designs, {} work, {} meet all constraints".format(*self.counts()), *self.notes]
         names = [*self.study.free(), *self.study.wanted()]
         for one in self.marked:
-            table = one.design.table()
-            values = (f"{name} {_short(table[name])}" for name in names)
+            table = one.design.table().items()
+            texts = {name: f"{value:.5g}" if isinstance(value, float) else str(value) for name, value in table}
+            values = (f"{name} {texts[name]}" for name in names)
             lines.append(f"{one.label}{' (chosen)' if one is self.winner else ''}: {', '.join(values)}")
         for found in self.agreements:
             if found.failure:
@@ -89,10 +87,6 @@ class SweepResult:
                 f"largest systematic error {worst:.3f} mm, {found.seconds:.0f} s"
             )
         return [*lines, f"wrote {self.folder / PAGE}, {TABLE}, {SUMMARY} and {WINNER}"]
-
-
-def _short(value: Value | None) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def sweep(
@@ -168,7 +162,10 @@ def sweep(
         write_csv(folder / TABLE, columns)
         chosen = choose(described, columns)
         winner = chosen.marked[-1]
-        write_winner(folder / WINNER, described, winner)
+        notes = f"{winner.label} of the study: {described.title}"
+        sensor = winner.sensor.model_copy(update={"name": f"{winner.sensor.name}-winner", "notes": notes})
+        with written_aside(folder / WINNER, overwrite=True) as aside:
+            aside.write_text(tomli_w.dumps(sensor.model_dump(mode="json", exclude_none=True)), encoding="utf-8")
         agreements: list[Agreement] = []
         if described.verify:
             rendered = [winner, *(one for one in chosen.marked if one.design.number < 0), *chosen.further]
@@ -179,14 +176,6 @@ def sweep(
     write_page(folder / PAGE, page, overwrite=True)
     write_summary(result)
     return result
-
-
-def write_winner(path: Path, study: Study, winner: Marked) -> None:
-    """Write the winning sensor as a description that every command takes."""
-    notes = f"{winner.label} of the study: {study.title}"
-    sensor = winner.sensor.model_copy(update={"name": f"{winner.sensor.name}-winner", "notes": notes})
-    with written_aside(path, overwrite=True) as aside, open(aside, "wb") as file:
-        tomli_w.dump(sensor.model_dump(mode="json", exclude_none=True), file)
 
 
 def write_summary(result: SweepResult) -> None:
@@ -221,13 +210,12 @@ def clear(folder: Path) -> None:
     for pattern in (f"{PARTS}/part-*.parquet", f"{PARTS}/lost-*.parquet", f"{RENDERED}/*.parquet"):
         for path in folder.glob(pattern):
             path.unlink()
-    for place in (folder, folder / PARTS, folder / RENDERED):
+    for place in (folder / PARTS, folder / RENDERED, folder):
         for path in place.glob(".*"):
             # What was being written when an earlier sweep was killed.
             if path.is_file() and re.fullmatch(r"\.[0-9a-f]{16}\.(parquet|json|csv|toml|html)", path.name):
                 path.unlink()
-    for place in (folder / PARTS, folder / RENDERED):
-        if place.is_dir() and not any(place.iterdir()):
+        if place != folder and place.is_dir() and not any(place.iterdir()):
             place.rmdir()
     for name in (PLAN, JOURNAL, f"{JOURNAL}.lock", PAGE, TABLE, WINNER, SUMMARY):
         (folder / name).unlink(missing_ok=True)

@@ -89,18 +89,10 @@ def verify(
     cloud stay only if ``keep`` is set. Equal arguments give equal results. With one worker the images are rendered in
     this process, else in processes of their own.
 
-    Raises
-    ------
-    DescriptionError, DesignError
-        The sensor cannot work in the medium, or not be calibrated.
-    CalibrationError, CaptureError
-        The sensor's software cannot calibrate the sensor or finds no stripe; the message is the software's.
-    EvaluationError
-        The cloud has too few points at every depth.
-    OutputError
-        A file cannot be written.
-    SetupError
-        A process was ended from outside, or the machine cannot render.
+    DescriptionError or DesignError where the sensor cannot work in the medium, or not be calibrated; CalibrationError
+    or CaptureError where its software cannot calibrate it or finds no stripe, with the software's message;
+    EvaluationError where the cloud has too few points at every depth; OutputError where a file cannot be written;
+    SetupError where a process was ended from outside, or the machine cannot render.
     """
     if workers < 1:
         raise errors.DescriptionError(f"workers is {workers}; it must be at least 1")
@@ -311,13 +303,7 @@ def render(
     """Verify candidates, in their order; each result is kept in a file of ``folder``.
 
     What was rendered before is taken from there, but what failed is tried again.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
-    SetupError
-        The workers' cluster is gone.
+    OutputError where a file cannot be written, SetupError where the workers' cluster is gone.
     """
     made_folder(folder)
     paths = []

@@ -107,12 +107,8 @@ class FrontView:
 def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     """Side and front view of a sensor in a medium.
 
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis in front of the window, or the laser shines back.
-    DescriptionError, RangeError
-        As `twin.design.parameters.numbers_of`.
+    DesignError where the sheet does not cross the camera's axis in front of the window, or the laser shines back; else
+    errors as of `twin.design.parameters.numbers_of`.
     """
     pose, p, camera = laser_pose(sensor), parameters_of([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())
