@@ -164,7 +164,7 @@ class Study(Description):
     @model_validator(mode="after")
     def _set_once(self) -> Study:
         chosen = self.chosen()
-        if twice := sorted(set(self.variables) & chosen):
+        if twice := sorted(chosen.keys() & self.variables):
             raise ValueError(f"{twice[0]} is set by a variable and by a choice")
         for what, path in FOLLOWING.items():
             if what in self.follow and path in (*self.variables, *chosen):

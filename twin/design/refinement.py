@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import ModuleType
 
 import numpy as np
@@ -56,11 +56,6 @@ def _rms(name: str, depth: int | None = None) -> Smooth:
     return lambda xp, p, f, mean: xp.sqrt(mean(getattr(f, name) ** 2, depth))
 
 
-def _line(depth: int) -> Smooth:
-    """Length of the stripe at one depth."""
-    return lambda xp, p, f, mean: 2 * mean(f.half_line_mm, depth)
-
-
 def _largest(xp: ModuleType, values: Array) -> Array:
     """The largest value: one of them where several are alike, of which a maximum would add up the derivatives."""
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
@@ -79,9 +74,9 @@ SMOOTH: dict[str, Smooth] = {
     "sigma_z_near_mm": _rms("sigma_z_mm", 0),
     "sigma_z_middle_mm": _rms("sigma_z_mm", MIDDLE),
     "sigma_z_far_mm": _rms("sigma_z_mm", DEPTHS - 1),
-    "line_near_mm": _line(0),
-    "line_mm": _line(MIDDLE),
-    "line_far_mm": _line(DEPTHS - 1),
+    "line_near_mm": lambda xp, p, f, mean: 2 * mean(f.half_line_mm, 0),
+    "line_mm": lambda xp, p, f, mean: 2 * mean(f.half_line_mm, MIDDLE),
+    "line_far_mm": lambda xp, p, f, mean: 2 * mean(f.half_line_mm, DEPTHS - 1),
     "required_ms": lambda xp, p, f, mean: f.required_ms,
     "standoff_mm": lambda xp, p, f, mean: standoff_mm(p.pose(xp)) - p.outer_mm(xp),
     "near_mm": lambda xp, p, f, mean: p.near_mm,
@@ -93,22 +88,8 @@ SMOOTH: dict[str, Smooth] = {
 """Figures that can be derived. For coverage the laser counts as reaching whatever the camera sees."""
 
 
-@dataclass(frozen=True)
-class Derived:
-    """Values of figures, and their derivatives by the free numbers (figures, numbers) in the paths' own units."""
-
-    values: np.ndarray
-    gradient: np.ndarray
-
-
 class DerivedFigures:
-    """Figures of a design as functions of those of its free numbers that can be derived.
-
-    Attributes
-    ----------
-    paths : list of str
-        The numbers, in the order in which values are given.
-    """
+    """Figures of a design as functions of those of its free numbers, ``paths``, that can be derived."""
 
     def __init__(self, study: Study, design: Design, figures: list[str]):
         use_variant()
@@ -117,24 +98,18 @@ class DerivedFigures:
 
         self._dr, self._float = dr, Float64
         sensor = sensor_of(study, design)
-        by_baseline = sensor.laser.baseline_mm is not None
-        self.paths = [
-            path
-            for path, variable in study.variables.items()
-            if path in PARAMETER_OF
-            and variable.values is None
-            and not variable.whole
-            and (by_baseline or path not in _OF_BASELINE)
-        ]
+        known = set(PARAMETER_OF) - (set() if sensor.laser.baseline_mm is not None else set(_OF_BASELINE))
+        free = ((path, one) for path, one in study.variables.items() if path in known)
+        self.paths = [path for path, variable in free if variable.values is None and not variable.whole]
         self._figures, self._study = figures, study
         self._parameters = numbers_of(sensor, study.medium_of(sensor))
         shares, places = np.meshgrid(np.linspace(0, 1, DEPTHS), np.linspace(-1, 1, PLACES), indexing="ij")
         self._shares, self._places = Float64(shares.ravel()), Float64(places.ravel() * (1 - 1e-9))
 
-    def at(self, values: np.ndarray) -> Derived:
-        """Figures and derivatives at values (K,) of the free numbers."""
+    def at(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Figures (F,) at values (K,) of the free numbers, and derivatives (F, K) by these, in the paths' own units."""
         found = [self._derived(values, number) for number in range(len(self.paths))]
-        return Derived(np.array(found[-1][0]), np.array([change for _, change in found]).T)
+        return np.array(found[-1][0]), np.array([change for _, change in found]).T
 
     def _derived(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
         """Figures, and their derivatives by one number."""
@@ -173,44 +148,40 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
     returns whether a design is better than the start; where it rejects the end, the step is halved. None if nothing has
     a derivative, or nothing better is found.
     """
-    objective = study.objectives[0]
-    bounds = [(name, bound) for name, bound in study.constraints.items() if name in SMOOTH]
+    objective, bounds = study.objectives[0], [bound for bound in study.bounds() if bound[0] in SMOOTH]
     if objective.figure not in SMOOTH:
         return None
-    figures = DerivedFigures(study, design, [objective.figure, *(name for name, _ in bounds)])
+    names = list(dict.fromkeys([objective.figure, *(name for name, _, _ in bounds)]))
+    figures = DerivedFigures(study, design, names)
     if not figures.paths:
         return None
     low, most = np.array([study.variables[path].ends() for path in figures.paths]).T
     wide = most - low
     start = (np.array([design.values[path] for path in figures.paths]) - low) / wide
-    known: dict[bytes, Derived] = {}
+    known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-    def at(shares: np.ndarray) -> Derived:
-        key = np.clip(shares, 0, 1).tobytes()
-        if key not in known:
-            known[key] = figures.at(low + np.clip(shares, 0, 1) * wide)
+    def at(shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Figures, and derivatives by the shares of the ranges."""
+        clipped = np.clip(shares, 0, 1)
+        if (key := clipped.tobytes()) not in known:
+            values, gradient = figures.at(low + clipped * wide)
+            known[key] = values, gradient * wide
         return known[key]
 
-    sign = 1.0 if objective.goal == "minimise" else -1.0
-    scale = sign / (abs(at(start).values[0]) or 1.0)
-    sides = [
-        (place, side / max(abs(limit), 1.0), limit)
-        for place, (_, bound) in enumerate(bounds, start=1)
-        for side, limit in ((1.0, bound.least), (-1.0, bound.most))
-        if limit is not None
-    ]
-    places, sizes, limits = np.array(sides).reshape(-1, 3).T
-    places = places.astype(int)
+    scale = (1.0 if objective.goal == "minimise" else -1.0) / (abs(at(start)[0][0]) or 1.0)
+    places = [names.index(name) for name, _, _ in bounds]
+    limits = np.array([limit for _, _, limit in bounds])
+    sizes = np.array([-sign / max(abs(limit), 1.0) for _, sign, limit in bounds])
     found = minimize(
-        lambda x: scale * at(x).values[0],
+        lambda x: scale * at(x)[0][0],
         start,
-        jac=lambda x: scale * at(x).gradient[0] * wide,
+        jac=lambda x: scale * at(x)[1][0],
         method="SLSQP",
         bounds=[(0.0, 1.0)] * len(start),
         constraints={
             "type": "ineq",
-            "fun": lambda x: sizes * (at(x).values[places] - limits),
-            "jac": lambda x: sizes[:, None] * at(x).gradient[places] * wide,
+            "fun": lambda x: sizes * (at(x)[0][places] - limits),
+            "jac": lambda x: sizes[:, None] * at(x)[1][places],
         },
         options={"maxiter": _STEPS, "ftol": _TOLERANCE},
     )
