@@ -148,7 +148,7 @@ class Study(Description):
         return load_sensor(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _figures_known(self) -> Study:
+    def _consistent(self) -> Study:
         if unknown := [name for name in self.wanted() if name not in FIGURES]:
             raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
         if not self.variables and not self.choices:
@@ -159,10 +159,6 @@ class Study(Description):
             raise ValueError(f"choices.{empty[0]} has no options")
         if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
             raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
-        return self
-
-    @model_validator(mode="after")
-    def _set_once(self) -> Study:
         chosen = self.chosen()
         if twice := sorted(chosen.keys() & self.variables):
             raise ValueError(f"{twice[0]} is set by a variable and by a choice")
@@ -171,10 +167,6 @@ class Study(Description):
                 raise ValueError(f"{path} is free, but follow sets it: leave '{what}' out of follow, or the path")
         if unfit := [path for path in (*self.variables, *chosen) if path.startswith("laser.window.tilt")]:
             raise ValueError(f"{unfit[0]}: the formulas do not know it; compare two rendered sensors instead")
-        return self
-
-    @model_validator(mode="after")
-    def _not_too_many(self) -> Study:
         free = self.free().values()
         count = math.prod(one.steps if one.values is None else len(one.values) for one in free)
         if self.sampling.kind == "grid" and count > MOST_DESIGNS:

@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 import plotly.graph_objects as go
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.colors import LogNorm, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import LinearNDInterpolator
@@ -227,39 +227,46 @@ def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None
     names, free = (x, y), judged.study.free()
     variables = [judged.study.variables[name] for name in names]
     columns = [np.asarray(judged.columns[name], dtype=float) for name in names]
-    axes = [np.unique(column) for column in columns]
+    axes, caption = [np.unique(column) for column in columns], ""
     scattered = len(axes[0]) * len(axes[1]) > 2 * len(judged)
-    if scattered and len(free) == 2:
+    if alone := scattered and len(free) == 2:
         shares = [share_of(variable, column) for variable, column in zip(variables, columns, strict=True)]
-        return _interpolated(judged, variables, np.column_stack(shares), figures)
-    cells = int(np.clip(math.sqrt(len(judged) / _PER_CELL), *_CELLS)) if scattered else _MOST_STEPS
-    for k, variable in enumerate(variables):
-        if scattered or len(axes[k]) > cells:
-            axes[k] = np.array([variable.at((cell + 0.5) / cells) for cell in range(cells)])
-    # Every design belongs to the cell of the axes' nearest values.
-    i, j = (np.searchsorted((a[1:] + a[:-1]) / 2, column) for a, column in zip(axes, columns, strict=True))
-    shape = (len(axes[1]), len(axes[0]))
-    best = np.full(shape, -1)
-    # Of several designs the last one written stays: failed ones first, then from the worst to the best.
-    order = np.concatenate([np.flatnonzero(~judged.works), judged.best_first[::-1]])
-    best[j[order], i[order]] = order
-    works = (best >= 0) & judged.works[best]
-    values = {name: np.where(works, judged.figure(name)[best], np.nan) for name in figures}
-    failures = np.where(best >= 0, np.array(judged.failures, dtype=object)[best], "")
-    caption = ""
-    if others := [words_of(name) for name in free if name not in names]:
-        caption = (
-            f"{listed(others).capitalize()} also vary: each place shows the design there that misses the constraints "
-            f"least and then has the best {words_of(judged.study.objectives[0].figure)}."
-        )
-    reasons = _reasons(judged, values, failures)
-    return Map(axes[0], axes[1], values, reasons, smooth=not scattered, dots=scattered, caption=caption)
+        found = _interpolated(judged, np.column_stack(shares), figures)
+        if found is None:
+            return None
+        values, failures = found
+        axes = [np.array([variable.at(share) for share in np.linspace(0, 1, _NODES)]) for variable in variables]
+        caption = f"Interpolated linearly between {int(judged.works.sum()):,} designs (dots); white: too far from any."
+    else:
+        cells = int(np.clip(math.sqrt(len(judged) / _PER_CELL), *_CELLS)) if scattered else _MOST_STEPS
+        for k, variable in enumerate(variables):
+            if scattered or len(axes[k]) > cells:
+                axes[k] = np.array([variable.at((cell + 0.5) / cells) for cell in range(cells)])
+        # Every design belongs to the cell of the axes' nearest values.
+        i, j = (np.searchsorted((a[1:] + a[:-1]) / 2, column) for a, column in zip(axes, columns, strict=True))
+        best = np.full((len(axes[1]), len(axes[0])), -1)
+        # Of several designs the last one written stays: failed ones first, then from the worst to the best.
+        order = np.concatenate([np.flatnonzero(~judged.works), judged.best_first[::-1]])
+        best[j[order], i[order]] = order
+        works = (best >= 0) & judged.works[best]
+        values = {name: np.where(works, judged.figure(name)[best], np.nan) for name in figures}
+        failures = np.where(best >= 0, np.array(judged.failures, dtype=object)[best], "")
+        if others := [words_of(name) for name in free if name not in names]:
+            caption = (
+                f"{listed(others).capitalize()} also vary: each place shows the design there that misses the "
+                f"constraints least and then has the best {words_of(judged.study.objectives[0].figure)}."
+            )
+    reasons, bounded = failures.astype(object), [name for name in judged.study.constraints if name in values]
+    for place in map(tuple, np.argwhere(reasons == "")):
+        row = {name: float(values[name][place]) for name in bounded}
+        reasons[place] = "; ".join(text for text, _ in misses(judged.study, row).values())
+    return Map(*axes, values, reasons, smooth=alone or not scattered, dots=scattered, caption=caption)
 
 
 def _interpolated(
-    judged: Judged, variables: Sequence[Variable], places: np.ndarray, figures: Sequence[str]
-) -> Map | None:
-    """The map between designs at ``places`` (N, 2), shares of the variables' ranges."""
+    judged: Judged, places: np.ndarray, figures: Sequence[str]
+) -> tuple[dict[str, np.ndarray], np.ndarray] | None:
+    """Figures between designs at ``places`` (N, 2), shares of the ranges, and reasons why the nearest one fails."""
     shares = np.linspace(0, 1, _NODES)
     nodes = np.stack(np.meshgrid(shares, shares), axis=-1)
     try:
@@ -273,22 +280,7 @@ def _interpolated(
     found[~judged.works[nearest]] = np.nan
     if not np.isfinite(found[..., 0]).any():
         return None
-    values = {name: found[..., k] for k, name in enumerate(figures)}
-    reasons = _reasons(judged, values, np.array(judged.failures, dtype=object)[nearest])
-    axes = [np.array([variable.at(share) for share in shares]) for variable in variables]
-    caption = f"Interpolated linearly between {int(judged.works.sum()):,} designs (dots); white: too far from any."
-    return Map(*axes, values, reasons, smooth=True, dots=True, caption=caption)
-
-
-def _reasons(judged: Judged, values: dict[str, np.ndarray], failures: np.ndarray) -> np.ndarray:
-    """What is said of places that do not do: why designs fail there, or which constraints they miss."""
-    reasons = failures.astype(object)
-    bounded = [name for name in judged.study.constraints if name in values]
-    for place in np.ndindex(reasons.shape):
-        if not reasons[place] and bounded:
-            row = {name: float(values[name][place]) for name in bounded}
-            reasons[place] = "; ".join(text for text, _ in misses(judged.study, row).values())
-    return reasons
+    return dict(zip(figures, np.moveaxis(found, -1, 0), strict=True)), np.array(judged.failures, dtype=object)[nearest]
 
 
 @_plain_text
@@ -301,9 +293,13 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
     figure, panels = _panels(figures)
     variables = [judged.study.variables[name] for name in (x, y)]
     dots = np.flatnonzero(sample(judged.works, np.zeros(len(judged), bool), _MOST_DOTS)) if found.dots else []
+    missed, grey = found.reasons != "", np.zeros((*found.reasons.shape, 4))
+    works = np.isfinite(np.stack(list(found.values.values()))).any(axis=0)
+    grey[missed & works], grey[missed & ~works] = to_rgba("#e4e7eb", 0.72), to_rgba("#969ea8")
     for number, (axes, name) in enumerate(panels):
         _fill(axes, found, name)
-        _shade(axes, found)
+        if missed.any():
+            axes.pcolormesh(found.x, found.y, grey, shading="nearest", rasterized=True, linewidth=0, antialiased=False)
         if len(judged.study.free()) == 2:
             _draw_limits(axes, found, judged)
         if len(dots):
@@ -323,10 +319,14 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         for one in marked
         if not all(low <= one.design.number_of(name) <= high for name, (low, high) in ends.items())
     ]
-    beyond = f" Outside the ranges: {listed(outside)}." if outside else ""
-    missed = "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
-    parts = [found.caption, missed if (found.reasons != "").any() else "", beyond]
-    return figure, " ".join(part.strip() for part in parts if part)
+    parts = (
+        found.caption,
+        "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
+        if missed.any()
+        else "",
+        f"Outside the ranges: {listed(outside)}." if outside else "",
+    )
+    return figure, " ".join(filter(None, parts))
 
 
 def _fill(axes: Axes, found: Map, name: str) -> None:
@@ -343,7 +343,7 @@ def _fill(axes: Axes, found: Map, name: str) -> None:
     norm = LogNorm(low, high) if log else Normalize(low, high)
     if found.smooth and min(values.shape) > 1:
         steps = np.geomspace(low, high, _LEVELS + 1) if log else MaxNLocator(_LEVELS).tick_values(low, high)
-        drawn = axes.contourf(found.x, found.y, np.ma.masked_invalid(values), levels=steps, norm=norm, extend="both")
+        drawn = axes.contourf(found.x, found.y, values, levels=steps, norm=norm, extend="both")
     else:
         drawn = axes.pcolormesh(found.x, found.y, values, norm=norm, shading="nearest", rasterized=True)
     ticks = np.geomspace(low, high, 5).tolist() if log else None
@@ -353,23 +353,13 @@ def _fill(axes: Axes, found: Map, name: str) -> None:
         bar.ax.minorticks_off()
 
 
-def _shade(axes: Axes, found: Map) -> None:
-    """Draw grey over places where constraints are missed, darker where nothing works."""
-    works = np.isfinite(np.stack(list(found.values.values()))).any(axis=0)
-    for where, colour, strength in ((works, "#e4e7eb", 0.72), (~works, "#969ea8", 1.0)):
-        shaded = np.where((found.reasons != "") & where, 1.0, np.nan)
-        if np.isfinite(shaded).any():
-            style = {"alpha": strength, "shading": "nearest", "rasterized": True, "linewidth": 0, "antialiased": False}
-            axes.pcolormesh(found.x, found.y, shaded, cmap=ListedColormap([colour]), **style)
-
-
 def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
     """Draw the lines on which constraints are just met."""
     for (name, sign, bound), colour in zip(judged.study.bounds(), _LIMITS * 10, strict=False):
         values = found.values.get(name, np.empty(0))
         level = bound + sign * _BESIDE * (abs(bound) or 1.0)
         if min(values.shape) > 1 and (values < level).any() and (values > level).any():
-            axes.contour(found.x, found.y, np.ma.masked_invalid(values), levels=[level], colors=colour, linestyles="--")
+            axes.contour(found.x, found.y, values, levels=[level], colors=colour, linestyles="--")
             axes.plot([], [], color=colour, linestyle="--", label=bound_text(name, sign, bound))
 
 
