@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from twin.design.description import Study
+from twin.design.designs import EvaluatedDesign, Marked
 from twin.design.parameters import followed, parameters_of
-from twin.design.verification import Candidate, verified
+from twin.design.verification import verified
 from twin.options import CPU
 from uwlts.model.library import load_sensor, merged, validated
 from uwlts.model.sensor import Sensor
@@ -52,7 +53,8 @@ def main() -> None:
         study = Study.model_validate(
             {"title": name, "medium": medium, "variables": {"laser.power_mw": {"least": 1.0, "most": 10.0}}}
         )
-        found = verified(study, Candidate(name, number, built), workers=2, variant=CPU)
+        candidate = Marked(name, built, EvaluatedDesign(number, {}, {}, 0.0, ""))
+        found = verified(study, candidate, workers=2, variant=CPU)
         if found.failure:
             print(f"| {name} | | | | | {found.failure} |", flush=True)
             continue

@@ -7,12 +7,17 @@ import pytest
 
 from tests.virtual_sensors import altered
 from twin.design.description import Study
-from twin.design.designs import Design, built
+from twin.design.designs import Design, EvaluatedDesign, Marked, built
 from twin.design.figures import scatter_at
 from twin.design.parameters import parameters_of
-from twin.design.verification import Agreement, Candidate, Rendered, compared, render, verified
+from twin.design.verification import Agreement, Rendered, compared, render, verified
 from twin.options import CPU
+from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import open_workers
+
+
+def candidate(label: str, number: int, sensor: Sensor) -> Marked:
+    return Marked(label, sensor, EvaluatedDesign(number, {}, {}, 0.0, ""))
 
 
 @pytest.fixture
@@ -27,7 +32,7 @@ def study() -> Study:
 def test_formulas_foretell_what_a_rendered_design_measures(study):
     # Unlike the thesis's in baseline, angle, stand-off and volume.
     design = Design(0, {"laser.baseline_mm": 200.0, "laser.triangulation_angle_deg": 30.0})
-    row = verified(study, Candidate("slim", 0, built(study, design)), workers=2, variant=CPU)
+    row = verified(study, candidate("slim", 0, built(study, design)), workers=2, variant=CPU)
     assert row.failure == ""
     assert row.agrees and row.ratio < 1.25
     found, foretold = np.array(row.rendered_mm), np.array(row.predicted_mm)
@@ -52,7 +57,7 @@ def test_a_disagreement_is_reported(study, thesis):
             exposure_ms=1.0,
             seconds={"render": 1.0},
         )
-        return compared(study, Candidate("thesis", -1, thesis), rendered)
+        return compared(study, candidate("thesis", -1, thesis), rendered)
 
     for factor, agrees in ((1.0, True), (1.45, True), (1 / 1.45, True), (1.55, False), (1 / 1.55, False)):
         row = measured(factor)
@@ -63,7 +68,7 @@ def test_a_disagreement_is_reported(study, thesis):
 
 def test_a_candidate_that_fails_is_kept_with_its_reason_and_tried_again(study, thesis, tmp_path):
     hopeless = altered(thesis, {"volume": {"near_mm": 900.0, "far_mm": 950.0}})
-    candidates = [Candidate("hopeless", 3, hopeless)]
+    candidates = [candidate("hopeless", 3, hopeless)]
     with open_workers(workers=1) as pool:
         (row,) = render(study, tmp_path / "verified", candidates, pool, variant=CPU)
         (path,) = (tmp_path / "verified").iterdir()
@@ -76,23 +81,23 @@ def test_a_candidate_that_fails_is_kept_with_its_reason_and_tried_again(study, t
 
 def test_what_was_rendered_is_not_rendered_again(study, thesis, tmp_path, monkeypatch):
     folder: Path = tmp_path / "verified"
-    candidates = [Candidate("thesis", -1, thesis)]
+    candidates = [candidate("thesis", -1, thesis)]
     monkeypatch.setattr("twin.design.verification.verified", _counted)
     with open_workers(workers=1) as pool:
         for label in ("thesis", "renamed"):
-            candidates = [Candidate(label, -1, thesis)]
+            candidates = [candidate(label, -1, thesis)]
             (row,) = render(study, folder, candidates, pool, variant=CPU)
             assert (row.label, row.ratio) == (label, 1.25)
     assert len(list(folder.iterdir())) == 1
     # The worker would have said another ratio the second time.
     with open_workers(workers=1) as pool:
         (other,) = render(
-            study, folder, [Candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool, variant=CPU
+            study, folder, [candidate("x", -1, altered(thesis, {"laser": {"power_mw": 8.0}}))], pool, variant=CPU
         )
     assert other.ratio == 1.25 and len(list(folder.iterdir())) == 2
 
 
-def _counted(study: Study, candidate: Candidate, **options: object) -> Agreement:
+def _counted(study: Study, candidate: Marked, **options: object) -> Agreement:
     first = candidate.label != "renamed"
     return Agreement(
         candidate.label,

@@ -93,8 +93,7 @@ def stripe_at(
     for axis in range(2):
         unit = tuple(1.0 + 0.0 * radius if k == axis else 0.0 * radius for k in range(3))
         change = slopes_per_mm(view, window, unit)
-        own = [(1 / p.focus_mm if k == axis else 0.0) - change[k] for k in range(2)]
-        shifts.append(across[0] * own[0] + across[1] * own[1])
+        shifts.append(sum(a * ((1 / p.focus_mm if k == axis else 0.0) - change[k]) for k, a in enumerate(across)))
     defocus = 0.5 * radius * xp.sqrt(shifts[0] ** 2 + shifts[1] ** 2 + 1e-24)
     diffraction = _DIFFRACTION * p.wavelength_mm * number / p.pixel_mm
     blur = xp.sqrt(defocus * defocus + diffraction * diffraction)
@@ -115,9 +114,8 @@ def stripe_at(
     per_radiance = lens * p.window_passes / (p.medium_index * p.medium_index)
     electrons = 1e-3 * p.pixel_mm * p.pixel_mm * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
-    ambient = (
-        p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons * xp.exp(-p.extinction_per_mm * back)
-    )
+    ambient = p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons
+    ambient = ambient * xp.exp(-p.extinction_per_mm * back)
     return Stripe(sigma, blur, rate, ambient)
 
 
@@ -132,12 +130,8 @@ def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: 
     """
     height = stripe.rate_e_per_ms * exposure_ms
     true, taken = p.centre_contrast(xp, stripe.sigma_px) ** 2 + p.prnu**2, p.pixel_contrast(xp) ** 2 + p.prnu**2
-    floor = (
-        p.read_noise_e**2
-        + p.offset_e**2
-        + p.step_e**2 / 12
-        + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms
-    )
+    floor = p.read_noise_e**2 + p.offset_e**2 + p.step_e**2 / 12
+    floor = floor + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms
     information, noise = 0.0 * height, 0.0 * height
     width = _FLANK / _NODES
     for node in range(_NODES):
@@ -164,21 +158,16 @@ def _lit(xp: ModuleType, p: Parameters, angle: Array) -> Array:
     """Power per angle over the mean one; 0 outside the fan where that is not needed smooth."""
     gauss = xp.exp(-2 * (angle / p.fan_half_rad) ** 2) * 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
     lit = p.gaussian_fan * gauss + (1 - p.gaussian_fan) * (1 - p.tabulated_fan)
-    if len(p.fan_nodes_rad) > 1:
-        lit = lit + p.tabulated_fan * 2 * p.fan_half_rad * _tabulated(xp, p, angle)
-    return lit
-
-
-def _tabulated(xp: ModuleType, p: Parameters, angle: Array) -> Array:
-    """Power per angle between the nodes of a table: a sum of ramps that begin at the nodes."""
-    total, slope_before = p.fan_powers[0] + 0.0 * angle, 0.0
     nodes, powers = p.fan_nodes_rad, p.fan_powers
-    for k in range(len(nodes) - 1):
-        width = nodes[k + 1] - nodes[k]
-        slope = (powers[k + 1] - powers[k]) / xp.maximum(width, 1e-12)
-        total = total + (slope - slope_before) * xp.maximum(angle - nodes[k], 0.0)
-        slope_before = slope
-    return xp.maximum(total, 0.0)
+    if len(nodes) > 1:
+        # Between the nodes of a table: a sum of ramps that begin at the nodes.
+        total, slope_before = powers[0] + 0.0 * angle, 0.0
+        for k in range(len(nodes) - 1):
+            slope = (powers[k + 1] - powers[k]) / xp.maximum(nodes[k + 1] - nodes[k], 1e-12)
+            total = total + (slope - slope_before) * xp.maximum(angle - nodes[k], 0.0)
+            slope_before = slope
+        lit = lit + p.tabulated_fan * 2 * p.fan_half_rad * xp.maximum(total, 0.0)
+    return lit
 
 
 # --- the measuring volume ---------------------------------------------------------------------------------------------
@@ -219,9 +208,8 @@ def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff, outer = standoff_mm(pose), p.outer_mm(xp)
-    other = p.across((p.width_px, p.height_px))
     ends = []
-    for edge in (-0.5, other - 0.5):
+    for edge in (-0.5, p.across((p.width_px, p.height_px)) - 0.5):
         inverse = 1 / standoff
         for _ in range(_EDGE_STEPS):
             depth = 1 / inverse
@@ -244,26 +232,22 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)
-    outer = p.outer_mm(xp)
-    z = (outer + depth_mm - standoff) / pose.axis[2]
-    origin = (0.0 * standoff, 0.0 * standoff, standoff)
-    middle = added(origin, scaled(pose.axis, z))
+    z = (p.outer_mm(xp) + depth_mm - standoff) / pose.axis[2]
+    middle = added((0.0 * standoff, 0.0 * standoff, standoff), scaled(pose.axis, z))
 
     def at(y: Array) -> Vector:
         return added(middle, scaled(pose.fan, y))
 
-    side = p.along((p.width_px, p.height_px))
-    other = p.across((p.width_px, p.height_px))
     ends = []
-    for edge in (-0.5, side - 0.5):
+    for edge in (-0.5, p.along((p.width_px, p.height_px)) - 0.5):
         y = 0.0 * z
         for _ in range(_EDGE_STEPS):
             view = seen(xp, lens, window, at(y))
             y = y + (edge - p.along((view.x, view.y))) / p.along(pixels_per_mm(view, window, pose.fan))
         ends.append(y)
     laser_window = p.laser_window(pose.axis)
-    offset = dot(added(middle, scaled(pose.origin, -1.0)), pose.fan)
-    height = dot(added(middle, scaled(pose.origin, -1.0)), pose.axis)
+    from_origin = added(middle, scaled(pose.origin, -1.0))
+    offset, height = dot(from_origin, pose.fan), dot(from_origin, pose.axis)
     edges = [across_mm(xp, laser_window, height, xp.tan(angle)) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
     low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
     high = xp.minimum(xp.maximum(ends[0], ends[1]), edges[1])
@@ -277,11 +261,8 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     stripe = stripe_at(xp, p, pose, window, point, view, reflectance=reflectance)
     u = p.across((view.x, view.y))
     lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
-    inside = lit & (u >= -0.5) & (u <= other - 0.5)
-    rate = stripe.rate_e_per_ms
-    brightest = _largest(xp, rate, lit)
-    required, used = exposure_ms(xp, p, brightest)
-    signal = rate * used
+    inside = lit & (u >= -0.5) & (u <= p.across((p.width_px, p.height_px)) - 0.5)
+    required, used = exposure_ms(xp, p, _largest(xp, stripe.rate_e_per_ms, lit))
     noise = centre_noise_px(xp, p, stripe, used)
     towards_camera = direction_outside(xp, window, view.path)
     from_laser = direction_outside(xp, laser_window, path_to(xp, laser_window, added(point, scaled(pose.origin, -1.0))))
@@ -296,7 +277,7 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
         centre_px=noise,
         stripe_px=stripe.sigma_px,
         blur_px=stripe.blur_px,
-        signal_e=signal,
+        signal_e=stripe.rate_e_per_ms * used,
         occlusion_rad=_angle(xp, towards_camera, from_laser),
         lit=lit,
         in_view=inside,
@@ -307,8 +288,8 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
 
 def _angle(xp: ModuleType, a: Vector, b: Vector) -> Array:
     """Angle between unit vectors."""
-    cross = added(a, scaled(b, -1.0))
-    return 2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(cross, cross) + 1e-24), 1.0))
+    chord = added(a, scaled(b, -1.0))
+    return 2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(chord, chord) + 1e-24), 1.0))
 
 
 def _largest(xp: ModuleType, values: Array, where: Array) -> Array:
@@ -471,40 +452,31 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
     inside = spread / snell_root(np, p.laser_window_index, spread)
     fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
     fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
-    checks = (
-        (one(p.focus_mm - p.focal_mm) <= 0, None, "the lens would be focused within its focal length"),
-        (
-            ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5),
-            -figures.standoff_mm,
-            "the sheet crosses the camera's axis {:.0f} mm behind the window's outer face, not in front of it",
+    begins, crossing = -figures.near_mm, -figures.standoff_mm
+    numbers = {"crossing": crossing, "begins": begins, "cone": cone, "fan": fan, "fullest": fullest}
+    flat = np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm)
+    checks = {
+        "the lens would be focused within its focal length": one(p.focus_mm - p.focal_mm) <= 0,
+        "the sheet crosses the camera's axis {crossing:.0f} mm behind the window's outer face, not in front of it": (
+            ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5)
         ),
-        (
-            ~(figures.near_mm > 0),
-            -figures.near_mm,
-            "the measuring volume would begin {:.0f} mm behind the window's outer face",
+        "the measuring volume would begin {begins:.0f} mm behind the window's outer face": ~(figures.near_mm > 0),
+        "the cone of view is {cone:.0f} mm wide at the window's outer face, wider than its opening": (
+            cone > one(p.window_aperture_mm)
         ),
-        (
-            cone > one(p.window_aperture_mm),
-            cone,
-            "the cone of view is {:.0f} mm wide at the window's outer face, wider than its opening",
+        "the laser's fan is {fan:.0f} mm wide at its window, wider than its opening": (
+            fan > one(p.laser_window_aperture_mm)
         ),
-        (
-            fan > one(p.laser_window_aperture_mm),
-            fan,
-            "the laser's fan is {:.0f} mm wide at its window, wider than its opening",
+        "camera and laser reach no point of the measuring volume": ~(figures.coverage > 0),
+        "the stripe saturates: at the given exposure it has {fullest:.1f} times the full well": fullest > 1,
+        "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser": (
+            ~(flat < 0.5 * figures.standoff_mm)
         ),
-        (~(figures.coverage > 0), None, "camera and laser reach no point of the measuring volume"),
-        (fullest > 1, fullest, "the stripe saturates: at the given exposure it has {:.1f} times the full well"),
-        (
-            ~(np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm) < 0.5 * figures.standoff_mm),
-            None,
-            "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser",
-        ),
-    )
+    }
     reasons = [""] * n
-    for failed, values, text in checks:
+    for text, failed in checks.items():
         for i in np.flatnonzero(failed):
-            reasons[i] = reasons[i] or (text if values is None else text.format(values[i]))
+            reasons[i] = reasons[i] or text.format(**{name: values[i] for name, values in numbers.items()})
     return reasons
 
 

@@ -137,21 +137,17 @@ def across_mm(xp: ModuleType, window: FlatWindow, height_mm: Array, slope: Array
 
 
 def traced(window: FlatWindow, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3, 3) where rays (N, 3) start and meet both faces of a window, and their directions behind it.
-
-    NaN for rays that lead away from the window.
-    """
+    """Points (N, 3, 3) where rays (N, 3) start and meet both faces of a window, and their directions behind it; NaN for
+    rays that lead away from the window."""
     normal = np.array(window.normal)
     with np.errstate(invalid="ignore", divide="ignore"):
         ahead = directions @ normal
         sideways = directions / np.where(ahead > 0, ahead, np.nan)[:, None] - normal
         slope = np.sqrt((sideways**2).sum(axis=1))
         leaning = sideways / np.maximum(slope, 1e-300)[:, None]
-    at_faces = (
-        (window.distance_mm, window.distance_mm * slope),
-        (window.outer_mm, across_mm(np, window, window.outer_mm, slope)),
-    )
-    points = [origin + height * normal + aside[:, None] * leaning for height, aside in at_faces]
+    asides = window.distance_mm * slope, across_mm(np, window, window.outer_mm, slope)
+    heights = window.distance_mm, window.outer_mm
+    points = [origin + h * normal + aside[:, None] * leaning for h, aside in zip(heights, asides, strict=True)]
     points = [np.broadcast_to(origin, directions.shape), *points]
     outside = slope / snell_root(np, window.medium_index, slope)
     return np.stack(points, axis=1), normal + outside[:, None] * leaning
@@ -186,8 +182,8 @@ def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
 
 def direction_outside(xp: ModuleType, window: FlatWindow, path: Path) -> Vector:
     """Unit vectors of rays in the medium, away from the module."""
-    along = added(window.normal, scaled(path.across, path.slope_outside))
-    return scaled(along, 1 / xp.sqrt(1 + path.slope_outside * path.slope_outside))
+    p = path.slope_outside
+    return scaled(added(window.normal, scaled(path.across, p)), 1 / xp.sqrt(1 + p * p))
 
 
 def length_outside_mm(xp: ModuleType, window: FlatWindow, path: Path) -> Array:

@@ -25,7 +25,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
 
-from twin.design.description import Study, Variable
+from twin.design.description import Study
 from twin.design.designs import Columns, Design, designs_of, judged, number_of_designs
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.runtime.workers import Lost, Workers
@@ -115,50 +115,35 @@ _NAME = "sweep"
 _POPULATION = 64
 
 
-class Search:
-    """The optimiser's memory lies in a journal in the study's folder, which several machines may share."""
-
-    def __init__(self, study: Study, folder: Path):
-        optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self._study = study
-        self._space = {name: _distribution(variable) for name, variable in study.free().items()}
-        journal = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
-        # Several machines must not propose the same designs: the seed is for the first of them only.
-        seed = None if _NAME in optuna.get_all_study_names(journal) else study.sampling.seed
-        self._optuna = optuna.create_study(
-            storage=journal,
-            sampler=optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed),
-            study_name=_NAME,
-            load_if_exists=True,
-            directions=[objective.goal.replace("ise", "ize") for objective in study.objectives],
-        )
-
-    def ask(self, count: int) -> list[Design]:
-        """New designs."""
-        trials = [self._optuna.ask(self._space) for _ in range(count)]
-        free = self._study.free()
-        return [Design(trial.number, {name: free[name].taken(trial.params[name]) for name in free}) for trial in trials]
-
-    def report(self, columns: Columns) -> None:
-        """Report columns of designs as `judged` returns them; those reported before are left alone."""
-        trials = {trial.number: trial for trial in self._optuna.get_trials(deepcopy=False)}
-        for place, number in enumerate(columns["design"].tolist()):
-            trial = trials.get(number)
-            if trial is None or trial.state != TrialState.RUNNING:
-                continue
-            values = [float(columns[objective.figure][place]) for objective in self._study.objectives]
-            violation = float(columns["violation"][place])
-            if math.isfinite(violation) and all(map(math.isfinite, values)):
-                Trial(self._optuna, trial._trial_id).set_constraint("violation", violation)
-                self._optuna.tell(number, values)
-            else:
-                self._optuna.tell(number, state=TrialState.FAIL)
+def _open_search(study: Study, folder: Path) -> optuna.Study:
+    """The optimiser, whose memory lies in a journal in the study's folder, which several machines may share."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    journal = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+    # Several machines must not propose the same designs: the seed is for the first of them only.
+    seed = None if _NAME in optuna.get_all_study_names(journal) else study.sampling.seed
+    return optuna.create_study(
+        storage=journal,
+        sampler=optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed),
+        study_name=_NAME,
+        load_if_exists=True,
+        directions=[objective.goal.replace("ise", "ize") for objective in study.objectives],
+    )
 
 
-def _distribution(variable: Variable) -> BaseDistribution:
-    if variable.values is not None:
-        return CategoricalDistribution(variable.values)
-    return FloatDistribution(*variable.ends(), log=variable.scale == "log")
+def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
+    """Report columns of designs to the optimiser; those reported before are left alone."""
+    trials = {trial.number: trial for trial in search.get_trials(deepcopy=False)}
+    for place, number in enumerate(columns["design"].tolist()):
+        trial = trials.get(number)
+        if trial is None or trial.state != TrialState.RUNNING:
+            continue
+        values = [float(columns[objective.figure][place]) for objective in study.objectives]
+        violation = float(columns["violation"][place])
+        if math.isfinite(violation) and all(map(math.isfinite, values)):
+            Trial(search, trial._trial_id).set_constraint("violation", violation)
+            search.tell(number, values)
+        else:
+            search.tell(number, state=TrialState.FAIL)
 
 
 Progress = Callable[[int, int], None]
@@ -222,21 +207,28 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress =
 
 def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
     """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
-    search = Search(study, folder)
+    search, free = _open_search(study, folder), study.free()
+    space: dict[str, BaseDistribution] = {
+        name: FloatDistribution(*variable.ends(), log=variable.scale == "log")
+        if variable.values is None
+        else CategoricalDistribution(variable.values)
+        for name, variable in free.items()
+    }
     if known := read_parts(place):
-        search.report(known)
+        _report(search, study, known)
     total = study.sampling.designs
     # Other machines may add designs of their own.
     while (done := sum(map(rows_in, parts(place)))) < total:
         progress(done, total)
-        asked = search.ask(min(study.sampling.batch, total - done))
+        trials = [search.ask(space) for _ in range(min(study.sampling.batch, total - done))]
+        asked = [Design(one.number, {name: free[name].taken(one.params[name]) for name in free}) for one in trials]
         share = -(-len(asked) // workers.count)
         shares = [tuple(asked[i : i + share]) for i in range(0, len(asked), share)]
         batches = [Batch(study, designs, designs[0].number, len(designs)) for designs in shares]
         for batch, result in workers.completed(judged_part, batches):
             content = _content(batch, result)
             write_part(place, batch.first, content)
-            search.report(_columns(pq.read_table(pa.BufferReader(content))))
+            _report(search, study, _columns(pq.read_table(pa.BufferReader(content))))
             done += batch.count
             progress(done, total)
 

@@ -7,22 +7,23 @@ continues where it was.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tomli_w
+from pydantic import TypeAdapter
 
 from twin.design.choice import choose
 from twin.design.description import Study, load_study
 from twin.design.designs import Columns, Marked
 from twin.design.report.page import page_text
 from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
-from twin.design.verification import Agreement, Candidate, render
+from twin.design.verification import Agreement, render
 from twin.options import CPU
 from uwlts.model.errors import DescriptionError
 from uwlts.report.page_toolkit import write_page
@@ -169,8 +170,7 @@ def sweep(
         agreements: list[Agreement] = []
         if described.verify:
             rendered = [winner, *(one for one in chosen.marked if one.design.number < 0), *chosen.further]
-            candidates = [Candidate(one.label, one.design.number, one.sensor) for one in rendered]
-            agreements = render(described, folder / RENDERED, candidates, pool, variant=variant, progress=progress)
+            agreements = render(described, folder / RENDERED, rendered, pool, variant=variant, progress=progress)
     result = SweepResult(described, folder, columns, chosen.marked, tuple(agreements), chosen.notes)
     page = page_text(described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
     write_page(folder / PAGE, page, overwrite=True)
@@ -187,20 +187,12 @@ def write_summary(result: SweepResult) -> None:
         "work": work,
         "meet_all_constraints": meet,
         "marked": [{"label": one.label} | one.design.table() for one in result.marked],
-        "verified": [asdict(one) for one in result.agreements],
-        "notes": list(result.notes),
+        "verified": result.agreements,
+        "notes": result.notes,
     }
     with written_aside(result.folder / SUMMARY, overwrite=True) as aside:
-        aside.write_text(json.dumps(_finite(content), indent=2) + "\n", encoding="utf-8")
-
-
-def _finite(value: object) -> object:
-    """The value with null in place of numbers that JSON cannot hold."""
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        # Numbers that JSON cannot hold become null.
+        aside.write_bytes(TypeAdapter(dict[str, Any]).dump_json(content, indent=2) + b"\n")
 
 
 def clear(folder: Path) -> None:

@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 from plyfile import PlyData, PlyParseError
 
 from twin.design.description import Study
+from twin.design.designs import Marked
 from twin.design.figures import figures_of, scatter_at
 from twin.design.parameters import parameters_of
 from twin.design.screening import made_folder
@@ -218,15 +219,6 @@ def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A design to render: its name, its number in the study (-1 if it is none of it), and the sensor as built."""
-
-    label: str
-    number: int
-    sensor: Sensor
-
-
-@dataclass(frozen=True)
 class Agreement:
     """Rendered and predicted scatter of a candidate at depths Z, and whether they agree.
 
@@ -251,18 +243,18 @@ class Agreement:
     failure: str = ""
 
 
-def verified(study: Study, candidate: Candidate, *, workers: int, variant: str) -> Agreement:
+def verified(study: Study, candidate: Marked, *, workers: int, variant: str) -> Agreement:
     """Render a candidate of a study in so many processes and compare its scatter with the predicted one."""
     options = {"reflectance": study.reflectance, "variant": variant, "workers": workers}
     try:
         with tempfile.TemporaryDirectory(prefix="verify-") as folder:
             rendered = verify(candidate.sensor, study.medium, Path(folder), **options)
     except (Error, OSError) as error:
-        return Agreement(candidate.label, candidate.number, failure=str(error))
+        return Agreement(candidate.label, candidate.design.number, failure=str(error))
     return compared(study, candidate, rendered)
 
 
-def compared(study: Study, candidate: Candidate, rendered: Rendered) -> Agreement:
+def compared(study: Study, candidate: Marked, rendered: Rendered) -> Agreement:
     """Rendered and predicted figures of a candidate side by side."""
     p = parameters_of([candidate.sensor], [study.medium_of(candidate.sensor)])
     predicted = scatter_at(p, rendered.z_mm, 0.5 * rendered.line_mm, reflectance=study.reflectance)
@@ -276,7 +268,7 @@ def compared(study: Study, candidate: Candidate, rendered: Rendered) -> Agreemen
     factor = max(ratio, 1 / ratio)
     return Agreement(
         candidate.label,
-        candidate.number,
+        candidate.design.number,
         z_mm=rendered.z_mm.tolist(),
         predicted_mm=predicted.tolist(),
         rendered_mm=rendered.scatter_mm.tolist(),
@@ -294,7 +286,7 @@ def compared(study: Study, candidate: Candidate, rendered: Rendered) -> Agreemen
 def render(
     study: Study,
     folder: Path,
-    candidates: Sequence[Candidate],
+    candidates: Sequence[Marked],
     workers: Workers,
     *,
     variant: str,
@@ -321,13 +313,15 @@ def render(
     for candidate, result in workers.completed(work, [candidates[place] for place in waiting]):
         place = next(place for place in waiting if candidates[place] is candidate)
         if isinstance(result, Lost):
-            result = Agreement(candidate.label, candidate.number, failure=result.reason)
+            result = Agreement(candidate.label, candidate.design.number, failure=result.reason)
         with written_aside(paths[place], overwrite=True) as aside:
             pq.write_table(pa.Table.from_pylist([asdict(result)]), aside)
         known[place] = result
         progress(len(known), len(candidates))
     # Name and tolerance may be others than when a result was kept.
     return [
-        replace(known[place], label=one.label, design=one.number, agrees=known[place].ratio <= study.verify_tolerance)
+        replace(
+            known[place], label=one.label, design=one.design.number, agrees=known[place].ratio <= study.verify_tolerance
+        )
         for place, one in enumerate(candidates)
     ]
