@@ -16,7 +16,7 @@ from twin.design.geometry import Array, FlatWindow, Lens, Pose, Vector, dot, pat
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.model.errors import DescriptionError
 from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Medium, Sensor, Window
+from uwlts.model.sensor import Medium, Sensor
 
 Follow = Literal["focus", "waist", "volume"]
 
@@ -210,7 +210,6 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     index = medium.refractive_index(wavelength)
     if not (window.mounted and laser.window.mounted) and index != 1:
         raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
-    glass, laser_glass = (w.index(wavelength) if w.mounted else 1.0 for w in (window, laser.window))
     by_axis = laser.origin_mm is not None
     placed: tuple[Vector, ...] = ((math.nan,) * 3,) * 4
     if by_axis:
@@ -236,13 +235,8 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "f_number": camera.f_number,
         "focus_mm": camera.focus_distance_mm,
         "window_mounted": float(window.mounted),
-        "window_distance_mm": window.distance_mm,
-        "window_thickness_mm": window.thickness_mm,
         "window_tilt_x_rad": math.radians(window.tilt_x_deg),
         "window_tilt_y_rad": math.radians(window.tilt_y_deg),
-        "window_index": glass,
-        "window_passes": _passes(window, glass, index),
-        "window_aperture_mm": window.aperture_diameter_mm if window.mounted else math.inf,
         "wavelength_mm": 1e-6 * wavelength,
         "power_w": 1e-3 * laser.power_mw,
         "fan_half_rad": half,
@@ -253,11 +247,6 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "waist_mm": laser.waist_radius_mm,
         "waist_distance_mm": laser.waist_distance_mm,
         "beam_quality": laser.beam_quality_m2,
-        "laser_window_distance_mm": laser.window.distance_mm * laser.window.mounted,
-        "laser_window_thickness_mm": laser.window.thickness_mm * laser.window.mounted,
-        "laser_window_index": laser_glass,
-        "laser_window_passes": _passes(laser.window, laser_glass, index),
-        "laser_window_aperture_mm": laser.window.aperture_diameter_mm if laser.window.mounted else math.inf,
         "medium_index": index,
         "extinction_per_mm": medium.extinction_per_mm(wavelength),
         "quantum_efficiency": detector.quantum_efficiency,
@@ -276,6 +265,17 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         "near_mm": sensor.volume.near_mm,
         "far_mm": sensor.volume.far_mm,
     }
+    for name, one in (("window", window), ("laser_window", laser.window)):
+        glass = one.index(wavelength) if one.mounted else 1.0
+        # The light that passes both faces and the glass, square to them (Fresnel; Beer and Lambert).
+        faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - index) / (glass + index)) ** 2)
+        numbers |= {
+            f"{name}_distance_mm": one.distance_mm,
+            f"{name}_thickness_mm": one.thickness_mm,
+            f"{name}_index": glass,
+            f"{name}_passes": faces * math.exp(-(one.absorption_per_mm() * one.thickness_mm * one.mounted)),
+            f"{name}_aperture_mm": one.aperture_diameter_mm if one.mounted else math.inf,
+        }
     # Powers per rad that integrate to 1.
     angles, powers = (
         np.radians([a for a, _ in table or ((0.0, 0.0),)]),
@@ -290,12 +290,6 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         fan_nodes_rad=tuple(angles.tolist()),
         fan_powers=tuple(powers.tolist()),
     )
-
-
-def _passes(window: Window, glass: float, medium: float) -> float:
-    """Share of light that passes both faces and the glass, square to them (Fresnel; Beer and Lambert)."""
-    faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - medium) / (glass + medium)) ** 2)
-    return faces * math.exp(-(window.absorption_per_mm() * window.thickness_mm * window.mounted))
 
 
 @cache

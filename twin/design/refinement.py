@@ -61,7 +61,7 @@ def _largest(xp: ModuleType, values: Array) -> Array:
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
 
 
-def _coverage(xp: ModuleType, p: Parameters) -> Array:
+def _coverage(xp: ModuleType, p: Parameters, f: Field, mean: Mean) -> Array:
     near, far = depths_in_view(xp, p)
     return (far - near) / (p.far_mm - p.near_mm)
 
@@ -83,7 +83,7 @@ SMOOTH: dict[str, Smooth] = {
     "far_mm": lambda xp, p, f, mean: p.far_mm,
     "depth_mm": lambda xp, p, f, mean: p.far_mm - p.near_mm,
     "baseline_mm": lambda xp, p, f, mean: p.baseline_mm,
-    "coverage": lambda xp, p, f, mean: _coverage(xp, p),
+    "coverage": _coverage,
 }
 """Figures that can be derived. For coverage the laser counts as reaching whatever the camera sees."""
 

@@ -46,15 +46,16 @@ _MAD_TO_STD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
-class Profiles:
-    """Measurements of a plane square to the laser's axis at K depths; arrays (K,).
+class Rendered:
+    """Measurements by a rendered sensor of a plane square to the laser's axis, at K depths; arrays (K,).
 
     ``z_mm`` is the plane's true Z in the OCS, ascending; ``points`` counts the points found, outliers included.
     ``scatter_mm`` is their standard deviation along Z about the profile's own quadratic trend (the random part),
     ``error_mm`` their mean deviation along Z from the true plane (the systematic part, with the error of the calibrated
     OCS's origin, which moves all depths alike), ``line_mm`` the length along Y over which they were found. Outliers,
     farther from the trend than five robust standard deviations, are left out of these. Where fewer than 20 points were
-    found, scatter and error are NaN and the length is 0.
+    found, scatter and error are NaN and the length is 0. ``exposure_ms`` is that of the plane's images, ``seconds`` are
+    the times to render, calibrate and measure.
     """
 
     z_mm: np.ndarray
@@ -62,14 +63,8 @@ class Profiles:
     scatter_mm: np.ndarray
     error_mm: np.ndarray
     line_mm: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Rendered(Profiles):
-    """Profiles of a rendered sensor, exposure of the plane's images, and seconds to render, calibrate and measure."""
-
-    exposure_ms: float
-    seconds: dict[str, float]
+    exposure_ms: float = math.nan
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def verify(
@@ -129,7 +124,7 @@ def verify(
             captures = [_capture(folder, recording) for recording in planned.all()]
             for path in (cloud, *captures, *map(truth_path, captures), *map(part_path, captures)):
                 path.unlink(missing_ok=True)
-    return Rendered(**vars(profiles), exposure_ms=exposure, seconds=seconds)
+    return replace(profiles, exposure_ms=exposure, seconds=seconds)
 
 
 @contextmanager
@@ -182,7 +177,7 @@ def _points(cloud: Path) -> np.ndarray:
         raise errors.CaptureError(f"{cloud} is not the cloud of the plane standard: {error}") from error
 
 
-def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Profiles:
+def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
     """Profiles, nearest first, from points (N, 3) with frame, Y and Z about the plane Z = 0, the stage at ``stage_mm``
     (K,) along Z."""
     order = np.argsort(-stage_mm)
@@ -196,7 +191,7 @@ def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Profiles:
     nothing = (math.nan, math.nan, 0.0)
     figures = np.array([_profile(p) if good else nothing for p, good in zip(found, enough, strict=True)])
     scatter, error, line = figures.T
-    return Profiles(-stage_mm[order], np.array([len(profile) for profile in found]), scatter, error, line)
+    return Rendered(-stage_mm[order], np.array([len(profile) for profile in found]), scatter, error, line)
 
 
 def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
@@ -241,6 +236,11 @@ class Agreement:
     predicted_exposure_ms: float = math.nan
     seconds: float = math.nan
     failure: str = ""
+
+    @property
+    def largest_error_mm(self) -> float:
+        """The largest systematic error, NaN where none is known."""
+        return max((abs(error) for error in self.error_mm if math.isfinite(error)), default=math.nan)
 
 
 def verified(study: Study, candidate: Marked, *, workers: int, variant: str) -> Agreement:

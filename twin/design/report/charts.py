@@ -23,17 +23,7 @@ from twin.design.choice import Judged, pareto
 from twin.design.description import Variable
 from twin.design.designs import Marked
 from twin.design.figures import CLASS_NAMES
-from twin.design.report.tables import (
-    bound_text,
-    label_of,
-    listed,
-    misses,
-    number_text,
-    rounded,
-    text_at,
-    value_text,
-    words_of,
-)
+from twin.design.report import tables
 from twin.design.verification import Agreement
 from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
 
@@ -103,7 +93,7 @@ def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[
     for unused in axes[len(names) :]:
         unused.remove()
     for one, name in zip(axes, names, strict=False):
-        one.set_title(label_of(name))
+        one.set_title(tables.label_of(name))
     return figure, list(zip(axes, names, strict=False))
 
 
@@ -144,7 +134,7 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
     caption = ""
     if len(groups) > len(COLOURS):
         groups = {"best": judged.best_first.tolist()}
-        caption = f"{listed([words_of(o) for o in others]).capitalize()} also vary: the best design of every place. "
+        caption = f"{tables.listed([tables.words_of(o) for o in others]).capitalize()} also vary: the best design of every place. "
     found = {name: _first_at(judged, x, np.array(places), best=bool(caption)) for name, places in groups.items()}
     figure, panels = _panels(shown_figures(judged))
     for axes, name in panels:
@@ -154,14 +144,14 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
             axes.scatter(*values, s=16, color=np.where(meets, colour, "white"), edgecolors=colour, zorder=3)
         _draw_bounds(axes.axhline, judged, name)
         _mark(axes, marked, x, name)
-        axes.set(xlabel=label_of(x), xscale=judged.study.variables[x].scale)
+        axes.set(xlabel=tables.label_of(x), xscale=judged.study.variables[x].scale)
     legend_below(figure)
     missed = "Hollow: misses a constraint. " if (judged.works & ~judged.feasible).any() else ""
     return figure, f"{caption}{missed}{_dashed(judged)}".strip()
 
 
 def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
-    return ", ".join(text_at(judged, name, place) for name in names)
+    return ", ".join(tables.text_at(judged, name, place) for name in names)
 
 
 def _first_at(judged: Judged, x: str, places: np.ndarray, *, best: bool) -> np.ndarray:
@@ -251,15 +241,15 @@ def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None
         works = (best >= 0) & judged.works[best]
         values = {name: np.where(works, judged.figure(name)[best], np.nan) for name in figures}
         failures = np.where(best >= 0, np.array(judged.failures, dtype=object)[best], "")
-        if others := [words_of(name) for name in free if name not in names]:
+        if others := [tables.words_of(name) for name in free if name not in names]:
             caption = (
-                f"{listed(others).capitalize()} also vary: each place shows the design there that misses the "
-                f"constraints least and then has the best {words_of(judged.study.objectives[0].figure)}."
+                f"{tables.listed(others).capitalize()} also vary: each place shows the design there that misses the "
+                f"constraints least and then has the best {tables.words_of(judged.study.objectives[0].figure)}."
             )
     reasons, bounded = failures.astype(object), [name for name in judged.study.constraints if name in values]
     for place in map(tuple, np.argwhere(reasons == "")):
         row = {name: float(values[name][place]) for name in bounded}
-        reasons[place] = "; ".join(text for text, _ in misses(judged.study, row).values())
+        reasons[place] = "; ".join(text for text, _ in tables.misses(judged.study, row).values())
     return Map(*axes, values, reasons, smooth=alone or not scattered, dots=scattered, caption=caption)
 
 
@@ -307,7 +297,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
             axes.plot(*at, ".", color=INK, markersize=1.0, alpha=0.5, rasterized=True)
         _mark(axes, marked, x, y)
         axes.grid(visible=False)
-        axes.set(xlabel=label_of(x), ylabel="" if number % _PANEL_COLUMNS else label_of(y))
+        axes.set(xlabel=tables.label_of(x), ylabel="" if number % _PANEL_COLUMNS else tables.label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
         # Designs on the border of the range are seen wholly.
         xlim, ylim = ((float(v.at(-_MARGIN)), float(v.at(1 + _MARGIN))) for v in variables)
@@ -324,7 +314,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
         if missed.any()
         else "",
-        f"Outside the ranges: {listed(outside)}." if outside else "",
+        f"Outside the ranges: {tables.listed(outside)}." if outside else "",
     )
     return figure, " ".join(filter(None, parts))
 
@@ -349,7 +339,7 @@ def _fill(axes: Axes, found: Map, name: str) -> None:
     ticks = np.geomspace(low, high, 5).tolist() if log else None
     bar = axes.figure.colorbar(drawn, ax=axes, ticks=ticks)
     if ticks:
-        bar.set_ticks(ticks, labels=[number_text(tick, 2) for tick in ticks], minor=False)
+        bar.set_ticks(ticks, labels=[tables.number_text(tick, 2) for tick in ticks], minor=False)
         bar.ax.minorticks_off()
 
 
@@ -360,7 +350,7 @@ def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
         level = bound + sign * _BESIDE * (abs(bound) or 1.0)
         if min(values.shape) > 1 and (values < level).any() and (values > level).any():
             axes.contour(found.x, found.y, values, levels=[level], colors=colour, linestyles="--")
-            axes.plot([], [], color=colour, linestyle="--", label=bound_text(name, sign, bound))
+            axes.plot([], [], color=colour, linestyle="--", label=tables.bound_text(name, sign, bound))
 
 
 # --- rendering --------------------------------------------------------------------------------------------------------
@@ -416,10 +406,10 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
     front = pareto(np.where((judged.of_interest & known)[:, None], values, np.nan))
     shown = sample(known, front, MOST_POINTS)
     figure = go.Figure()
-    labels = [_escaped(label_of(name)) for name in (x, y)]
+    labels = [_escaped(tables.label_of(name)) for name in (x, y)]
 
     def at(places: np.ndarray) -> dict[str, object]:
-        return {axis: rounded(judged.figure(name)[places]) for axis, name in (("x", x), ("y", y))}
+        return {axis: tables.rounded(judged.figure(name)[places]) for axis, name in (("x", x), ("y", y))}
 
     for name, chosen, colour in (
         ("misses a constraint", shown & ~judged.feasible, "#b3bcc6"),
@@ -447,7 +437,7 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         text=[
             "<br>".join(
                 [f"design {judged.columns['design'][place]}"]
-                + [_escaped(f"{words_of(name)}: {text_at(judged, name, place)}") for name in names]
+                + [_escaped(f"{tables.words_of(name)}: {tables.text_at(judged, name, place)}") for name in names]
             )
             for place in order
         ],
@@ -476,7 +466,7 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
     logs = ["type" in axis for axis in axes]
     _add_marked(figure, marked, (x, y), logs, middle=sum(map(math.log10, ends[0]) if logs[0] else ends[0]) / 2)
     better = " and ".join(
-        f"{'less' if sign > 0 else 'more'} {words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
+        f"{'less' if sign > 0 else 'more'} {tables.words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
     )
     thin = f" {int(shown.sum()):,} of {int(known.sum()):,} designs are drawn." if shown.sum() < known.sum() else ""
     none = "" if judged.feasible.any() else " None meets all constraints: the front is that of all that work."
@@ -496,13 +486,13 @@ def _add_marked(
         left = places[0] > middle
         marker = {"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": 15 if one is marked[-1] else 11}
         figure.add_scatter(
-            x=rounded(at[:1]),
-            y=rounded(at[1:]),
+            x=tables.rounded(at[:1]),
+            y=tables.rounded(at[1:]),
             mode="markers",
             showlegend=False,
             name=label,
             marker=marker | {"color": colour, "line": {"color": "white", "width": 1.5}},
-            hovertemplate=f"<b>{label}</b><br>{_escaped(label_of(names[0]))}: %{{x}}<br>%{{y}}<extra></extra>",
+            hovertemplate=f"<b>{label}</b><br>{_escaped(tables.label_of(names[0]))}: %{{x}}<br>%{{y}}<extra></extra>",
         )
         figure.add_annotation(
             {"x": places[0], "y": places[1], "ax": -30 if left else 30, "ay": _AWAY[number % len(_AWAY)]},
@@ -547,13 +537,16 @@ def parallel_chart(judged: Judged) -> Interactive | None:
             tickfont={"size": 11},
             rangefont={"size": 1, "color": "rgba(0,0,0,0)"},
             line={
-                "color": rounded(colours),
+                "color": tables.rounded(colours),
                 "colorscale": "Viridis",
                 "showscale": True,
                 "cmin": low,
                 "cmax": high if high > low else low + max(abs(low), 1e-9),
                 "reversescale": objective.goal == "maximise",
-                "colorbar": {"title": {"text": _escaped(label_of(objective.figure)), "side": "right"}, "thickness": 14},
+                "colorbar": {
+                    "title": {"text": _escaped(tables.label_of(objective.figure)), "side": "right"},
+                    "thickness": 14,
+                },
             },
         )
     )
@@ -566,17 +559,19 @@ def parallel_chart(judged: Judged) -> Interactive | None:
 def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, object]:
     """A parallel axis: choices and laser classes by name, else numbers."""
     values, variable = judged.columns[name][places], judged.study.free().get(name)
-    label = _escaped(label_of(name))
+    label = _escaped(tables.label_of(name))
     if variable is not None and variable.values is not None:
         options = list(variable.values)
         # Ticks hold plain text, in which nothing is a tag.
-        texts = [textwrap.shorten(value_text(name, option, unit=False), 24, placeholder="…") for option in options]
+        texts = [
+            textwrap.shorten(tables.value_text(name, option, unit=False), 24, placeholder="…") for option in options
+        ]
         ticks, codes = list(range(len(options))), [options.index(value) for value in values.tolist()]
     elif name == "laser_class":
-        ticks, texts, codes = list(CLASS_NAMES), list(CLASS_NAMES.values()), rounded(values)
+        ticks, texts, codes = list(CLASS_NAMES), list(CLASS_NAMES.values()), tables.rounded(values)
     else:
         low, high = float(values.min()), float(values.max())
         margin = 0.0 if high > low else max(abs(low) * 0.05, 1e-6)
-        return {"label": label, "values": rounded(values), "range": [low - margin, high + margin]}
+        return {"label": label, "values": tables.rounded(values), "range": [low - margin, high + margin]}
     ends = [ticks[0] - 0.3, ticks[-1] + 0.3]
     return {"label": label, "values": codes, "tickvals": ticks, "ticktext": texts, "range": ends}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,7 +36,7 @@ _HOUSING_MM, _WALL_MM, _BARE_FRONT_MM, _BARE_HALF_MM = 42.0, 5.0, 12.0, 15.0
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """Camera or laser from one side, in mm: origin (2,), corners of window, (4, 2) or (0, 2), and housing (4, 2).
+    """Camera or laser from one side, in mm: origin (2,), corners of window, (4, 2) or (0, 2), and housing (5, 2).
 
     Only origin and window are to scale: the description does not know the housing.
     """
@@ -43,10 +44,6 @@ class Module:
     origin: np.ndarray
     window: np.ndarray
     housing: np.ndarray
-
-    def outline(self) -> np.ndarray:
-        """The housing as a closed line (5, 2)."""
-        return np.vstack([self.housing, self.housing[:1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +70,7 @@ class SideView:
 
     def outlines(self) -> list[np.ndarray]:
         """Lines (K, 2) that show the design behind another one."""
-        return [*self.edges, self.sheet, self.camera.outline(), self.laser.outline(), self.volume]
+        return [*self.edges, self.sheet, self.camera.housing, self.laser.housing, self.volume]
 
     def extent(self) -> list[np.ndarray]:
         """All points (K, 2) that must be in the picture."""
@@ -97,7 +94,7 @@ class FrontView:
 
     def outlines(self) -> list[np.ndarray]:
         """Lines (K, 2) that show the design behind another one."""
-        return [*self.fan, *self.lines, self.laser.outline()]
+        return [*self.fan, *self.lines, self.laser.housing]
 
     def extent(self) -> list[np.ndarray]:
         """All points (K, 2) that must be in the picture."""
@@ -138,7 +135,7 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
     ahead = np.array([0.0, 0.0, 1.0])
     border = directions_of(lens, _border_towards(camera, across))
-    side = SideView(
+    side_view = SideView(
         camera=seeing.seen_along(side_axes, 0.0),
         laser=lighting.seen_along(side_axes, 0.0),
         pupil_mm=camera.focal_length_mm / camera.f_number,
@@ -155,7 +152,10 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     front_axes = np.stack([pose.fan, pose.axis])
     heights, shown = ((on_sheet(outer + at) - pose.origin_mm) @ pose.axis for at in (depths, shown))
     low, high = (np.stack([y, heights], axis=1)[reached] for y in (low, high))
-    borders = [seeing.rays(directions_of(lens, s), pose.origin_mm, pose.normal)[:, -1] for s in _image_sides(camera)]
+    width, height = camera.width_px - 0.5, camera.height_px - 0.5
+    corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height), (-0.5, -0.5)])
+    sides = [directions_of(lens, np.linspace(a, b, _BORDER)) for a, b in pairwise(corners)]
+    borders = [seeing.rays(side, pose.origin_mm, pose.normal)[:, -1] for side in sides]
     front = FrontView(
         laser=lighting.seen_along(front_axes, pose.origin_mm),
         fan=tuple((edge - pose.origin_mm) @ front_axes.T for edge in fan),
@@ -163,7 +163,7 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
         lines=np.stack([line, np.repeat(shown[:, None], 2, axis=1)], axis=2),
         region=np.concatenate([low, high[::-1]]),
     )
-    return side, front
+    return side_view, front
 
 
 def _crossing_mm(pose: LaserPose, outer: float) -> float:
@@ -247,14 +247,8 @@ class _Mounted:
             corners = np.array([inner - along, inner + along, outer + along, outer - along])
         side, back = (half + _WALL_MM) * sideways, _HOUSING_MM * forward
         head = place + front * forward
-        return Module(place, corners, np.array([place - back - side, place - back + side, head + side, head - side]))
-
-
-def _image_sides(camera: Camera) -> list[np.ndarray]:
-    """Pixels (N, 2) along the image's four sides."""
-    width, height = camera.width_px - 0.5, camera.height_px - 0.5
-    corners = np.array([(-0.5, -0.5), (width, -0.5), (width, height), (-0.5, height)])
-    return [np.linspace(a, b, _BORDER) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+        rear = place - back
+        return Module(place, corners, np.array([rear - side, rear + side, head + side, head - side, rear - side]))
 
 
 def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
@@ -348,7 +342,7 @@ class _Pen:
         self.area(module.housing, "#e6eaef", 0.6, edge="#aab4c0")
         self.area(module.window, _GLASS, 0.4, edge=_GLASS)
         back = module.housing[:2].mean(axis=0)
-        ahead = module.housing[2:].mean(axis=0) - back
+        ahead = module.housing[2:4].mean(axis=0) - back
         place = back + 10 * self.px * ahead / max(np.hypot(*ahead), 1e-9)
         self.text(place, name, turned=90 - math.degrees(math.atan2(ahead[1], ahead[0])), ha="center")
 

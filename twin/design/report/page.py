@@ -11,19 +11,7 @@ import uwlts
 from twin.design.choice import Judged
 from twin.design.description import Study
 from twin.design.designs import Columns, Marked
-from twin.design.report.charts import Static, bars, contours, curves, parallel_chart, pareto_chart, verification_chart
-from twin.design.report.drawing import draw, views_of
-from twin.design.report.tables import (
-    agreement_rows,
-    agreement_text,
-    failure_counts,
-    introduction,
-    label_of,
-    miss_counts,
-    text_at,
-    tiles,
-    words_of,
-)
+from twin.design.report import charts, drawing, tables
 from twin.design.verification import Agreement
 from uwlts.model.errors import Error
 from uwlts.report.page_toolkit import FigureCollector, render_page, svg_of
@@ -55,33 +43,37 @@ def page_text(
     judged, collected = Judged(study, columns), FigureCollector()
     over_free_title, over_free = _over_what_is_free(judged, marked)
     nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
-    pareto, parallel = pareto_chart(judged, marked), parallel_chart(judged)
+    pareto, parallel = charts.pareto_chart(judged, marked), charts.parallel_chart(judged)
     return render_page(
         "twin.design.report",
         "template.html.j2",
         interactive=collected,
         title=study.title,
-        introduction=introduction(judged),
+        introduction=tables.introduction(judged),
         notes=list(notes),
         label=marked[-1].label if marked else "",
-        chosen=tiles(study, marked[-1], marked[0] if len(marked) > 1 else None) if marked else None,
+        chosen=tables.tiles(study, marked[-1], marked[0] if len(marked) > 1 else None) if marked else None,
         drawing=_drawing(study, marked),
         over_free=over_free,
         over_free_title=over_free_title,
         pareto=pareto and collected.add(*pareto),
         parallel=parallel and collected.add(*parallel),
         nothing=nothing if len(judged) else "No design has been judged.",
-        rendered=agreement_rows(agreements),
-        verdicts=[(found, agreement_text(study, found), _shown(verification_chart(found))) for found in agreements],
+        number=tables.number_text,
+        value=tables.value_text,
+        verdicts=[
+            (found, tables.agreement_text(study, found), _shown(charts.verification_chart(found)))
+            for found in agreements
+        ],
         best=_best(judged),
-        failures=failure_counts(judged),
-        misses=miss_counts(judged),
+        failures=tables.failure_counts(judged),
+        misses=tables.miss_counts(judged),
         working=int(judged.works.sum()),
         version=uwlts.__version__,
     )
 
 
-def _shown(drawn: Static | None) -> tuple[Markup, str] | None:
+def _shown(drawn: charts.Static | None) -> tuple[Markup, str] | None:
     return drawn and (svg_of(drawn[0]), drawn[1])
 
 
@@ -91,30 +83,30 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
         return None, "There is no design to draw."
     chosen, base = marked[-1], marked[0]
     try:
-        views = views_of(chosen.sensor, study.medium_of(chosen.sensor))
+        views = drawing.views_of(chosen.sensor, study.medium_of(chosen.sensor))
     except Error as error:
         return None, f"The design cannot be drawn: {error}."
     other = None
     if base is not chosen:
         with suppress(Error):
-            other = views_of(base.sensor, study.medium_of(base.sensor))
-    figure, with_other = draw(*views, other)
+            other = drawing.views_of(base.sensor, study.medium_of(base.sensor))
+    figure, with_other = drawing.draw(*views, other)
     return svg_of(figure), _DRAWN + (f" Dashed grey behind: {base.label}." if with_other else "")
 
 
 def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:
     """Title of the chart that suits what is free, and the chart; None where no design works."""
     ranges = [name for name, variable in judged.study.variables.items() if variable.values is None][:2]
-    title = f"Figures over {' and '.join(map(words_of, ranges))}" if ranges else "Figures of the choices"
+    title = f"Figures over {' and '.join(map(tables.words_of, ranges))}" if ranges else "Figures of the choices"
     if not judged.works.any():
         return title, None
     match ranges:
         case [x, y]:
-            return title, _shown(contours(judged, marked, x, y))
+            return title, _shown(charts.contours(judged, marked, x, y))
         case [x]:
-            return title, _shown(curves(judged, marked, x))
+            return title, _shown(charts.curves(judged, marked, x))
         case _:
-            return title, _shown(bars(judged))
+            return title, _shown(charts.bars(judged))
 
 
 def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
@@ -126,8 +118,8 @@ def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
     missed = not judged.feasible.any()
     rows = [
         [str(judged.columns["design"][place])]
-        + [text_at(judged, name, place, unit=False) for name in names]
+        + [tables.text_at(judged, name, place, unit=False) for name in names]
         + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
         for place in (judged.best_first[:_BEST] if len(judged) else [])
     ]
-    return ["design", *map(label_of, names), *(["constraints missed by"] if missed else [])], rows
+    return ["design", *map(tables.label_of, names), *(["constraints missed by"] if missed else [])], rows

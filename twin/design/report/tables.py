@@ -257,21 +257,3 @@ def agreement_text(study: Study, found: Agreement) -> str:
         f"{number_text(1e3 * predicted[worst])} µm were predicted and {number_text(1e3 * rendered[worst])} µm "
         "rendered. Do not rely on the formulas for designs like this one."
     )
-
-
-def agreement_rows(agreements: Sequence[Agreement]) -> list[list[str]]:
-    """Rows of the table of what was rendered."""
-    rows = []
-    for found in agreements:
-        largest = max((abs(value) for value in found.error_mm if math.isfinite(value)), default=math.nan)
-        lines = found.line_mm
-        verdict = "failed" if found.failure else "agree" if found.agrees else "DISAGREE"
-        exposures = found.predicted_exposure_ms, found.exposure_ms
-        rows.append(
-            [found.label, str(found.design) if found.design >= 0 else MISSING, verdict, number_text(found.ratio, 3)]
-            + [number_text(1e3 * largest)]
-            + [f"{number_text(min(lines))} to {number_text(max(lines))}" if lines else MISSING]
-            + [value_text("exposure_ms", exposure, unit=False) for exposure in exposures]
-            + [number_text(found.seconds, 3)]
-        )
-    return rows
