@@ -134,7 +134,8 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
     caption = ""
     if len(groups) > len(COLOURS):
         groups = {"best": judged.best_first.tolist()}
-        caption = f"{tables.listed([tables.words_of(o) for o in others]).capitalize()} also vary: the best design of every place. "
+        varying = tables.listed([tables.words_of(name) for name in others]).capitalize()
+        caption = f"{varying} also vary: the best design of every place. "
     found = {name: _first_at(judged, x, np.array(places), best=bool(caption)) for name, places in groups.items()}
     figure, panels = _panels(shown_figures(judged))
     for axes, name in panels:
