@@ -179,22 +179,18 @@ def designs_of(study: Study, first: int, count: int) -> list[Design]:
         places = np.unravel_index(np.array(numbers), [len(grid) for grid in grids])
         chosen = ([grid[k] for grid, k in zip(grids, row, strict=True)] for row in zip(*places, strict=True))
     else:
-        shares = _shares(study, numbers)
+        variables, seed = len(free), study.sampling.seed
+        if study.sampling.kind == "random":
+            shares = np.array([np.random.default_rng([seed, number]).random(variables) for number in numbers])
+        else:
+            sequence = qmc.Sobol(variables, rng=np.random.default_rng(seed))
+            with warnings.catch_warnings():
+                # A part of the sequence need not be a power of two long: the whole counts.
+                warnings.simplefilter("ignore", UserWarning)
+                if numbers.start > 0:
+                    sequence.fast_forward(numbers.start)
+                shares = sequence.random(len(numbers))
         chosen = ([v.taken(v.at(float(s))) for v, s in zip(free.values(), row, strict=True)] for row in shares)
     return [
         Design(number, dict(zip(free, values, strict=True))) for number, values in zip(numbers, chosen, strict=True)
     ]
-
-
-def _shares(study: Study, numbers: range) -> np.ndarray:
-    """Points (N, V) of the unit cube."""
-    variables, seed = len(study.free()), study.sampling.seed
-    if study.sampling.kind == "random":
-        return np.array([np.random.default_rng([seed, number]).random(variables) for number in numbers])
-    sequence = qmc.Sobol(variables, rng=np.random.default_rng(seed))
-    with warnings.catch_warnings():
-        # A part of the sequence need not be a power of two long: the whole counts.
-        warnings.simplefilter("ignore", UserWarning)
-        if numbers.start > 0:
-            sequence.fast_forward(numbers.start)
-        return sequence.random(len(numbers))

@@ -262,10 +262,15 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
     u = p.across((view.x, view.y))
     lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
     inside = lit & (u >= -0.5) & (u <= p.across((p.width_px, p.height_px)) - 0.5)
-    required, used = exposure_ms(xp, p, _largest(xp, stripe.rate_e_per_ms, lit))
+    if xp is np:
+        brightest = np.where(lit, stripe.rate_e_per_ms, 0.0).max(axis=(1, 2), keepdims=True)
+        brightest = np.where(brightest > 0, brightest, math.nan)
+    else:
+        brightest = xp.max(stripe.rate_e_per_ms)
+    required, used = exposure_ms(xp, p, brightest)
     noise = centre_noise_px(xp, p, stripe, used)
-    towards_camera = direction_outside(xp, window, view.path)
     from_laser = direction_outside(xp, laser_window, path_to(xp, laser_window, added(point, scaled(pose.origin, -1.0))))
+    chord = added(direction_outside(xp, window, view.path), scaled(from_laser, -1.0))  # of unit vectors
     return Field(
         y_mm=y,
         z_mm=z,
@@ -278,26 +283,12 @@ def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, r
         stripe_px=stripe.sigma_px,
         blur_px=stripe.blur_px,
         signal_e=stripe.rate_e_per_ms * used,
-        occlusion_rad=_angle(xp, towards_camera, from_laser),
+        occlusion_rad=2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(chord, chord) + 1e-24), 1.0)),
         lit=lit,
         in_view=inside,
         exposure_ms=used,
         required_ms=required,
     )
-
-
-def _angle(xp: ModuleType, a: Vector, b: Vector) -> Array:
-    """Angle between unit vectors."""
-    chord = added(a, scaled(b, -1.0))
-    return 2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(chord, chord) + 1e-24), 1.0))
-
-
-def _largest(xp: ModuleType, values: Array, where: Array) -> Array:
-    """Largest value of every design."""
-    if xp is np:
-        found = np.where(where, values, 0.0).max(axis=(1, 2), keepdims=True)
-        return np.where(found > 0, found, math.nan)
-    return xp.max(values)
 
 
 def _figure(words: str, unit: str = "mm") -> Any:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from twin.design.choice import PARAMETER_OF, SMOOTH, DerivedFigures, refined
 from twin.design.description import Study
 from twin.design.designs import Design, judged
-from twin.design.refinement import PARAMETER_OF, SMOOTH, DerivedFigures, refined
 
 VALUES = {
     "laser.baseline_mm": 265.0,

@@ -62,6 +62,7 @@ _LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
 _LOG_AXIS = {"type": "log", "dtick": "D2"}
 _WIDE_RANGE = 30.0
 """A figure whose largest value is so many times the least gets a logarithmic axis."""
+_DASHED = "Dashed: bounds."
 _INTERVALS = 100
 _MOST_STEPS, _NODES = 100, 60
 _PER_CELL, _CELLS = 8, (4, 40)
@@ -117,10 +118,6 @@ def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None
             draw(bound, color=RED, linewidth=1.2, linestyle="--")
 
 
-def _dashed(judged: Judged) -> str:
-    return "Dashed: bounds." if judged.study.bounds() else ""
-
-
 # --- curves and bars --------------------------------------------------------------------------------------------------
 
 
@@ -148,7 +145,7 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
         axes.set(xlabel=tables.label_of(x), xscale=judged.study.variables[x].scale)
     legend_below(figure)
     missed = "Hollow: misses a constraint. " if (judged.works & ~judged.feasible).any() else ""
-    return figure, f"{caption}{missed}{_dashed(judged)}".strip()
+    return figure, f"{caption}{missed}{_DASHED if judged.study.bounds() else ''}".strip()
 
 
 def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
@@ -179,7 +176,7 @@ def bars(judged: Judged) -> Static:
         _draw_bounds(axes.axvline, judged, name)
     count = f"The best {len(places)} of {int(judged.works.sum()):,} designs." if len(places) == _MOST_BARS else ""
     grey = " Grey: misses a constraint." if not judged.feasible[places].all() else ""
-    return figure, f"{count}{grey} {_dashed(judged)}".strip()
+    return figure, f"{count}{grey} {_DASHED if judged.study.bounds() else ''}".strip()
 
 
 def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
@@ -287,12 +284,20 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
     missed, grey = found.reasons != "", np.zeros((*found.reasons.shape, 4))
     works = np.isfinite(np.stack(list(found.values.values()))).any(axis=0)
     grey[missed & works], grey[missed & ~works] = to_rgba("#e4e7eb", 0.72), to_rgba("#969ea8")
+    # Lines on which constraints are just met.
+    limits = []
+    for (name, sign, bound), colour in zip(judged.study.bounds(), _LIMITS * 10, strict=False):
+        values, level = found.values.get(name, np.empty(0)), bound + sign * _BESIDE * (abs(bound) or 1.0)
+        crossed = min(values.shape) > 1 and (values < level).any() and (values > level).any()
+        if crossed and len(judged.study.free()) == 2:
+            limits.append((values, level, colour, tables.bound_text(name, sign, bound)))
     for number, (axes, name) in enumerate(panels):
         _fill(axes, found, name)
         if missed.any():
             axes.pcolormesh(found.x, found.y, grey, shading="nearest", rasterized=True, linewidth=0, antialiased=False)
-        if len(judged.study.free()) == 2:
-            _draw_limits(axes, found, judged)
+        for values, level, colour, label in limits:
+            axes.contour(found.x, found.y, values, levels=[level], colors=colour, linestyles="--")
+            axes.plot([], [], color=colour, linestyle="--", label=label)
         if len(dots):
             at = [judged.columns[free][dots] for free in (x, y)]
             axes.plot(*at, ".", color=INK, markersize=1.0, alpha=0.5, rasterized=True)
@@ -344,16 +349,6 @@ def _fill(axes: Axes, found: Map, name: str) -> None:
         bar.ax.minorticks_off()
 
 
-def _draw_limits(axes: Axes, found: Map, judged: Judged) -> None:
-    """Draw the lines on which constraints are just met."""
-    for (name, sign, bound), colour in zip(judged.study.bounds(), _LIMITS * 10, strict=False):
-        values = found.values.get(name, np.empty(0))
-        level = bound + sign * _BESIDE * (abs(bound) or 1.0)
-        if min(values.shape) > 1 and (values < level).any() and (values > level).any():
-            axes.contour(found.x, found.y, values, levels=[level], colors=colour, linestyles="--")
-            axes.plot([], [], color=colour, linestyle="--", label=tables.bound_text(name, sign, bound))
-
-
 # --- rendering --------------------------------------------------------------------------------------------------------
 
 
@@ -387,14 +382,12 @@ def trade_off(judged: Judged) -> tuple[tuple[str, int], tuple[str, int]]:
     wanted = [(o.figure, 1 if o.goal == "minimise" else -1) for o in judged.study.objectives]
     wanted += [(name, 1 if c.least is None else -1) for name, c in judged.study.constraints.items()]
     wanted += [("line_mm", -1), ("depth_mm", -1)]
-    second = next((one for one in wanted[1:] if one[0] != wanted[0][0] and _varies(judged, one[0])), wanted[-1])
+    second = wanted[-1]
+    for name, sign in reversed(wanted[1:]):
+        values = judged.figure(name)[judged.works & np.isfinite(judged.figure(name))]
+        varies = len(values) > 1 and float(np.ptp(values)) > 1e-9 * float(np.abs(values).max())
+        second = (name, sign) if varies and name != wanted[0][0] else second
     return wanted[0], second
-
-
-def _varies(judged: Judged, name: str) -> bool:
-    values = judged.figure(name)[judged.works]
-    values = values[np.isfinite(values)]
-    return len(values) > 1 and float(np.ptp(values)) > 1e-9 * float(np.abs(values).max())
 
 
 def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None:

@@ -279,8 +279,9 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
 
     The figure, and whether the other design is drawn.
     """
-    if other is not None and not (_fits(side, other[0]) and _fits(front, other[1])):
-        other = None
+    for view, behind in zip((side, front), other or (), strict=False):
+        if (_box(view, behind)[1] > _FITS * _box(view)[1].max()).any():
+            other = None
     behind_side, behind_front = other or (None, None)
     low, size = _box(side, behind_side)
     front_low, front_size = _box(front, behind_front)
@@ -303,10 +304,6 @@ def _box(*views: SideView | FrontView | None) -> tuple[np.ndarray, np.ndarray]:
     points = np.concatenate([points for view in views if view is not None for points in view.extent()])
     points = points[np.isfinite(points).all(axis=1)]
     return points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
-
-
-def _fits(view: SideView | FrontView, other: SideView | FrontView) -> bool:
-    return bool((_box(view, other)[1] <= _FITS * _box(view)[1].max()).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,7 +379,19 @@ def _draw_side(pen: _Pen, view: SideView, other: SideView | None, low: np.ndarra
         pen.line(view.in_view, _RED, 3.4)
     pen.line([(-view.pupil_mm / 2, 0), (view.pupil_mm / 2, 0)], INK, 2.6)
     pen.line([view.laser.origin, view.crossing], INK, 0.0, "o")
-    _draw_angle(pen, view)
+    # An arc between the camera's axis and the sheet, above their crossing.
+    radius = min(74.0 * px, 0.6 * (cross - outer))
+    towards = math.copysign(1.0, float(view.sheet[0, 0] - view.sheet[-1, 0]))
+
+    def on_arc(angles: np.ndarray | float, r: float) -> np.ndarray:
+        return view.crossing + r * np.stack([towards * np.sin(angles), -np.cos(angles)], axis=-1)
+
+    pen.line(on_arc(np.linspace(0, view.angle_rad, 60), radius), INK, 0.8)
+    words = f"{number_text(math.degrees(view.angle_rad), 3)}°"
+    if 2 * math.sin(view.angle_rad / 2) * (radius - 16 * px) < 40 * px:
+        pen.text(on_arc(view.angle_rad, radius + 8 * px), words, ha="left" if towards > 0 else "right", halo=True)
+    else:
+        pen.text(on_arc(view.angle_rad / 2, radius - 16 * px), words, ha="center", halo=True)
 
     chain, whole = low[0] - 26 * px, low[0] - 70 * px
     for depth in (outer, cross):
@@ -426,20 +435,3 @@ def _draw_front(pen: _Pen, view: FrontView, other: FrontView | None, *, right: f
             x, y = line.max(axis=0)
             pen.line([(x, y), (right + 8 * px, y)], _THIN, 0.6)
             pen.text((right + 12 * px, y), f"{word} {number_text(float(np.ptp(line[:, 0])))} mm")
-
-
-def _draw_angle(pen: _Pen, view: SideView) -> None:
-    """Draw an arc between the camera's axis and the sheet, above their crossing."""
-    px = pen.px
-    radius = min(74.0 * px, 0.6 * float(view.crossing[1] - view.outer_mm))
-    towards = math.copysign(1.0, float(view.sheet[0, 0] - view.sheet[-1, 0]))
-
-    def at(angles: np.ndarray | float, r: float) -> np.ndarray:
-        return view.crossing + r * np.stack([towards * np.sin(angles), -np.cos(angles)], axis=-1)
-
-    pen.line(at(np.linspace(0, view.angle_rad, 60), radius), INK, 0.8)
-    words = f"{number_text(math.degrees(view.angle_rad), 3)}°"
-    if 2 * math.sin(view.angle_rad / 2) * (radius - 16 * px) < 40 * px:
-        pen.text(at(view.angle_rad, radius + 8 * px), words, ha="left" if towards > 0 else "right", halo=True)
-    else:
-        pen.text(at(view.angle_rad / 2, radius - 16 * px), words, ha="center", halo=True)
