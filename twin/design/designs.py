@@ -114,28 +114,30 @@ def judged(study: Study, designs: Sequence[Design]) -> Columns:
             numbers[place] = numbers_of(sensor, study.medium_of(sensor))
         except Error as error:
             failures[place] = str(error)
-    columns = {"design": np.array([design.number for design in designs])}
-    columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
-    columns |= {name: np.full(len(designs), math.nan) for name in FIGURES}
-    columns["violation"] = np.full(len(designs), math.inf)
+    columns = failed(study, designs, failures)
     if numbers:
         places = np.array(list(numbers))
         options = {"reflectance": study.reflectance, "water_depth_m": study.water_depth_m, "follow": study.follow}
         figures, reasons = figures_of(stacked(list(numbers.values())), **options)
-        for place, reason in zip(places, reasons, strict=True):
-            failures[place] = reason
+        columns["failure"][places] = reasons
         works = np.array([not reason for reason in reasons])
         for name in FIGURES:
             columns[name][places[works]] = getattr(figures, name)[works]
         columns["violation"][places[works]] = violations(study, figures)[works]
-    return columns | {"failure": np.array(failures, dtype=object)}
+    return columns
+
+
+def failed(study: Study, designs: Sequence[Design], reasons: Sequence[str]) -> Columns:
+    """Columns (N,) of N designs that fail for these reasons: figures NaN, and an infinite violation."""
+    columns = {"design": np.array([design.number for design in designs])}
+    columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
+    columns |= {name: np.full(len(designs), math.nan) for name in FIGURES}
+    return columns | {"violation": np.full(len(designs), math.inf), "failure": np.array(reasons, dtype=object)}
 
 
 def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
-    """A sensor that is not one of the study's designs, evaluated; nothing in it follows the stand-off.
-
-    DesignError where the sensor cannot work.
-    """
+    """A sensor that is not one of the study's designs, evaluated; nothing in it follows the stand-off. DesignError
+    where the sensor cannot work."""
     numbers = parameters_of([sensor], [study.medium_of(sensor)])
     figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     if reason:

@@ -347,9 +347,7 @@ FIGURES: dict[str, tuple[str, str]] = {
 
 def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
     """Root mean square of sigma Z (K,) along the stripe of one design, where Z is ``z_mm`` (K,), from the stand-off on.
-
-    The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view.
-    """
+    The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view."""
     with np.errstate(all="ignore"):
         pose = p.pose(np)
         depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)

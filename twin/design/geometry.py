@@ -54,9 +54,7 @@ class Pose:
 
 def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> Pose:
     """Pose of a laser placed by baseline and triangulation angle; ``towards`` is the baseline's direction, (x, y, 0).
-
-    As `uwlts.model.placement.laser_pose`, in a form that can be derived.
-    """
+    As `uwlts.model.placement.laser_pose`, in a form that can be derived."""
     sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
     axis = (-sine * towards[0], -sine * towards[1], cosine)
     across = (cosine * towards[0], cosine * towards[1], sine)
@@ -124,10 +122,8 @@ class Path:
 
 
 def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:
-    """The root sqrt(n^2 + (n^2 - 1) p^2) by which Snell's law divides the slope p that a ray has in air.
-
-    From n sin(b) = sin(a) with p = tan(a): tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2).
-    """
+    """The root sqrt(n^2 + (n^2 - 1) p^2) by which Snell's law divides the slope p that a ray has in air. From n sin(b)
+    = sin(a) with p = tan(a): tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2)."""
     return xp.sqrt(index * index + (index * index - 1) * slope * slope)
 
 

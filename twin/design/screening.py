@@ -26,7 +26,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
 
 from twin.design.description import Study
-from twin.design.designs import Columns, Design, designs_of, judged, number_of_designs
+from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.runtime.workers import Lost, Workers
 from uwlts.storage.files import written_aside
@@ -67,10 +67,8 @@ def rows_in(path: Path) -> int:
 
 
 def read_parts(folder: Path) -> Columns:
-    """Columns of all designs of a folder, in the order of their numbers; empty where there are none.
-
-    CaptureError where a part is damaged or foreign.
-    """
+    """Columns of all designs of a folder, in the order of their numbers; empty where there are none. CaptureError where
+    a part is damaged or foreign."""
     tables = []
     for path in parts(folder):
         try:
@@ -237,24 +235,12 @@ def _content(batch: Batch, result: bytes | Lost) -> bytes:
     """A part's content; of a batch whose worker died, all designs fail with the reason, until it is tried again."""
     if not isinstance(result, Lost):
         return result
-    designs, study = batch.all(), batch.study
-    columns = {name: np.full(len(designs), np.nan) for name in judged(study, [])}
-    columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
-    return as_part(
-        columns
-        | {
-            "design": np.array([design.number for design in designs]),
-            "violation": np.full(len(designs), np.inf),
-            "failure": np.array([result.reason] * len(designs), dtype=object),
-        }
-    )
+    return as_part(failed(batch.study, batch.all(), [result.reason] * batch.count))
 
 
 def keep_to_plan(study: Study, folder: Path) -> None:
-    """Write down what a folder's study is, or make sure that it is the same.
-
-    DescriptionError where the folder holds another study, or other files.
-    """
+    """Write down what a folder's study is, or make sure that it is the same. DescriptionError where the folder holds
+    another study, or other files."""
     made_folder(folder)
     plan = json.loads(study.model_dump_json(exclude=set(_FREE_TO_CHANGE)))
     del plan["sampling"]["designs"]

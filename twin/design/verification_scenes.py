@@ -19,11 +19,8 @@ from uwlts.model.sensor import Camera, Exposure, Medium, Sensor, Volume
 
 @dataclass(frozen=True, eq=False)
 class LineOfSight:
-    """A sensor's camera and fan in a medium.
-
-    ``pose`` is ``T_camera_object`` (4, 4), ``laser_mm`` (3,) the fan's origin in the OCS, ``fan_slope`` the tangent of
-    half the fan's angle in the medium.
-    """
+    """A sensor's camera and fan in a medium. ``pose`` is ``T_camera_object`` (4, 4), ``laser_mm`` (3,) the fan's origin
+    in the OCS, ``fan_slope`` the tangent of half the fan's angle in the medium."""
 
     camera: Camera
     index: float
@@ -79,10 +76,8 @@ class LineOfSight:
         return y[longest_run(visible & lit)]
 
     def half_target_mm(self, z: float, y: float) -> np.ndarray:
-        """Half sides (2,), X and Y, of a target about (0, y, z) that fills the view, without window and distortion.
-
-        At a grazing angle it would have to be endless: it goes beyond the view's diagonal by a quarter.
-        """
+        """Half sides (2,), X and Y, of a target about (0, y, z) that fills the view, without window and distortion. At
+        a grazing angle it would have to be endless: it goes beyond the view's diagonal by a quarter."""
         camera, rotation = self.camera, self.pose[:3, :3]
         side = np.linspace(-0.5, 0.5, 41)
         edge = np.concatenate([[(t, -0.5), (t, 0.5), (-0.5, t), (0.5, t)] for t in side])
@@ -180,7 +175,14 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
     if not (sensor.camera.window.mounted and sight.index > 1 + 1e-6):
         return Recordings(_target(calibrated, medium, sight, near, far, y), None, standard)
     step = Recording("step", calibrated, _step(medium, near, far, y, length))
-    in_air, air = _with_air(calibrated)
+    wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
+    air = next(
+        (name for name, one in media.items() if one.kind == "air" and one.refractive_index(wavelength) == 1), None
+    )
+    if air is None:
+        air = "air" if "air" not in media else "air to calibrate in"
+        media[air] = Medium(kind="air")
+    in_air = calibrated.model_copy(update={"media": media})
     window = in_air.camera.window.model_copy(update={"mounted": False})
     camera = in_air.camera.model_copy(update={"window": window})
     bare = LineOfSight.of(in_air.model_copy(update={"camera": camera}), in_air.medium(air))
@@ -210,15 +212,6 @@ def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
         )
     margin = _MARGIN * (lit[-1] - lit[0])
     return float(lit[0] + margin), float(lit[-1] - margin)
-
-
-def _with_air(sensor: Sensor) -> tuple[Sensor, str]:
-    """The sensor with air among its media, and what it is called there."""
-    for name, medium in sensor.media.items():
-        if medium.kind == "air" and medium.refractive_index(sensor.laser.wavelength_nm) == 1:
-            return sensor, name
-    name = "air" if "air" not in sensor.media else "air to calibrate in"
-    return sensor.model_copy(update={"media": sensor.media | {name: Medium(kind="air")}}), name
 
 
 def _step(medium: str, near: float, far: float, y: float, length: float) -> Scene:

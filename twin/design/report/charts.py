@@ -100,16 +100,14 @@ def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[
 
 def _mark(axes: Axes, marked: Sequence[Marked], x: str, y: str) -> None:
     """Draw marked designs as symbols, the chosen one in red."""
-    for number, (one, colour) in enumerate(_coloured(marked)):
-        at, size = (one.design.number_of(x), one.design.number_of(y)), 10 if one is marked[-1] else 8
+    for number, one in enumerate(marked):
+        at, (colour, size) = (
+            (one.design.number_of(x), one.design.number_of(y)),
+            (RED, 10) if one is marked[-1] else (INK, 8),
+        )
         if all(map(math.isfinite, at)):
             style = {"color": colour, "markersize": size, "markeredgecolor": "white", "zorder": 6}
             axes.plot(*at, _SYMBOLS[number % len(_SYMBOLS)][1], label=one.label, **style)
-
-
-def _coloured(marked: Sequence[Marked]) -> list[tuple[Marked, str]]:
-    """Marked designs with the colours of their symbols and labels; the last is the chosen one."""
-    return [(one, RED if one is marked[-1] else INK) for one in marked]
 
 
 def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None:
@@ -208,10 +206,8 @@ class Map:
 
 
 def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None:
-    """The map of figures over two variables; None where the designs span no area.
-
-    A grid shows its designs, others are interpolated linearly. Where more is free, every cell shows its best design.
-    """
+    """The map of figures over two variables; None where the designs span no area. A grid shows its designs, others are
+    interpolated linearly. Where more is free, every cell shows its best design."""
     names, free = (x, y), judged.study.free()
     variables = [judged.study.variables[name] for name in names]
     columns = [np.asarray(judged.columns[name], dtype=float) for name in names]
@@ -472,13 +468,14 @@ def _add_marked(
     figure: go.Figure, marked: Sequence[Marked], names: tuple[str, str], logs: Sequence[bool], *, middle: float
 ) -> None:
     """Add marked designs with their labels, which stand towards the ``middle`` of the x axis."""
-    for number, (one, colour) in enumerate(_coloured(marked)):
+    for number, one in enumerate(marked):
+        colour, size = (RED, 15) if one is marked[-1] else (INK, 11)
         at, label = [one.design.number_of(name) for name in names], _escaped(one.label)
         if not all(map(math.isfinite, at)):
             continue
         places = [math.log10(value) if log else value for value, log in zip(at, logs, strict=True)]
         left = places[0] > middle
-        marker = {"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": 15 if one is marked[-1] else 11}
+        marker = {"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": size}
         figure.add_scatter(
             x=tables.rounded(at[:1]),
             y=tables.rounded(at[1:]),

@@ -36,10 +36,8 @@ _HOUSING_MM, _WALL_MM, _BARE_FRONT_MM, _BARE_HALF_MM = 42.0, 5.0, 12.0, 15.0
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """Camera or laser from one side, in mm: origin (2,), corners of window, (4, 2) or (0, 2), and housing (5, 2).
-
-    Only origin and window are to scale: the description does not know the housing.
-    """
+    """Camera or laser from one side, in mm: origin (2,), corners of window, (4, 2) or (0, 2), and housing (5, 2). Only
+    origin and window are to scale: the description does not know the housing."""
 
     origin: np.ndarray
     window: np.ndarray
@@ -102,11 +100,8 @@ class FrontView:
 
 
 def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
-    """Side and front view of a sensor in a medium.
-
-    DesignError where the sheet does not cross the camera's axis in front of the window, or the laser shines back; else
-    errors as of `twin.design.parameters.numbers_of`.
-    """
+    """Side and front view of a sensor in a medium. DesignError where the sheet does not cross the camera's axis in
+    front of the window, or the laser shines back; else errors as of `twin.design.parameters.numbers_of`."""
     pose, p, camera = laser_pose(sensor), parameters_of([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())
     crossing = _crossing_mm(pose, outer)
@@ -275,10 +270,8 @@ _LETTER_PX = 6.7
 
 
 def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> tuple[Figure, bool]:
-    """Draw a design's views beside each other at one scale, another design dashed behind them where it fits.
-
-    The figure, and whether the other design is drawn.
-    """
+    """Draw a design's views beside each other at one scale, another design dashed behind them where it fits. The
+    figure, and whether the other design is drawn."""
     for view, behind in zip((side, front), other or (), strict=False):
         if (_box(view, behind)[1] > _FITS * _box(view)[1].max()).any():
             other = None

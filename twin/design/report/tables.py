@@ -33,22 +33,17 @@ _UNITS = {
     "_per_million": "per million",
     "_per_m": "1/m",
     "_g_kg": "g/kg",
-    "_mm": "mm",
     "_um": "µm",
-    "_nm": "nm",
     "_mw": "mW",
     "_deg": "°",
-    "_px": "px",
-    "_ms": "ms",
     "_us": "µs",
     "_hz": "Hz",
     "_dn": "DN",
     "_e": "e⁻",
     "_c": "°C",
     "_k": "K",
-    "_s": "s",
-    "_m": "m",
-}
+} | {f"_{unit}": unit for unit in ("mm", "nm", "px", "ms", "s", "m")}
+"""Units by the ends of names; the first that fits counts."""
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
