@@ -172,25 +172,14 @@ def sweep(
     result = SweepResult(described, folder, columns, chosen.marked, tuple(agreements), chosen.notes)
     page = page_text(described, columns, marked=chosen.marked, agreements=agreements, notes=chosen.notes)
     write_page(folder / PAGE, page, overwrite=True)
-    write_summary(result)
-    return result
-
-
-def write_summary(result: SweepResult) -> None:
-    """Write in numbers what the page shows of the marked and the rendered designs."""
-    designs, work, meet = result.counts()
-    content = {
-        "title": result.study.title,
-        "designs": designs,
-        "work": work,
-        "meet_all_constraints": meet,
-        "marked": [{"label": one.label} | one.design.table() for one in result.marked],
-        "verified": result.agreements,
-        "notes": result.notes,
-    }
-    with written_aside(result.folder / SUMMARY, overwrite=True) as aside:
+    counts = dict(zip(("designs", "work", "meet_all_constraints"), result.counts(), strict=True))
+    content: dict[str, Any] = {"title": described.title} | counts
+    content["marked"] = [{"label": one.label} | one.design.table() for one in result.marked]
+    content |= {"verified": result.agreements, "notes": result.notes}
+    with written_aside(folder / SUMMARY, overwrite=True) as aside:
         # Numbers that JSON cannot hold become null.
         aside.write_bytes(TypeAdapter(dict[str, Any]).dump_json(content, indent=2) + b"\n")
+    return result
 
 
 def clear(folder: Path) -> None:

@@ -57,7 +57,6 @@ _MOST_DOTS, _MOST_OF_CURVE, _MOST_BARS, _MOST_DIMENSIONS = 2000, 500, 40, 12
 """More designs, points of a curve, bars and axes would hide each other."""
 _FEW, _IN_SVG = 300, 2500
 """More points are drawn smaller; more than the second number with WebGL, which does not slow the page down."""
-_SEED = 0
 _LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
 _LOG_AXIS = {"type": "log", "dtick": "D2"}
 _WIDE_RANGE = 30.0
@@ -504,7 +503,7 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
     others = np.flatnonzero(candidates & ~kept)
     room = max(0, most - int(kept.sum()))
     if len(others) > room:
-        others = np.random.default_rng(_SEED).choice(others, room, replace=False)
+        others = np.random.default_rng(0).choice(others, room, replace=False)
     chosen = kept.copy()
     chosen[others] = True
     return chosen

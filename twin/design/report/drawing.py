@@ -67,12 +67,8 @@ class SideView:
     angle_rad: float
 
     def outlines(self) -> list[np.ndarray]:
-        """Lines (K, 2) that show the design behind another one."""
+        """Lines (K, 2) that show the design behind another one; everything else lies within their extent."""
         return [*self.edges, self.sheet, self.camera.housing, self.laser.housing, self.volume]
-
-    def extent(self) -> list[np.ndarray]:
-        """All points (K, 2) that must be in the picture."""
-        return [*self.outlines(), self.camera.window, self.laser.window]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +87,8 @@ class FrontView:
     region: np.ndarray
 
     def outlines(self) -> list[np.ndarray]:
-        """Lines (K, 2) that show the design behind another one."""
+        """Lines (K, 2) that show the design behind another one; everything else lies within their extent."""
         return [*self.fan, *self.lines, self.laser.housing]
-
-    def extent(self) -> list[np.ndarray]:
-        """All points (K, 2) that must be in the picture."""
-        return [*self.outlines(), self.laser.window, self.region]
 
 
 def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
@@ -294,7 +286,7 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
 
 def _box(*views: SideView | FrontView | None) -> tuple[np.ndarray, np.ndarray]:
     """Least coordinates and size of all points of views."""
-    points = np.concatenate([points for view in views if view is not None for points in view.extent()])
+    points = np.concatenate([points for view in views if view is not None for points in view.outlines()])
     points = points[np.isfinite(points).all(axis=1)]
     return points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
 
