@@ -1,7 +1,5 @@
-"""Choice of the design to build: the Pareto front, the best design, its refinement, and others to look at.
-
-The refinement follows the gradient of the objective, which Dr.Jit derives from the formulas of all designs.
-"""
+"""Choice of the design to build: the Pareto front, the best design, its refinement along the gradient of the objective,
+which Dr.Jit derives from the formulas of all designs, and others to look at."""
 
 from __future__ import annotations
 

@@ -435,8 +435,13 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
     inside = spread / snell_root(np, p.laser_window_index, spread)
     fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
     fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
-    begins, crossing = -figures.near_mm, -figures.standoff_mm
-    numbers = {"crossing": crossing, "begins": begins, "cone": cone, "fan": fan, "fullest": fullest}
+    numbers = {
+        "crossing": -figures.standoff_mm,
+        "begins": -figures.near_mm,
+        "cone": cone,
+        "fan": fan,
+        "fullest": fullest,
+    }
     flat = np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm)
     checks = {
         "the lens would be focused within its focal length": one(p.focus_mm - p.focal_mm) <= 0,
@@ -451,7 +456,7 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
             fan > one(p.laser_window_aperture_mm)
         ),
         "camera and laser reach no point of the measuring volume": ~(figures.coverage > 0),
-        "the stripe saturates: at the given exposure it has {fullest:.1f} times the full well": fullest > 1,
+        "the stripe saturates: at the given exposure it has {full:.1f} times the full well": fullest > 1,
         "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser": (
             ~(flat < 0.5 * figures.standoff_mm)
         ),

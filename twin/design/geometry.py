@@ -209,10 +209,8 @@ class Lens:
 
 @dataclass(frozen=True)
 class Seen:
-    """Points as the camera sees them: pixels x, y, the ray there, and what a shift of the image point does to pixels.
-
-    ``jacobian`` holds dx/da, dx/db, dy/da, dy/db in px for the image point (a, b), slopes in air, before distortion.
-    """
+    """Points as the camera sees them: pixels x, y, the ray there and its slopes (a, b) in air, before distortion, and in
+    ``jacobian`` how these change the pixels: dx/da, dx/db, dy/da, dy/db in px."""
 
     x: Array
     y: Array

@@ -118,9 +118,8 @@ class Parameters:
 
     def _normal(self, xp: ModuleType) -> Vector:
         """Unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""
-        cosine = xp.cos(self.window_tilt_x_rad)
-        tilt_y = self.window_tilt_y_rad
-        return cosine * xp.sin(tilt_y), -xp.sin(self.window_tilt_x_rad), cosine * xp.cos(tilt_y)
+        x, y = self.window_tilt_x_rad, self.window_tilt_y_rad
+        return xp.cos(x) * xp.sin(y), -xp.sin(x), xp.cos(x) * xp.cos(y)
 
     def window(self, xp: ModuleType) -> FlatWindow:
         """The camera's window; unmounted one of no thickness in the pupil, with nothing but air behind it."""

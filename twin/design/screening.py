@@ -1,9 +1,8 @@
 """Judging of all designs of a study by formulas, a batch at a time, into parts from which a stopped sweep continues.
 
-Results are Parquet parts in a folder, each with the rows of a batch of designs, read together as a table. A part is
-named after its first design. It appears whole, and a part that two machines have written is the same part: nothing is
-lost when one of them is stopped, and nothing counts twice. An optimised study gets its designs from NSGA-II (Deb et
-al. 2002).
+Results are Parquet parts in a folder, each with the rows of a batch of designs and named after its first design. A part
+appears whole, and a part that two machines have written is the same part: nothing is lost when one of them is stopped,
+and nothing counts twice. An optimised study gets its designs from NSGA-II (Deb et al. 2002).
 """
 
 from __future__ import annotations
@@ -132,20 +131,18 @@ def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
     """Report columns of designs to the optimiser; those reported before are left alone."""
     trials = {trial.number: trial for trial in search.get_trials(deepcopy=False)}
     for place, number in enumerate(columns["design"].tolist()):
-        trial = trials.get(number)
-        if trial is None or trial.state != TrialState.RUNNING:
+        if number not in trials or trials[number].state != TrialState.RUNNING:
             continue
         values = [float(columns[objective.figure][place]) for objective in study.objectives]
         violation = float(columns["violation"][place])
         if math.isfinite(violation) and all(map(math.isfinite, values)):
-            Trial(search, trial._trial_id).set_constraint("violation", violation)
+            Trial(search, trials[number]._trial_id).set_constraint("violation", violation)
             search.tell(number, values)
         else:
             search.tell(number, state=TrialState.FAIL)
 
 
-Progress = Callable[[int, int], None]
-"""Called with the number of designs that are done, and of how many."""
+Progress = Callable[[int, int], None]  # called with the number of designs that are done, and of how many
 PLAN, PARTS = "plan.json", "screen"
 _FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
 """What may be different when a sweep is gone on with, besides the number of random, Sobol or optimised designs."""

@@ -12,8 +12,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -104,34 +104,28 @@ def verify(
         (recording, Options(spp=spp, seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
         for k, recording in enumerate(planned.all())
     ]
-    seconds: dict[str, float] = {}
+    times = [time.perf_counter()]
     try:
-        with _timed(seconds, "render"):
-            work_through(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
-        with _timed(seconds, "calibrate"):
-            steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
-            target = str(_capture(folder, planned.target))
-            _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
-        with _timed(seconds, "measure"):
-            capture = _capture(folder, planned.standard)
-            known = ("--calibration", str(calibration), "--out", str(cloud))
-            _run("reconstruct", str(capture), *known, fails_as=errors.CaptureError)
-            with Capture(capture) as opened:
-                exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
-            profiles = _judged(_points(cloud), stage)
+        work_through(partial(_record, folder, variant), jobs, workers=min(workers, len(jobs)))
+        times.append(time.perf_counter())
+        steps = [] if planned.step is None else ["--step", str(_capture(folder, planned.step))]
+        target = str(_capture(folder, planned.target))
+        _run("calibrate", "--air", target, *steps, "--out", str(calibration), fails_as=errors.CalibrationError)
+        times.append(time.perf_counter())
+        capture = _capture(folder, planned.standard)
+        known = ("--calibration", str(calibration), "--out", str(cloud))
+        _run("reconstruct", str(capture), *known, fails_as=errors.CaptureError)
+        with Capture(capture) as opened:
+            exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
+        profiles = _judged(_points(cloud), stage)
+        times.append(time.perf_counter())
     finally:
         if not keep:
             captures = [_capture(folder, recording) for recording in planned.all()]
             for path in (cloud, *captures, *map(truth_path, captures), *map(part_path, captures)):
                 path.unlink(missing_ok=True)
+    seconds = dict(zip(("render", "calibrate", "measure"), np.diff(times).tolist(), strict=True))
     return replace(profiles, exposure_ms=exposure, seconds=seconds)
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    begun = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - begun
 
 
 def _capture(folder: Path, recording: Recording) -> Path:

@@ -97,11 +97,8 @@ class LineOfSight:
 def longest_run(flags: np.ndarray | list[bool]) -> slice:
     """Where the longest row of true flags lies; empty where there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    if not len(edges):
-        return slice(0, 0)
-    starts, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - starts))
-    return slice(int(starts[longest]), int(ends[longest]))
+    start, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
+    return slice(start, end)
 
 
 STANDARD_DEPTHS = 9

@@ -130,7 +130,16 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
         groups = {"best": judged.best_first.tolist()}
         varying = tables.listed([tables.words_of(name) for name in others]).capitalize()
         caption = f"{varying} also vary: the best design of every place. "
-    found = {name: _first_at(judged, x, np.array(places), best=bool(caption)) for name, places in groups.items()}
+    at, found = np.asarray(judged.columns[x], dtype=float), {}
+    for name, members in groups.items():
+        places = np.array(members)
+        if caption:
+            # The best come first: one per interval.
+            share = share_of(judged.study.variables[x], at[places])
+            places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
+        places = places[np.argsort(at[places], kind="stable")]
+        thinned = np.linspace(0, len(places) - 1, min(len(places), _MOST_OF_CURVE)).round().astype(int)
+        found[name] = places[np.unique(thinned)]
     figure, panels = _panels(shown_figures(judged))
     for axes, name in panels:
         for colour, (group, places) in zip(COLOURS, found.items(), strict=False):
@@ -147,16 +156,6 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
 
 def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
     return ", ".join(tables.text_at(judged, name, place) for name in names)
-
-
-def _first_at(judged: Judged, x: str, places: np.ndarray, *, best: bool) -> np.ndarray:
-    """Places by ascending x, thinned out where there are many; of the best, which come first, one per interval."""
-    values = np.asarray(judged.columns[x], dtype=float)
-    if best:
-        share = share_of(judged.study.variables[x], values[places])
-        places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
-    places = places[np.argsort(values[places], kind="stable")]
-    return places[np.unique(np.linspace(0, len(places) - 1, min(len(places), _MOST_OF_CURVE)).round().astype(int))]
 
 
 @_plain_text
