@@ -198,9 +198,8 @@ PARAMETER_OF: dict[str, tuple[str, float]] = {
     "volume.near_mm": ("near_mm", 1.0),
     "volume.far_mm": ("far_mm", 1.0),
 }
-"""Numbers of the description along which figures can be derived, with the parameter and its unit per the path's.
-
-What a window's glass absorbs is taken as it is at the starting point."""
+"""Numbers of the description along which figures can be derived, with the parameter and its unit per the path's; what a
+window's glass absorbs is taken as it is at the starting point."""
 
 _OF_BASELINE = ("laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg")
 """Numbers without a meaning for a laser that is placed by its axis."""

@@ -144,9 +144,8 @@ def traced(window: FlatWindow, origin: np.ndarray, directions: np.ndarray) -> tu
     asides = window.distance_mm * slope, across_mm(np, window, window.outer_mm, slope)
     heights = window.distance_mm, window.outer_mm
     points = [origin + h * normal + aside[:, None] * leaning for h, aside in zip(heights, asides, strict=True)]
-    points = [np.broadcast_to(origin, directions.shape), *points]
     outside = slope / snell_root(np, window.medium_index, slope)
-    return np.stack(points, axis=1), normal + outside[:, None] * leaning
+    return np.stack([np.broadcast_to(origin, directions.shape), *points], axis=1), normal + outside[:, None] * leaning
 
 
 def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
@@ -209,7 +208,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Seen:
-    """Points as the camera sees them: pixels x, y, the ray there and its slopes (a, b) in air, before distortion, and in
+    """Points as the camera sees them: pixels x, y, the ray there and its slopes (a, b) in air, before distortion; in
     ``jacobian`` how these change the pixels: dx/da, dx/db, dy/da, dy/db in px."""
 
     x: Array

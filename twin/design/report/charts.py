@@ -58,7 +58,6 @@ _MOST_DOTS, _MOST_OF_CURVE, _MOST_BARS, _MOST_DIMENSIONS = 2000, 500, 40, 12
 _FEW, _IN_SVG = 300, 2500
 """More points are drawn smaller; more than the second number with WebGL, which does not slow the page down."""
 _LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
-_LOG_AXIS = {"type": "log", "dtick": "D2"}
 _WIDE_RANGE = 30.0
 """A figure whose largest value is so many times the least gets a logarithmic axis."""
 _DASHED = "Dashed: bounds."
@@ -304,11 +303,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         axes.set(xlim=xlim, ylim=ylim)
     legend_below(figure)
     ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
-    outside = [
-        one.label
-        for one in marked
-        if not all(low <= one.design.number_of(name) <= high for name, (low, high) in ends.items())
-    ]
+    outside = [m.label for m in marked if not all(a <= m.design.number_of(n) <= b for n, (a, b) in ends.items())]
     parts = (
         found.caption,
         "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
@@ -436,7 +431,7 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
     for name, label, distance in zip((x, y), labels, (10, 12), strict=True):
         numbers = np.append(judged.figure(name)[known], [one.design.number_of(name) for one in marked])
         ends.append((float(np.nanmin(numbers)), float(np.nanmax(numbers))))
-        log = _LOG_AXIS if 0 < ends[-1][0] * _WIDE_RANGE < ends[-1][1] else {}
+        log = {"type": "log", "dtick": "D2"} if 0 < ends[-1][0] * _WIDE_RANGE < ends[-1][1] else {}
         axes.append(axis | {"title": {"text": label, "standoff": distance}} | log)
     figure.update_layout(
         _LAYOUT,
