@@ -210,7 +210,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     if not (window.mounted and laser.window.mounted) and index != 1:
         raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
     by_axis = laser.origin_mm is not None
-    placed: tuple[Vector, ...] = ((math.nan,) * 3,) * 4
+    placed: Array = ((math.nan,) * 3,) * 4
     if by_axis:
         pose = laser_pose(sensor)
         placed = tuple(tuple(v.tolist()) for v in (pose.origin_mm, pose.axis, pose.fan, pose.normal))
@@ -218,10 +218,9 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
     d, angle, speckle = camera.distortion, laser.triangulation_angle_deg, 1.0
-    if laser.linewidth_nm > 0:
+    if (width := laser.linewidth_nm) > 0:
         # The contrast that the line width leaves on a diffuse surface.
-        light = {"linewidth_nm": laser.linewidth_nm, "wavelength_nm": wavelength, "index": index}
-        speckle = coherence(_DIFFUSE_ROUGHNESS_UM, **light)
+        speckle = coherence(_DIFFUSE_ROUGHNESS_UM, linewidth_nm=width, wavelength_nm=wavelength, index=index)
     numbers = {
         "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
         "angle_rad": math.nan if by_axis or angle is None else math.radians(angle),

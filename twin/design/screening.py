@@ -123,7 +123,7 @@ def _open_search(study: Study, folder: Path) -> optuna.Study:
         sampler=optuna.samplers.NSGAIISampler(population_size=_POPULATION, seed=seed),
         study_name=_NAME,
         load_if_exists=True,
-        directions=[objective.goal.replace("ise", "ize") for objective in study.objectives],
+        directions=["minimize" if one.goal == "minimise" else "maximize" for one in study.objectives],
     )
 
 

@@ -27,7 +27,8 @@ from twin.design.report import tables
 from twin.design.verification import Agreement
 from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
 
-Static, Interactive = tuple[Figure, str], tuple[go.Figure, str]
+Static = tuple[Figure, str]
+Interactive = tuple[go.Figure, str]
 """A figure for a page, and its caption."""
 
 RED, GREEN, PALE = "#c22f2f", "#2e8b57", "#c3cad2"
@@ -241,7 +242,7 @@ def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None
     for place in map(tuple, np.argwhere(reasons == "")):
         row = {name: float(values[name][place]) for name in bounded}
         reasons[place] = "; ".join(text for text, _ in tables.misses(judged.study, row).values())
-    return Map(*axes, values, reasons, smooth=alone or not scattered, dots=scattered, caption=caption)
+    return Map(axes[0], axes[1], values, reasons, smooth=alone or not scattered, dots=scattered, caption=caption)
 
 
 def _interpolated(

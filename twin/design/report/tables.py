@@ -224,9 +224,9 @@ def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
     if "window_mm" not in objectives:
         thin = " – too thin" if needed > window.thickness_mm else ""
-        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}"
-        text = value_text("window_mm", window.thickness_mm)
-        found.append(Tile("camera's window", *((text, note) if window.mounted else ("none",))))
+        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}" if window.mounted else ""
+        text = value_text("window_mm", window.thickness_mm) if window.mounted else "none"
+        found.append(Tile("camera's window", text, note))
     return found
 
 
