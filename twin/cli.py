@@ -70,14 +70,14 @@ def _sections(function: Callable[..., object]) -> list[str]:
 def _typed(hint: Any, described: str) -> Any:
     """The annotation of a command's parameter: those of a function's types that can be given as text."""
     kinds = get_args(hint) or (hint,)
-    shown = {"help": described.replace("`", "")}
+    text = described.replace("`", "")
     if Sequence[str] in (hint, *kinds):
-        return Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="", **shown)]
+        return Annotated[tuple[str, ...], Parameter(consume_multiple=True, negative="", help=text)]
     if hint is bool:
-        return Annotated[bool, Parameter(negative="", **shown)]
+        return Annotated[bool, Parameter(negative="", help=text)]
     if get_origin(hint) is not Literal:
         hint = reduce(or_, (kind for kind in kinds if kind in (str, int, float, bool, NoneType)))
-    return Annotated[hint, Parameter(**shown)]
+    return Annotated[hint, Parameter(help=text)]
 
 
 @_command(twin.simulate)

@@ -16,6 +16,7 @@ import re
 import sys
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -44,15 +45,7 @@ SINGLE_PRECISION_INTEGERS = 2**24
 
 _NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.so(\..+)?")
 _NAMED_VERSION = re.compile(r"libLLVM(?:-(\d+)(?:\.(\d+))?|\.so\.(\d+)\.(\d+))")
-_SYSTEM_FOLDERS = (
-    "/usr/local/lib",
-    "/usr/local/lib64",
-    "/usr/lib",
-    "/usr/lib64",
-    "/usr/lib/*-linux-gnu",
-    "/usr/lib/llvm*/lib",
-    "/usr/lib64/llvm*/lib",
-)
+_SYSTEM_FOLDERS = ("local/lib", "local/lib64", "lib", "lib64", "lib/*-linux-gnu", "lib/llvm*/lib", "lib64/llvm*/lib")
 _HOW_TO_INSTALL = """\
 Install what is missing:
   Debian, Ubuntu:  apt-get install libllvm19 libatomic1   (as root; any of libllvm17 and newer)
@@ -94,11 +87,7 @@ def prepare_llvm() -> LlvmLibrary:
     """Choose a libLLVM and set DRJIT_LIBLLVM_PATH, which Dr.Jit reads when it is imported.
 
     Where Dr.Jit is imported already, its library is checked instead, because it cannot be exchanged any more.
-
-    Raises
-    ------
-    SetupError
-        There is no suitable libLLVM, or Dr.Jit was imported without one.
+    SetupError where there is no suitable libLLVM, or Dr.Jit was imported without one.
     """
     if "drjit" in sys.modules:
         major, minor, patch = sys.modules["drjit"].detail.llvm_version()
@@ -118,22 +107,12 @@ def prepare_llvm() -> LlvmLibrary:
     return library
 
 
-# --- search -----------------------------------------------------------------------------------------------------------
-
-
 def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
     """Choose the newest libLLVM that Dr.Jit can work with, and make sure that Dr.Jit's runtime library is there.
 
-    Parameters
-    ----------
-    folders
-        Where to look; without it everywhere (`search_folders`). A library named by the environment variable
-        DRJIT_LIBLLVM_PATH is the user's choice and the only one considered: it is used or refused, never replaced.
-
-    Raises
-    ------
-    SetupError
-        There is none, or the user's choice is unsuitable. The message lists what was found and how to install one.
+    It is searched in ``folders``, without them everywhere (`search_folders`). A library named by the environment
+    variable DRJIT_LIBLLVM_PATH is the user's choice and the only one considered: it is used or refused, never replaced.
+    SetupError, which lists what was found and how to install one, where none is suitable.
     """
     if chosen := os.environ.get(VARIABLE):
         try:
@@ -156,15 +135,15 @@ def _newest(folders: Iterable[Path] | None) -> LlvmLibrary:
         if best is not None and named_version(path) <= best.version:
             break
         try:
-            best = max(filter(None, (best, examine(path))), key=lambda library: library.version)
+            found = examine(path)
+            best = found if best is None or found.version > best.version else best
         except SetupError as error:
             unsuitable += f"\n  {error}"
     if best is None:
         found = unsuitable or "\n  none"
         raise SetupError(
             f"no suitable libLLVM: Dr.Jit needs the shared library of LLVM {MINIMUM_MAJOR} or newer. Found:{found}\n"
-            f"{_HOW_TO_INSTALL}\n"
-            f"or let the environment variable {VARIABLE} name a libLLVM."
+            f"{_HOW_TO_INSTALL}\nor let the environment variable {VARIABLE} name a libLLVM."
         )
     return best
 
@@ -176,9 +155,9 @@ def _runtime_library(beside: Path) -> tuple[Path, ...]:
     try:
         ctypes.CDLL(RUNTIME_LIBRARY)
     except OSError as error:
-        for folder in (beside, *own_folders("llvm")):
-            if path := file_of(RUNTIME_LIBRARY, folder):
-                return (path,)
+        found = (file_of(RUNTIME_LIBRARY, folder) for folder in (beside, *own_folders("llvm")))
+        if path := next(filter(None, found), None):
+            return (path,)
         raise SetupError(f"Dr.Jit needs {RUNTIME_LIBRARY}, which this machine lacks.\n{_HOW_TO_INSTALL}") from error
     return ()
 
@@ -225,12 +204,9 @@ def list_candidates(folders: Iterable[Path] | None = None) -> list[Path]:
     """Files named like a libLLVM in the folders, links resolved, each file once; unreadable folders hold none."""
     found: dict[Path, None] = {}
     for folder in search_folders() if folders is None else folders:
-        try:
-            inside = sorted(entry.name for entry in folder.iterdir())
-        except OSError:
-            continue
-        paths = (folder / name for name in inside if _NAME.fullmatch(name))
-        found |= dict.fromkeys(path.resolve() for path in paths if path.is_file())
+        with suppress(OSError):
+            paths = [path for path in sorted(folder.iterdir()) if _NAME.fullmatch(path.name)]
+            found |= dict.fromkeys(path.resolve() for path in paths if path.is_file())
     return list(found)
 
 
@@ -239,24 +215,15 @@ def search_folders() -> list[Path]:
     folders = own_folders("llvm")
     folders += [Path(folder) for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
     folders += [Path(prefix, "lib") for prefix in (sys.prefix, os.environ.get("CONDA_PREFIX")) if prefix]
-    for pattern in _SYSTEM_FOLDERS:
-        folders += sorted(Path("/").glob(pattern.lstrip("/")))
+    folders += [folder for pattern in _SYSTEM_FOLDERS for folder in sorted(Path("/usr").glob(pattern))]
     return folders
-
-
-# --- installation -----------------------------------------------------------------------------------------------------
 
 
 def install_llvm(report: packages.Report = lambda line: None) -> LlvmLibrary:
     """Find a suitable libLLVM, or obtain one: with apt-get as root, else unpacked from Debian packages or a wheel.
 
     ``report`` is called with a line of text for each step. It is unpacked into `.llvm` in the source tree, or the
-    user's cache folder.
-
-    Raises
-    ------
-    SetupError
-        None of the ways led to a library; the message gives the reason of each.
+    user's cache folder. SetupError, with the reason of each, where none of the ways led to a library.
     """
     return packages.obtain(
         find_llvm,
@@ -273,22 +240,9 @@ def _offered(options: Sequence[str]) -> list[str]:
     """The packages to take according to the package lists; SetupError where there is none."""
     policy = run_command(["apt-cache", *options, "policy", *DEBIAN_PACKAGES])
     offered = set(re.findall(r"^(\S+):\n  Installed: .*\n  Candidate: (?!\(none\))", policy, flags=re.MULTILINE))
-    for package in DEBIAN_PACKAGES:
-        if package in offered:
-            return [package, DEBIAN_RUNTIME]
+    if package := next((package for package in DEBIAN_PACKAGES if package in offered), None):
+        return [package, DEBIAN_RUNTIME]
     raise SetupError(f"apt-get: there is none of {', '.join(DEBIAN_PACKAGES)}")
-
-
-def run_trial_kernel() -> None:
-    """Compile and run a small kernel in a child process, where an abort inside LLVM does no harm.
-
-    Raises
-    ------
-    SetupError
-        The kernel did not run; the message holds the end of what was printed.
-    """
-    child = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
-    run_command(child, seconds=TRIAL_SECONDS, shown="a trial kernel of Dr.Jit")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -297,18 +251,17 @@ def main(arguments: list[str] | None = None) -> int:
         prog="python -m twin.backend.llvm", description="Find or install the libLLVM for Dr.Jit."
     )
     parser.add_argument("--install", action="store_true", help="obtain a libLLVM if there is no suitable one")
-    options = parser.parse_args(arguments)
+    install = parser.parse_args(arguments).install
+    # A child process compiles the kernel, where an abort inside LLVM does no harm.
+    trial = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
     try:
-        if options.install:
-            print(install_llvm(partial(print, flush=True)))
-        else:
-            for path in list_candidates():
-                try:
-                    print(f"found: {examine(path)}")
-                except SetupError as unsuitable:
-                    print(f"found: {unsuitable}")
-            print(f"chosen: {find_llvm()}")
-        run_trial_kernel()
+        for path in () if install else list_candidates():
+            try:
+                print(f"found: {examine(path)}")
+            except SetupError as unsuitable:
+                print(f"found: {unsuitable}")
+        print(install_llvm(partial(print, flush=True)) if install else f"chosen: {find_llvm()}")
+        run_command(trial, seconds=TRIAL_SECONDS, shown="a trial kernel of Dr.Jit")
     except SetupError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

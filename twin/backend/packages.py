@@ -35,25 +35,11 @@ def obtain(
 ) -> Library:
     """Find a library; else obtain it with apt-get as root, or unpacked from Debian packages or from a wheel.
 
-    Parameters
-    ----------
-    find
-        Finds it, also in ``folders``, or raises a SetupError that says where it looked.
-    what
-        Name of the library.
-    choose, wheel
-        Debian's packages, and the requirement that pip downloads.
-    folders
-        The first of them that can be written to is unpacked into.
-    choice
-        Environment variable by which the user chooses a library.
-    report
-        Called with a line of text for each step.
-
-    Raises
-    ------
-    SetupError
-        The user's choice does not serve, or no way led to a library; the message gives the reason of each.
+    ``find`` looks for the library called ``what``, also in ``folders``, or raises a SetupError that says where it
+    looked. ``choose`` gives Debian's packages, ``wheel`` is the requirement that pip downloads; the first of
+    ``folders`` that can be written to is unpacked into. The environment variable ``choice`` names a library of the
+    user's, and ``report`` is called with a line of text for each step. SetupError, with the reason of each, where the
+    user's choice does not serve, or no way led to a library.
     """
     try:
         return find()
@@ -64,8 +50,7 @@ def obtain(
         nothing_found = error
     target = _writable_folder(folders)
     refusals = []
-    ways = (partial(_install_packages, choose), partial(_unpack_packages, choose), partial(_unpack_wheel, wheel))
-    for way in ways:
+    for way in (partial(_install_packages, choose), partial(_unpack_packages, choose), partial(_unpack_wheel, wheel)):
         try:
             with tempfile.TemporaryDirectory() as scratch:
                 way(Path(scratch), target, lambda line: report(f"{what}: {line}"))
@@ -165,17 +150,11 @@ def run_command(
     command: Sequence[str], *, folder: Path | None = None, seconds: float = COMMAND_SECONDS, shown: str = ""
 ) -> str:
     """Run a command and return what it printed; SetupError, in which it is called ``shown``, where it fails."""
-    environment = os.environ | {"LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
+    env = os.environ | {"LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
     shown = shown or f"`{' '.join(command)}`"
     try:
         result = subprocess.run(
-            command,
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=seconds,
+            command, cwd=folder, env=env, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=seconds
         )
     except FileNotFoundError as error:
         raise SetupError(f"{command[0]} is not on this machine") from error

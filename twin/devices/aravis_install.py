@@ -20,12 +20,8 @@ WHEEL = "aravis-python==0.8.31.post1"
 def install_aravis(report: Report = lambda line: None) -> str:
     """Name of the library that is used; where there is none it is obtained, into `.aravis` or the user's cache folder.
 
-    ``report`` is called with a line of text for each step.
-
-    Raises
-    ------
-    SetupError
-        None of the ways led to a library; the message gives the reason of each.
+    ``report`` is called with a line of text for each step. SetupError, with the reason of each, where none of the ways
+    led to a library.
     """
     return obtain(
         lambda: load_aravis()._name,
