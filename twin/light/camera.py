@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +22,7 @@ from twin.backend.arrays import (
     to_jit,
     to_numpy,
 )
-from twin.light.pose import SensorPose
+from twin.light.pose import Rays, SensorPose
 from twin.scene.objects import Objects
 from uwlts.model.errors import DesignError
 from uwlts.model.placement import camera_from_object
@@ -47,16 +48,14 @@ class LensRays:
 
     camera: Camera
 
-    def pupil_radius_mm(self) -> float:
-        """Radius of the entrance pupil, D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant)."""
-        return 0.5 * self.camera.focal_length_mm / self._working_f_number()
-
     def through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
         """Origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
 
-        ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens).
+        ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens). The pupil's
+        radius is D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant).
         """
-        origin = self.pupil_radius_mm() * mi.Point3f(pupil.x, pupil.y, 0.0)
+        radius_mm = 0.5 * self.camera.focal_length_mm / self._working_f_number()
+        origin = radius_mm * mi.Point3f(pupil.x, pupil.y, 0.0)
         focused = chief * (self.camera.focus_distance_mm / chief.z)
         return origin, dr.normalize(mi.Vector3f(focused - origin))
 
@@ -64,8 +63,7 @@ class LensRays:
         """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
         focal = self.camera.focal_length_px()
         cx, cy = self.camera.principal_point()
-        seen = mi.Point2f((x - cx) / focal, (y - cy) / focal)
-        true = self._undistorted(seen)
+        true = self._undistorted(mi.Point2f((x - cx) / focal, (y - cy) / focal))
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
     def _undistorted(self, seen: Point2f) -> Point2f:
@@ -109,25 +107,11 @@ def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-@dataclass(frozen=True)
-class LightPath:
-    """Rays in the medium behind a window: origin, unit direction, weight, and whether they passed both faces."""
-
-    origin: Point3f
-    direction: Vector3f
-    weight: Float
-    valid: Bool
-
-
 class WindowFaces:
-    """Both faces of a window. Rays meet them in a known order, so each is intersected alone, without a scene.
+    """Both faces of a window, which lets rays pass unchanged if it is not mounted.
 
-    Parameters
-    ----------
-    window
-        Description of the window; unmounted it lets rays pass unchanged.
-    origin_mm, rotation
-        Module frame in the camera frame: its origin (3,) and rotation (3, 3); the third column is the module's axis.
+    Rays meet the faces in a known order, so each is intersected alone, without a scene. ``origin_mm`` (3,) and
+    ``rotation`` (3, 3) are the module's frame in the camera frame; the third column is the module's axis.
     """
 
     def __init__(
@@ -156,8 +140,8 @@ class WindowFaces:
             bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
             self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
 
-    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> LightPath:
-        """Send rays from the module's side through both faces.
+    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
+        """Send rays from the module's side through both faces; the weight of those that do not pass is 0.
 
         ``mode`` is Radiance for rays traced backwards from the camera (weights carry 1 / n^2) and Importance for light
         sent forwards from the laser.
@@ -165,7 +149,7 @@ class WindowFaces:
         width = dr.width(direction)
         weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
         if not self.mounted:
-            return LightPath(origin, direction, weight, valid)
+            return Rays(origin, direction, weight)
         context = mi.BSDFContext(mode)
         context.component = 1
         ray = mi.Ray3f(origin, direction)
@@ -178,16 +162,7 @@ class WindowFaces:
                 weight *= dr.exp(-self._absorption * (si.t + _STEP_MM))
             onward = si.to_world(sample.wo)
             ray = mi.Ray3f(si.p + onward * _STEP_MM, onward)
-        return LightPath(ray.o, ray.d, weight, valid & (weight > 0))
-
-
-@dataclass(frozen=True)
-class Bundle:
-    """Camera rays in the medium, in the sensor's OCS: origins, unit directions, and sensor irradiance per radiance."""
-
-    origin: Point3f
-    direction: Vector3f
-    weight: Float
+        return Rays(ray.o, ray.d, dr.select(valid & (weight > 0), weight, 0.0))
 
 
 class View:
@@ -196,16 +171,13 @@ class View:
     def __init__(self, sensor: Sensor, medium: Medium):
         self.camera = sensor.camera
         self.lens = LensRays(sensor.camera)
-        wavelength = sensor.laser.wavelength_nm
-        self._faces = WindowFaces(
-            self.camera.window, medium, wavelength_nm=wavelength, origin_mm=np.zeros(3), rotation=np.eye(3)
-        )
+        place = {"origin_mm": np.zeros(3), "rotation": np.eye(3)}
+        self._faces = WindowFaces(self.camera.window, medium, wavelength_nm=sensor.laser.wavelength_nm, **place)
         self._camera_from_object = camera_from_object(sensor)
         self._to_object = np.linalg.inv(self._camera_from_object)
-        self._grids: dict[int, tuple[Bundle, tuple[int, int]]] = {}
-        self._blur: tuple[np.ndarray, np.ndarray] | None = None
+        self._grids: dict[int, tuple[Rays, tuple[int, int]]] = {}
 
-    def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Bundle:
+    def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Rays:
         """Rays behind the window of image points; pixel (0, 0) is the centre of the first pixel.
 
         ``pupil`` holds points of the unit disc; without them chief rays through the pupil's centre are returned.
@@ -215,10 +187,10 @@ class View:
         path = self._faces.through(origin, direction, mode=mi.TransportMode.Radiance)
         transform = mi.Transform4f(mi.Matrix4f(self._to_object))
         cosine = dr.square(dr.square(chief.z))
-        weight = dr.select(path.valid, path.weight * cosine * self.lens.irradiance_on_axis(), 0.0)
-        return Bundle(transform @ path.origin, transform @ path.direction, weight)
+        weight = dr.select(path.weight > 0, path.weight * cosine * self.lens.irradiance_on_axis(), 0.0)
+        return Rays(transform @ path.origin, transform @ path.direction, weight)
 
-    def grid(self, spacing: int) -> tuple[Bundle, tuple[int, int]]:
+    def grid(self, spacing: int) -> tuple[Rays, tuple[int, int]]:
         """Chief rays of nodes at pixel corners every ``spacing`` pixels, and the grid's shape (rows, columns)."""
         if spacing not in self._grids:
             columns, rows = -(-self.camera.width_px // spacing) + 1, -(-self.camera.height_px // spacing) + 1
@@ -239,10 +211,9 @@ class View:
         Rays through the pupil's rim and chief rays of neighbouring pixels are followed through the window to every
         depth; the largest blur anywhere in the image counts.
         """
-        if self._blur is None:
-            self._blur = self._blur_table()
-        return np.interp(depth_mm, *self._blur)
+        return np.interp(depth_mm, *self._blur_table)
 
+    @cached_property
     def _blur_table(self) -> tuple[np.ndarray, np.ndarray]:
         camera = self.camera
         field = _FIELD * np.array([(i, j) for i in (-0.5, 0.0, 0.5) for j in (-0.5, 0.0, 0.5)])
@@ -252,9 +223,8 @@ class View:
         rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         # Per field point: the chief ray, its neighbours in x and y, then the rays through the rim.
         shift = np.concatenate([[(0, 0), (1, 0), (0, 1)], np.zeros((_RIM_POINTS, 2))])
-        pupil = np.concatenate([np.zeros((3, 2)), rim])
         at = (image[:, None] + shift).reshape(-1, 2)
-        through = np.tile(pupil, (len(image), 1))
+        through = np.tile(np.concatenate([np.zeros((3, 2)), rim]), (len(image), 1))
         x, y, pupil_x, pupil_y = (to_jit(mi.Float, values) for values in (*at.T, *through.T))
         bundle = self.bundle(x, y, mi.Point2f(pupil_x, pupil_y))
         dr.eval(bundle.origin, bundle.direction, bundle.weight)
@@ -288,7 +258,7 @@ class RaySegment:
 
 
 def ray_segments(
-    objects: Objects, extinction: float, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, *, mirrors: int
+    objects: Objects, extinction: float, pose: SensorPose, bundle: Rays, travel_mm: Float | None, *, mirrors: int
 ) -> Iterator[RaySegment]:
     """The first segment of camera rays, then one for each of up to ``mirrors`` mirrors that they meet in turn."""
     o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)

@@ -4,35 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque_transform
-from twin.light.pose import SensorPose
-from twin.light.sheet import Sheet, SheetLight, SheetRays
+from twin.light.pose import Rays, SensorPose
+from twin.light.sheet import Sheet, SheetLight
 from twin.scene.objects import MirrorFace
 
 _CLEAR_MM = 1e-2
 """Rays towards the laser start this far from the surface they leave."""
 
 
-@dataclass(frozen=True)
-class Source:
-    """A laser's sheet and where its own OCS stands in the sensor's: ``own_from_object`` (4, 4), None if they agree."""
-
-    sheet: Sheet
-    own_from_object: np.ndarray | None = None
-
-
 class Light:
-    """A source before a posed scene, directly or by way of one mirror face."""
+    """A sheet before a posed scene, directly or by way of one mirror face."""
 
-    def __init__(self, source: Source, pose: SensorPose, mirror: MirrorFace | None = None):
-        self.sheet, self._pose, self._mirror = source.sheet, pose, mirror
-        own = source.own_from_object
+    def __init__(self, sheet: Sheet, pose: SensorPose, mirror: MirrorFace | None = None):
+        self.sheet, self._pose, self._mirror = sheet, pose, mirror
+        own = sheet.own_from_object
         if mirror is not None:
             object_from_face = np.linalg.inv(pose.scene_from_object) @ mirror.pose
             reflection = object_from_face @ np.diag([1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(object_from_face)
@@ -77,9 +69,8 @@ class Light:
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
         """Where the sheet may shine: everywhere, but by way of a mirror only where that sends it."""
-        if self._mirror is None:
-            return dr.full(mi.Bool, True, dr.width(p))
-        return self._on_mirror(p, -light.direction)[1]
+        everywhere = dr.full(mi.Bool, True, dr.width(p))
+        return everywhere if self._mirror is None else self._on_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, travel_mm: Float | None, active: Bool):
         """Whether nothing stands between points of the sensor's OCS and the laser's window."""
@@ -108,12 +99,12 @@ class Light:
         ray.maxt = length - 2 * _CLEAR_MM
         return objects.ray_test(ray, active & (length > 2 * _CLEAR_MM))
 
-    def rays(self, u: Point3f) -> SheetRays:
+    def rays(self, u: Point3f) -> Rays:
         """Rays of a direct light in the sensor's OCS, drawn in proportion to its power."""
         rays = self.sheet.sample(u)
         if self._from_own is None:
             return rays
-        return SheetRays(self._from_own @ mi.Point3f(rays.origin), self._from_own @ rays.direction)
+        return Rays(self._from_own @ mi.Point3f(rays.origin), self._from_own @ rays.direction, rays.weight)
 
     def crossing(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
         """Where rays of the sheet's own OCS cross its middle: how far along, and the light there in its own OCS."""
@@ -152,11 +143,11 @@ class Light:
 
 
 def lights(
-    sources: Iterable[Source], pose: SensorPose, mirrors: Iterable[MirrorFace] = ()
+    sheets: Iterable[Sheet], pose: SensorPose, mirrors: Iterable[MirrorFace] = ()
 ) -> tuple[list[Light], list[Light]]:
-    """The sources directly, and by way of each mirror face."""
-    direct = [Light(source, pose) for source in sources]
-    return direct, [Light(source, pose, mirror) for source in sources for mirror in mirrors]
+    """The sheets directly, and by way of each mirror face."""
+    direct = [Light(sheet, pose) for sheet in sheets]
+    return direct, [Light(sheet, pose, mirror) for sheet in sheets for mirror in mirrors]
 
 
 def _away_from_zero(x: Float) -> Float:

@@ -1,4 +1,4 @@
-"""Pose of the sensor in the scene, and its travel during an exposure."""
+"""Rays, the pose of the sensor in the scene, and its travel during an exposure."""
 
 from __future__ import annotations
 
@@ -9,6 +9,18 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, Point3f, Vector3f, opaque_transform
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays of one frame: origins in mm, unit directions, and what each carries, 0 if a window does not let it pass.
+
+    Of camera rays ``weight`` is the image sensor's irradiance per radiance in sr, of rays through a window their share.
+    """
+
+    origin: Point3f
+    direction: Vector3f
+    weight: Float
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, UInt32, to_jit
-from twin.light.camera import Bundle, RaySegment, View, ray_segments
-from twin.light.illumination import Light, Source, lights
+from twin.backend.arrays import Float, to_jit
+from twin.light.camera import RaySegment, View, ray_segments
+from twin.light.illumination import Light, lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
     any_corner,
@@ -32,7 +32,7 @@ from twin.light.image_sampling import (
     pupil_shifts,
     widened,
 )
-from twin.light.pose import SensorPose, Travel
+from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
 from twin.light.walk import Walker
 from twin.light.water import Scattering, single_scattering
@@ -40,7 +40,7 @@ from twin.options import ALL, Effects
 from twin.scene.description import Scene
 from twin.scene.objects import build_objects
 from uwlts.model.placement import camera_from_object, check_design
-from uwlts.model.sensor import Laser, Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor
 
 WALK_CELL_PX = 8
 """Side of the cells of multiply scattered light away from the stripe."""
@@ -83,10 +83,7 @@ class LaserFrame:
 class Renderer:
     """One sensor in one medium before one scene.
 
-    Raises
-    ------
-    DesignError, DescriptionError
-        The sensor cannot work in the medium, or an object cannot be built.
+    DesignError or DescriptionError where the sensor cannot work in the medium, or an object cannot be built.
     """
 
     def __init__(self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL):
@@ -99,7 +96,7 @@ class Renderer:
         self.view = View(sensor, medium)
         self.scattering = Scattering(medium, wavelength)
         self.sheet = Sheet(sensor, medium)
-        self._sources = [Source(self.sheet), *(_further(sensor, laser, medium) for laser in sensor.more_lasers)]
+        self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
         # Through the water to the stand-off and back, light is scattered so many times.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
@@ -133,13 +130,13 @@ class Renderer:
     ) -> LaserFrame:
         """The light of the laser, and of the day if there is any, on the image sensor; see `irradiance`."""
         pose = SensorPose(scene_from_object, travel)
-        direct, mirrored = lights(self._sources, pose, self._mirrors)
+        direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, image = self._laser_nodes(pose, direct, mirrored)
         walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
         self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
         if self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0:
             image += self._lamp_frame(pose, spp=spp, ambient=True)
-        rows, columns = self._pixels_of(lit)
+        rows, columns = np.nonzero(self._repeated(lit))
         facts = [
             self._fine(self._stripe_sums, pose, r, c, direct + mirrored, spp=spp)
             for r, c in _parts(rows, columns, spp=spp)
@@ -151,22 +148,23 @@ class Renderer:
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
         bundle, shape = self.view.grid(NODE_SPACING_PX)
-        direct, _ = lights(self._sources[:1], pose)
+        direct, _ = lights(self._sheets[:1], pose)
         near = [
             near_sheet(self._sigmas(light, next(self._segments(moment, bundle, None))).numpy().reshape(shape))
             for moment, (light, *_) in self._moments(pose, direct)
         ]
-        return self._pixels_of(np.any(near, axis=0))
+        rows, columns = np.nonzero(self._repeated(np.any(near, axis=0)))
+        return rows, columns
 
-    def laser(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None = None) -> Float:
+    def laser(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None = None) -> Float:
         """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
-        direct, _ = lights(self._sources[:1], pose)
+        direct, _ = lights(self._sheets[:1], pose)
         segment = next(self._segments(pose, bundle, travel_mm))
         return segment.weight * self._radiance(pose, segment, direct, travel_mm)
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
-    def _segments(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None) -> Iterator[RaySegment]:
+    def _segments(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
         return ray_segments(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
 
@@ -213,8 +211,8 @@ class Renderer:
                     blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
                     reach = np.maximum(reach, np.where(near, corner_extremes(blur)[1], 0))
                 lit |= near
-            if moment is pose:
-                image = self._spread(haze, shape)
+            if moment is pose and dr.width(haze) > 1:
+                image = self._repeated(corner_mean(haze.numpy().reshape(shape)))
         return widened(lit, reach), image
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
@@ -224,7 +222,7 @@ class Renderer:
             first, last = pose.travel.ends(self.sensor.camera.height_px)
             for travel_mm in np.linspace(first, last, 2 + int((last - first) / _TRAVEL_STEP_MM)):
                 moved = pose.moved(float(travel_mm))
-                direct, mirrored = lights(self._sources, moved, self._mirrors)
+                direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
     def _haze(self, light: Light, segment: RaySegment, sigmas: Float) -> Float:
@@ -271,7 +269,8 @@ class Renderer:
             some = min(most, walks - first)
             count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
             cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
-            u, v = (_random(count, (place_seed + k) % 2**32) for k in (0, 1))
+            keys = (dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1))
+            u, v = (mi.sample_tea_float32(dr.arange(mi.UInt32, count), key) for key in keys)
             column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
             bundle = self.view.bundle(column + u * size_px - 0.5, row + v * size_px - 0.5)
             total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
@@ -300,7 +299,7 @@ class Renderer:
             image[rows, columns] = fine[0]
         return image
 
-    def _evenly_lit(self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, ambient: bool) -> tuple[Float]:
+    def _evenly_lit(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None, ambient: bool) -> tuple[Float]:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -321,7 +320,7 @@ class Renderer:
     # --- pixels -------------------------------------------------------------------------------------------------------
 
     def _stripe_sums(
-        self, pose: SensorPose, bundle: Bundle, travel_mm: Float | None, sources: list[Light]
+        self, pose: SensorPose, bundle: Rays, travel_mm: Float | None, sources: list[Light]
     ) -> tuple[Float, Float, Float]:
         """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
@@ -366,34 +365,11 @@ class Renderer:
         dr.eval(values)  # together: each sum on its own would trace the rays anew
         return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
 
-    def _pixels_of(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the pixels in the marked grid cells."""
-        rows, columns = np.nonzero(self._repeated(cells))
-        return rows, columns
-
-    def _spread(self, values: Float, shape: tuple[int, int]) -> np.ndarray:
-        """Values of nodes given to the pixels between them, (H, W); zero if they are one number."""
-        if dr.width(values) == 1:
-            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return self._repeated(corner_mean(values.numpy().reshape(shape)))
-
     def _repeated(self, cells: np.ndarray) -> np.ndarray:
         """Values of grid cells given to their pixels, (H, W)."""
         camera = self.sensor.camera
         full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
         return np.ascontiguousarray(full[: camera.height_px, : camera.width_px])
-
-
-def _further(sensor: Sensor, laser: Laser, medium: Medium) -> Source:
-    """Another laser of the sensor, whose sheet has an OCS of its own."""
-    other = sensor.model_copy(update={"laser": laser})
-    return Source(Sheet(other, medium), np.linalg.inv(camera_from_object(other)) @ camera_from_object(sensor))
-
-
-def _random(count: int, seed: int) -> Float:
-    """Numbers from 0 to 1 that depend on their index and the seed."""
-    index, key = cast(UInt32, dr.arange(mi.UInt32, count)), cast(UInt32, dr.opaque(mi.UInt32, seed))
-    return mi.sample_tea_float32(index, key)
 
 
 def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -22,6 +22,7 @@ from numpy.polynomial import Chebyshev
 
 from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, to_jit
 from twin.light.camera import WindowFaces, frame_about
+from twin.light.pose import Rays
 from uwlts.model.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Laser, Medium, Sensor
@@ -59,33 +60,22 @@ class SheetLight:
     exit_mm: Float
 
 
-@dataclass(frozen=True)
-class SheetRays:
-    """Rays of the sheet's light in the OCS, each of equal power: where they leave the window, and unit directions."""
-
-    origin: Point3f
-    direction: Vector3f
-
-
 class Sheet:
-    """The lit surface of one sensor's laser in one medium.
+    """The lit surface of a laser in a medium: of the sensor's own, or of ``laser``, another one of the sensor.
 
-    Attributes
-    ----------
-    power_w
-        Power behind the window, before the medium takes any.
-    begins_at_z_mm
-        Smallest Z of the window's outer face in the OCS; there is no light before it.
-
-    Raises
-    ------
-    DesignError
-        A part of the fan does not pass the window, or is bent too much by it.
+    ``power_w`` is the power behind the window, before the medium takes any; ``begins_at_z_mm`` the smallest Z of the
+    window's outer face in the OCS, before which there is no light. Another laser's sheet has an OCS of its own, into
+    which ``own_from_object`` (4, 4) leads from the sensor's. DesignError where a part of the fan does not pass the
+    window, or is bent too much by it.
     """
 
-    def __init__(self, sensor: Sensor, medium: Medium):
-        laser = sensor.laser
-        self._origin, fan = _traced(sensor, medium)
+    def __init__(self, sensor: Sensor, medium: Medium, laser: Laser | None = None):
+        own = sensor if laser is None else sensor.model_copy(update={"laser": laser})
+        self.own_from_object = (
+            None if laser is None else np.linalg.inv(camera_from_object(own)) @ camera_from_object(sensor)
+        )
+        laser = own.laser
+        self._origin, angle, fan = _traced(own, medium)
         o, d = fan.origin, fan.direction
         slope, tilt = d[1] / d[2], d[0] / d[2]
         self._y0 = _series(slope, o[1] - slope * o[2], _SERIES_MM)
@@ -102,7 +92,7 @@ class Sheet:
                 f"to {miss:.3f} mm only, not to {_LARGEST_MISS_MM:g} mm: make the fan narrower or tilt the window less"
             )
         self._dy0, self._dx0, self._dtilt = self._y0.deriv(), self._x0.deriv(), self._tilt.deriv()
-        self._power, self.power_w = _power_along(laser, slope, fan)
+        self._power, self.power_w = _power_along(laser, slope, angle, fan.weight)
         waist = laser.waist_radius_mm
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
@@ -136,8 +126,8 @@ class Sheet:
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
         return SheetLight(distance, sigma, dr.select(exit_mm > 0, irradiance, 0.0), direction, normal, exit_mm)
 
-    def sample(self, u: Point3f) -> SheetRays:
-        """Rays behind the window, drawn in proportion to power with three numbers from 0 to 1 each.
+    def sample(self, u: Point3f) -> Rays:
+        """Rays behind the window, of weight 1 and drawn in proportion to power with three numbers from 0 to 1 each.
 
         ``u.x`` chooses the fan ray, ``u.y`` and ``u.z`` how far beside and how much turned against it: with the
         standard deviations w0 / 2 at the waist and w0 / (2 zR), independent of each other, straight rays spread by
@@ -158,7 +148,7 @@ class Sheet:
         beside, turned = sigma * _standard_normal(u.y), sigma / self._rayleigh * _standard_normal(u.z)
         leaves.x += beside - turned * to_waist
         along.x += turned * stretch
-        return SheetRays(leaves, dr.normalize(along))
+        return Rays(leaves, dr.normalize(along), mi.Float(1.0))
 
     def _normalised(self, m: Float) -> Float:
         offset, scale = self._y0.mapparms()
@@ -172,18 +162,8 @@ class Sheet:
         return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - _value(self._tilt, t)))
 
 
-@dataclass(frozen=True)
-class _FanBehindWindow:
-    """Fan rays where they leave the window: angles (N,), origins and unit directions (3, N), transmittances (N,)."""
-
-    angle: np.ndarray
-    origin: np.ndarray
-    direction: np.ndarray
-    transmitted: np.ndarray
-
-
-def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindow]:
-    """The laser's origin (3,) and its fan traced through the window's faces, all in the OCS."""
+def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Rays]:
+    """The laser's origin (3,), and angles (N,) and rays (3, N) of its fan behind the window, all in the OCS."""
     laser, pose = sensor.laser, laser_pose(sensor)
     to_object = np.linalg.inv(camera_from_object(sensor))
     rotation = frame_about(pose.axis, pose.normal)
@@ -191,10 +171,10 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindo
         laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
     )
     # Denser towards the edges, where a series would otherwise swing.
-    angle = -_fan_half_angle(laser) * np.cos(np.linspace(0, math.pi, _RAYS))
+    angle = -math.radians(laser.fan_angle_deg / 2) * np.cos(np.linspace(0, math.pi, _RAYS))
     fan = mi.Vector3f(rotation @ _fan_directions(laser, angle))
     path = faces.through(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
-    if not bool(dr.all(path.valid)):
+    if not bool(dr.all(path.weight > 0)):
         raise DesignError(
             f"part of the laser's {laser.fan_angle_deg:g} deg fan does not pass its window of "
             f"{laser.window.aperture_diameter_mm:g} mm: enlarge the window or bring it closer"
@@ -202,19 +182,18 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, _FanBehindWindo
     d = to_object[:3, :3] @ path.direction.numpy().astype(float)
     o = np.broadcast_to(to_object[:3, :3] @ path.origin.numpy().astype(float) + to_object[:3, 3:], d.shape)
     passed = np.broadcast_to(path.weight.numpy().astype(float), angle.shape)
-    return to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3], _FanBehindWindow(angle, o, d, passed)
+    return to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3], angle, Rays(o, d, passed)
 
 
-def _power_along(laser: Laser, slope: np.ndarray, fan: _FanBehindWindow) -> tuple[PowerTable, float]:
-    """Power behind the window per slope, and in total in W."""
+def _power_along(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
+    """Power behind the window per slope, and in total in W, of fan rays at slopes, angles and with shares (N,)."""
     lit = _fan_lit_angles(laser)
-    first, last = np.interp(lit[[0, -1]], fan.angle, slope)
-    nodes = np.linspace(first, last, _NODES)
-    angle_of, passes = _series(slope, fan.angle, _SERIES_SLOPE), _series(slope, fan.transmitted, 1e-6)
+    nodes = np.linspace(*np.interp(lit[[0, -1]], angle, slope), _NODES)
+    angle_of, passes = _series(slope, angle, _SERIES_SLOPE), _series(slope, passed, 1e-6)
     density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
-    between = np.union1d(lit, fan.angle[(fan.angle > lit[0]) & (fan.angle < lit[-1])])
-    total = np.trapezoid(_power_per_angle(laser, between) * np.interp(between, fan.angle, fan.transmitted), between)
-    return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=float(total)), float(total)
+    between = np.union1d(lit, angle[(angle > lit[0]) & (angle < lit[-1])])
+    total = float(np.trapezoid(_power_per_angle(laser, between) * np.interp(between, angle, passed), between))
+    return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=total), total
 
 
 def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
@@ -236,16 +215,11 @@ def _standard_normal(u: Float) -> Float:
     return math.sqrt(2.0) * dr.erfinv(dr.clip(2 * u - 1, -1 + 1e-7, 1 - 1e-7))
 
 
-def _fan_half_angle(laser: Laser) -> float:
-    """Angle of the fan's edge in rad."""
-    return math.radians(laser.fan_angle_deg / 2)
-
-
 def _fan_lit_angles(laser: Laser) -> np.ndarray:
     """Angles (K,) in rad between which the power per angle is smooth; outside the first and the last it is zero."""
-    if isinstance(laser.fan_profile, str):
-        return np.array([-_fan_half_angle(laser), _fan_half_angle(laser)])
-    return np.radians([angle for angle, _ in laser.fan_profile])
+    half = laser.fan_angle_deg / 2
+    nodes = (-half, half) if isinstance(laser.fan_profile, str) else [angle for angle, _ in laser.fan_profile]
+    return np.radians(nodes)
 
 
 def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
@@ -261,7 +235,7 @@ def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
 
 def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
     """Power in W/rad at lit angles (N,), before the window. Its integral over the fan is the laser's power."""
-    half = _fan_half_angle(laser)
+    half = math.radians(laser.fan_angle_deg / 2)
     match laser.fan_profile:
         case "flat":
             relative, total = np.ones_like(angle), 2 * half
@@ -276,18 +250,10 @@ def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
 
 
 class PowerTable:
-    """Power per unit of a coordinate along the fan: linear between even nodes, zero outside them.
+    """Power per unit of a coordinate along the fan: linear between even nodes (N,), zero outside them.
 
-    The values lie in arrays, not in the kernel: every profile is looked up, and drawn from, by the same few steps.
-
-    Parameters
-    ----------
-    nodes
-        (N,), evenly spaced and increasing.
-    density
-        (N,), relative power per unit of the coordinate at the nodes, smooth or not.
-    power_w
-        What the density is scaled to in total.
+    ``density`` (N,) is the relative power per unit at the nodes, smooth or not, scaled to ``power_w`` in total. The
+    values lie in arrays, not in the kernel: every profile is looked up, and drawn from, by the same few steps.
     """
 
     def __init__(self, nodes: np.ndarray, density: np.ndarray, *, power_w: float):

@@ -26,9 +26,8 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInteraction3f, UInt32, Vector3f
-from twin.light.camera import Bundle
 from twin.light.illumination import Light
-from twin.light.pose import SensorPose
+from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import SheetLight
 from twin.light.water import Scattering
 from twin.options import Effects
@@ -83,7 +82,7 @@ class Walker:
     def _scatters(self) -> bool:
         return self.effects.multiple_scattering and self.scattering.coefficient > 0
 
-    def radiance(self, bundle: Bundle, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
+    def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
         width = dr.width(cell)
         total = np.zeros(cells)
@@ -117,7 +116,8 @@ class Walker:
 
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
-        rng = _random_numbers(seed, walks.number)
+        state, sequence = mi.sample_tea_32(seed, walks.number)
+        rng = mi.PCG32(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
         o, d, c = walks.origin, walks.direction, self.scattering.extinction
         si = self.objects.scene.ray_intersect(self.pose.ray(o, d))
         hit = si.is_valid()
@@ -289,8 +289,3 @@ class Walker:
 def _one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
     """1 - cos of the angle between unit vectors, exact for small angles too."""
     return 0.5 * dr.squared_norm(a - b)
-
-
-def _random_numbers(seed: UInt32, number: UInt32) -> PCG32:
-    state, sequence = mi.sample_tea_32(seed, number)
-    return cast(Any, mi.PCG32)(size=dr.width(number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))

@@ -23,16 +23,11 @@ from uwlts.model.sensor import Medium
 
 
 class Scattering:
-    """How a medium absorbs and scatters light of one wavelength: coefficients in 1/mm and the phase function.
+    """Absorption and scattering of light of one wavelength in a medium: coefficients in 1/mm and the phase function.
 
     ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``backward_share`` is the share of b that
     scatters by more than 90 deg. The phase function of all that scatters lies in a table, read by the same kernels
-    whatever the medium.
-
-    Raises
-    ------
-    RangeError
-        The medium's tables do not reach the wavelength.
+    whatever the medium. RangeError where the medium's tables do not reach the wavelength.
     """
 
     def __init__(self, medium: Medium, wavelength_nm: float):

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar, cast
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
@@ -108,10 +108,8 @@ class Flat(Placed):
     @model_validator(mode="after")
     def _reflects_at_most_all(self) -> "Flat":
         if self.reflectance + self.mirror > 1:
-            raise ValueError(
-                f"reflectance {self.reflectance:g} and mirror {self.mirror:g} add up to more than all light: "
-                f"lower one of them"
-            )
+            both = f"reflectance {self.reflectance:g} and mirror {self.mirror:g}"
+            raise ValueError(f"{both} add up to more than all light: lower one of them")
         if self.mirror > 0 and self.finish in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
         return self
@@ -212,9 +210,8 @@ class Weld(FreeForm):
         if self.length_mm < self.width_mm:
             raise ValueError(f"a bead of length_mm {self.length_mm:g} is shorter than its width_mm {self.width_mm:g}")
         if self.beads > 1 and self.spacing_mm < 2 * self.bead_reach_mm():
-            raise ValueError(
-                f"spacing_mm {self.spacing_mm:g} lets beads touch that may be {2 * self.bead_reach_mm():g} mm wide"
-            )
+            touching = f"lets beads touch that may be {2 * self.bead_reach_mm():g} mm wide"
+            raise ValueError(f"spacing_mm {self.spacing_mm:g} {touching}")
         if self.length_mm > plate[0] or wide > plate[1]:
             raise ValueError(
                 f"beads of {self.length_mm:g} mm along {self.along} and {wide:g} mm together across it do not fit on "
@@ -245,14 +242,12 @@ class Printed(Placed, ABC):
     @model_validator(mode="after")
     def _has_one_pattern(self) -> Self:
         if self.texture is not None:
-            raise ValueError(
-                f"texture {self.texture} on a plate with a printed pattern: put it on an object of kind 'plate'"
-            )
+            raise ValueError(f"texture {self.texture} on a plate with a printed pattern: use it on a 'plate'")
         return self
 
     @abstractmethod
     def described_target(self) -> Target:
-        """The target without errors."""
+        """The target without errors; its spacing may have the 32 bits of the renderer."""
 
     @abstractmethod
     def bounds_mm(self) -> np.ndarray:
@@ -311,8 +306,8 @@ class CirclePlate(Printed):
         return self.circle_reflectance, self.marker_reflectance
 
 
-def _described_target(value: object) -> Target:
-    return value if isinstance(value, Target) else parse_target(cast(Mapping[str, object], value))
+def _parsed(target: Target | Mapping[str, object]) -> Target:
+    return target if isinstance(target, Target) else parse_target(target)
 
 
 class TargetPlate(Printed):
@@ -324,7 +319,7 @@ class TargetPlate(Printed):
     """
 
     kind: Literal["target_plate"]
-    target: Annotated[SerializeAsAny[Target], BeforeValidator(_described_target)]
+    target: Annotated[SerializeAsAny[Target], BeforeValidator(_parsed)]
     ink_reflectance: Reflectance = 0.05
     rim_mm: NotNegative = 10.0
 
@@ -433,22 +428,16 @@ class Scene(Description):
         """A target_plate without a description of its own shows the scene's target."""
         if not isinstance(table, dict) or table.get("target") is None or not isinstance(table.get("objects"), list):
             return table
-        objects = [
-            {"target": table["target"]} | thing
-            if isinstance(thing, dict) and thing.get("kind") == "target_plate"
-            else thing
-            for thing in table["objects"]
-        ]
+        objects = list(table["objects"])
+        for number, thing in enumerate(objects):
+            if isinstance(thing, dict) and thing.get("kind") == "target_plate":
+                objects[number] = {"target": table["target"]} | thing
         return table | {"objects": objects}
 
     @model_validator(mode="after")
-    def _placement_known(self) -> "Scene":
+    def _has_its_placement_and_one_target_with_detection_errors(self) -> "Scene":
         if self.placement not in self.placements:
             raise ValueError(f"placement '{self.placement}' is not one of {', '.join(self.placements)}")
-        return self
-
-    @model_validator(mode="after")
-    def _one_target_with_detection_errors(self) -> "Scene":
         plates = [thing for thing in self.objects if isinstance(thing, Printed)]
         if len(plates) > 1 and any(plate.detection_std_px > 0 for plate in plates):
             raise ValueError("detection_std_px is for scenes with one target: leave it out, or the other targets")
@@ -476,18 +465,16 @@ def load_scene(
     """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
     path = find(name_or_path)
     table = read_table(path)
-    if isinstance(motion, Motion):
-        motion = motion.model_dump()
+    motion = motion.model_dump() if isinstance(motion, Motion) else motion
     given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
     table |= {key: value for key, value in given.items() if value is not None}
     objects = table.get("objects", [])
     if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
-    table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
+    # Relative paths of meshes and textures start at the scene's folder.
+    files = [{key: thing[key] for key in ("path", "texture") if isinstance(thing.get(key), str)} for thing in objects]
+    table["objects"] = [
+        thing | {key: str(path.parent / name) for key, name in named.items()}
+        for thing, named in zip(objects, files, strict=True)
+    ]
     return validated(Scene, table, path)
-
-
-def _with_paths_from(folder: Path, thing: Table) -> Table:
-    """An object's table with relative paths of mesh and texture starting at a folder."""
-    paths = {key: thing.get(key) for key in ("path", "texture")}
-    return thing | {key: str(folder / path) for key, path in paths.items() if isinstance(path, str)}

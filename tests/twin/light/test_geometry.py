@@ -174,7 +174,7 @@ def sent_through(window: Window, medium: Medium, angles: np.ndarray) -> tuple[np
     faces = WindowFaces(window, medium, wavelength_nm=635.0, origin_mm=np.zeros(3), rotation=np.eye(3))
     x, z = to_jit(mi.Float, np.sin(angles)), to_jit(mi.Float, np.cos(angles))
     path = faces.through(mi.Point3f(0.0, 0.0, 0.0), mi.Vector3f(x, 0.0, z), mode=mi.TransportMode.Radiance)
-    return to_numpy(path.origin), to_numpy(path.direction), path.valid.numpy()
+    return to_numpy(path.origin), to_numpy(path.direction), path.weight.numpy() > 0
 
 
 def test_the_aperture_blocks_rays_outside_it():

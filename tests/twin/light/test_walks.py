@@ -48,7 +48,7 @@ def coarse(thesis) -> Sensor:
 def walked(renderer: Renderer, pixels: np.ndarray, walks: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Irradiance (N,) of light on longer ways at image points (N, 2), and its standard error."""
     pose = SensorPose(np.eye(4))
-    direct, _ = lights([renderer._sources[0]], pose)
+    direct, _ = lights([renderer._sheets[0]], pose)
     walker = Walker(renderer.objects, renderer.scattering, renderer.effects, pose, direct, 2000.0)
     each = walks // BATCHES
     cell = np.repeat(np.arange(len(pixels) * BATCHES), each)
