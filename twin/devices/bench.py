@@ -31,21 +31,13 @@ class _Kind:
 
 
 _KINDS = {
-    "drop": _Kind(1),
-    "repeat": _Kind(1),
-    "cut": _Kind(1),
+    **dict.fromkeys(("drop", "repeat", "cut"), _Kind(1)),
     "delay": _Kind(1.0, whole=False),
-    "camera-disconnect": _Kind(),
-    "stage-disconnect": _Kind(),
-    "mute": _Kind(),
-    "stall": _Kind(),
+    **dict.fromkeys(("camera-disconnect", "stage-disconnect", "mute", "stall"), _Kind()),
     "stop-short": _Kind(40),
     "lose-steps": _Kind(40, signed=True),
     "alarm": _Kind(1),
-    "hold": _Kind(),
-    "restart": _Kind(),
-    "garbage": _Kind(),
-    "break-laser": _Kind(),
+    **dict.fromkeys(("hold", "restart", "garbage", "break-laser"), _Kind()),
 }
 NAMES = tuple(_KINDS)
 
@@ -159,15 +151,12 @@ class FrameRates:
 
     def __str__(self) -> str:
         repeated = self.frames - self.rendered
-        parts = [
-            f"{count} {what} at {count / seconds:.1f} frames/s"
-            for count, what, seconds in (
-                (self.rendered, "rendered", self.rendering_s),
-                (repeated, "of the same place", self.repeating_s),
-            )
-            if count
-        ]
-        return ", ".join([f"{self.frames} frames", *parts])
+        parts = [f"{self.frames} frames"]
+        if self.rendered:
+            parts.append(f"{self.rendered} rendered at {self.rendered / self.rendering_s:.1f} frames/s")
+        if repeated:
+            parts.append(f"{repeated} of the same place at {repeated / self.repeating_s:.1f} frames/s")
+        return ", ".join(parts)
 
 
 class Bench:

@@ -6,9 +6,8 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -82,7 +81,7 @@ class _Register:
 
     MAKER, MODEL, STREAM_PORT, PACKET_SIZE, STREAM_IP = 0x48, 0x68, 0xD00, 0xD04, 0xD18
     WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
-    EXPOSURE_US, ACQUISITION, OFFSET_X, OFFSET_Y = 0x120, 0x124, 0x130, 0x134
+    ACQUISITION, OFFSET_X, OFFSET_Y = 0x124, 0x130, 0x134
     TRIGGER_SOFTWARE, DEVICE_ID = 0x30C, 0xD8
 
 
@@ -117,16 +116,9 @@ class GigeCamera:
     """Serves a camera of 8 bit; a context manager.
 
     ``frame(exposure_ms)`` returns the whole image (height_px, width_px) of uint8. It is called in one thread, always
-    the same. An exception of it leaves the frame out and is kept in ``failure``.
-
-    A trigger that comes while an image is being made replaces the one before, which stays without an answer.
-
-    Raises
-    ------
-    HardwareError
-        Another camera is served on this machine.
-    SetupError
-        Aravis is not installed.
+    the same. An exception of it leaves the frame out and is kept in ``failure``. A trigger that comes while an image is
+    being made replaces the one before, which stays without an answer. HardwareError where another camera is served on
+    this machine, SetupError where Aravis is not installed.
     """
 
     def __init__(
@@ -135,19 +127,15 @@ class GigeCamera:
         *,
         width_px: int = 1280,
         height_px: int = 1024,
-        maker: str = "UWLTS",
-        model: str = "Twin",
         serial: str = "1",
         first_number: int = 1,
     ):
-        names = {"maker": (maker, _NAME_BYTES), "model": (model, _NAME_BYTES), "serial": (serial, _SERIAL_BYTES)}
-        for name, (text, room) in names.items():
-            if not text.isascii() or not 0 < len(text) < room:
-                raise HardwareError(f"{name} is '{text}': it must have 1 to {room - 1} ASCII characters")
+        if not serial.isascii() or not 0 < len(serial) < _SERIAL_BYTES:
+            raise HardwareError(f"serial is '{serial}': it must have 1 to {_SERIAL_BYTES - 1} ASCII characters")
         self.failure: BaseException | None = None
         self._frame = frame
         self._size = (height_px, width_px)
-        self._texts = tuple(names.values())
+        self._serial = serial.encode()
         self._library = _functions()
         # The library keeps no reference to it.
         self._callback = _FILL(self._fill)
@@ -168,14 +156,6 @@ class GigeCamera:
     def address(self) -> str:
         """Address by which `uwlts` opens this camera."""
         return f"gige:{LOOPBACK}"
-
-    @property
-    def exposure_ms(self) -> float:
-        """Exposure that the host has set, in ms."""
-        with self._lock:
-            if self._server is None:
-                raise HardwareError("the camera is disconnected: its exposure is not known")
-            return 1e-3 * self._read(_Register.EXPOSURE_US)
 
     def inject(
         self, fault: Literal["drop", "repeat", "cut", "delay"], frames: int = 1, *, delay_s: float = 0.0
@@ -213,18 +193,23 @@ class GigeCamera:
         _refuse_second_camera()
         self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stream.bind((LOOPBACK, 0))
-        with _nothing_beyond_loopback():
-            self._server = library.arv_gv_fake_camera_new(LOOPBACK.encode(), self._texts[-1][0].encode())
+        # Aravis would also listen at the broadcast address of all networks, which is held while the camera starts.
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
+            guard.bind(("255.255.255.255", PORT))
+            self._server = library.arv_gv_fake_camera_new(LOOPBACK.encode(), self._serial)
         if not library.arv_gv_fake_camera_is_running(self._server):
             self.disconnect()
             raise HardwareError(f"Aravis's camera does not start on {LOOPBACK}: is the loopback interface up?")
-        self._silence_library()
+        # The library is to lose all packets of its own.
+        every = (c_uint64 * 3)()
+        library.g_value_init(every, _DOUBLE_TYPE)
+        library.g_value_set_double(every, 1.0)
+        library.g_object_set_property(self._server, b"gvsp-lost-ratio", every)
         self._camera = library.arv_gv_fake_camera_get_fake_camera(self._server)
         height, width = self._size
-        for register, (text, room) in zip(
-            (_Register.MAKER, _Register.MODEL, _Register.DEVICE_ID), self._texts, strict=True
-        ):
-            library.arv_fake_camera_write_memory(self._camera, register, room, text.encode().ljust(room, b"\0"))
+        texts = ((_Register.MAKER, b"UWLTS", _NAME_BYTES), (_Register.MODEL, b"Twin", _NAME_BYTES))
+        for register, text, room in (*texts, (_Register.DEVICE_ID, self._serial, _SERIAL_BYTES)):
+            library.arv_fake_camera_write_memory(self._camera, register, room, text.ljust(room, b"\0"))
         for register, number in (
             (_Register.SENSOR_WIDTH, width),
             (_Register.WIDTH, width),
@@ -311,13 +296,6 @@ class GigeCamera:
             raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
         return _Shot(image, began_ns)
 
-    def _silence_library(self) -> None:
-        """Have the library lose all packets of its own."""
-        value = (c_uint64 * 3)()
-        self._library.g_value_init(value, _DOUBLE_TYPE)
-        self._library.g_value_set_double(value, 1.0)
-        self._library.g_object_set_property(self._server, b"gvsp-lost-ratio", value)
-
     def _read(self, register: int) -> int:
         number = c_uint32()
         self._library.arv_fake_camera_read_register(self._camera, register, ctypes.byref(number))
@@ -357,11 +335,3 @@ def _refuse_second_camera() -> None:
                 f"UDP port {PORT} of {LOOPBACK} cannot be used ({error.strerror}): another camera is served there; "
                 "end that program first"
             ) from error
-
-
-@contextmanager
-def _nothing_beyond_loopback() -> Iterator[None]:
-    """Hold the broadcast address of all networks, at which Aravis would listen too, while the camera starts."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
-        guard.bind(("255.255.255.255", PORT))
-        yield

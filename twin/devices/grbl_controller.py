@@ -154,29 +154,20 @@ class GrblController:
             with self._lock:
                 if not self._powered:
                     return
-                self._notice_port(closed=bool(events & select.POLLHUP and not events & select.POLLIN))
+                was_open = self._port_open
+                self._port_open = not (events & select.POLLHUP and not events & select.POLLIN)
+                if self._port_open and not was_open and self._resets_when_opened:
+                    self._firmware.restart()
                 if events & select.POLLIN:
-                    self._receive()
+                    try:
+                        self._firmware.hear(os.read(self._master, 4096))
+                    except OSError as error:
+                        if error.errno != errno.EIO:  # the last program has closed the port
+                            raise
                 self._firmware.work()
             if events & select.POLLHUP:
                 # Polling a closed port does not wait.
                 time.sleep(_BUSY_MS / 1000)
-
-    def _notice_port(self, *, closed: bool) -> None:
-        opened = not closed and not self._port_open
-        self._port_open = not closed
-        if opened and self._resets_when_opened:
-            self._firmware.restart()
-
-    def _receive(self) -> None:
-        try:
-            data = os.read(self._master, 4096)
-        except OSError as error:
-            # The last program has closed the port.
-            if error.errno == errno.EIO:
-                return
-            raise
-        self._firmware.hear(data)
 
     def _say(self, data: bytes) -> None:
         if self._muted or not self._powered:

@@ -76,18 +76,16 @@ def parse_block(line: str) -> Block:
 
 def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machine_coordinates: bool) -> None:
     once, motion = commands.get("once"), commands.get("motion")
-    if once == "G4" and "P" not in values:
-        raise GrblError(28)
-    if "P" in values and once != "G4":
-        raise GrblError(36)
-    if once == "G92" and "X" not in values:
-        raise GrblError(26)
-    if once == "G92" and motion:
-        raise GrblError(24)
-    if machine_coordinates and motion == "G80":
-        raise GrblError(30)
-    if once == "G4" and "X" in values:
-        raise GrblError(31)
+    refused = {
+        28: once == "G4" and "P" not in values,
+        36: once != "G4" and "P" in values,
+        26: once == "G92" and "X" not in values,
+        24: once == "G92" and motion is not None,
+        30: machine_coordinates and motion == "G80",
+        31: once == "G4" and "X" in values,
+    }
+    for code in (code for code, wrong in refused.items() if wrong):
+        raise GrblError(code)
 
 
 _DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}
@@ -144,8 +142,14 @@ class GrblFirmware:
         for byte in data if self._booted_s is None else b"":
             if byte == 0x18:
                 self._soft_reset()
-            elif byte in b"?!~":
-                self._realtime(chr(byte))
+            elif byte == ord("?"):
+                if self._mode != "Home" and not self._critical:
+                    self._send(self._report(self._now()))
+            elif byte == ord("!"):
+                if self._mode == "Idle":
+                    self.axis.hold(self._now())
+            elif byte == ord("~"):
+                self.axis.resume(self._now())
             elif byte < 0x80 and len(self._input) < _RECEIVE_BYTES:
                 self._input.append(byte)
 
@@ -197,15 +201,6 @@ class GrblFirmware:
         else:
             self._clear(booted_s=None)
             self._greet()
-
-    def _realtime(self, character: str) -> None:
-        now = self._now()
-        if character == "?" and self._mode != "Home" and not self._critical:
-            self._send(self._report(now))
-        elif character == "!" and self._mode == "Idle":
-            self.axis.hold(now)
-        elif character == "~":
-            self.axis.resume(now)
 
     def work(self) -> None:
         """Whatever the main loop does between two interrupts."""
@@ -268,19 +263,15 @@ class GrblFirmware:
         if int(self._settings[10]) & 2:
             fields.append(f"Bf:{_PLANNER_BLOCKS - self.axis.pending},{_RECEIVE_BYTES - len(self._input)}")
         fields.append(f"FS:{abs(speed) * 60:.0f},{self._spindle(now):.0f}")
-        if self._switch_pressed(position):
+        # Half a step, so that rounding does not press the switch.
+        stage_mm, slack = position + self.shift_mm, 0.5 / self._settings[100]
+        if stage_mm < -slack if int(self._settings[23]) & 1 else stage_mm > self._settings[130] + slack:
             fields.append("Pn:X")
         if self._reports_to_offset == 0:
             self._reports_to_offset = _WCO_IDLE if state == "Idle" else _WCO_BUSY
             fields.append(f"WCO:{self._offset_mm:.3f},0.000,0.000")
         self._reports_to_offset -= 1
         return f"<{'|'.join(fields)}>"
-
-    def _switch_pressed(self, position: float) -> bool:
-        stage_mm = position + self.shift_mm
-        # Half a step, so that rounding does not press it.
-        slack = 0.5 / self._settings[100]
-        return stage_mm < -slack if int(self._settings[23]) & 1 else stage_mm > self._settings[130] + slack
 
     def _spindle(self, now: float) -> float:
         """The S in force at the pin; laser mode darkens G0 and holds, and M4 while nothing moves."""
@@ -401,7 +392,8 @@ class GrblFirmware:
             target = self.axis.planned_mm + x
         else:
             target = x + self._offset_mm
-        if self._settings[20] and not self._within_travel(target):
+        low = 0 if "Z" in self._options and int(self._settings[23]) & 1 else -self._settings[130]
+        if self._settings[20] and not low <= target <= low + self._settings[130]:
             yield from self._done()
             self.raise_alarm(2)
             return
@@ -412,9 +404,3 @@ class GrblFirmware:
             target -= (1 if way > 0 else -1) * self.short_steps / self._settings[100]
             self.short_steps = 0
         self.axis.add(target, speed=fastest / 60, time_s=self._now())
-
-    def _within_travel(self, target: float) -> bool:
-        travel = self._settings[130]
-        if "Z" in self._options and int(self._settings[23]) & 1:
-            return 0 <= target <= travel
-        return -travel <= target <= 0

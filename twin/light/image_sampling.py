@@ -67,22 +67,10 @@ def _kernel(x: np.ndarray) -> np.ndarray:
     return 1 + 2 * math.pi**2 * (x * x - x + 1 / 6)
 
 
-def corner_mean(nodes: np.ndarray) -> np.ndarray:
-    """Mean (rows - 1, columns - 1) of the four corners of every grid cell."""
-    beside = nodes[:, :-1] + nodes[:, 1:]
-    return 0.25 * (beside[:-1] + beside[1:])
-
-
-def corner_extremes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest (rows - 1, columns - 1) of the four corners of every grid cell."""
-    low, high = np.minimum(nodes[:, :-1], nodes[:, 1:]), np.maximum(nodes[:, :-1], nodes[:, 1:])
-    return np.minimum(low[:-1], low[1:]), np.maximum(high[:-1], high[1:])
-
-
-def any_corner(nodes: np.ndarray) -> np.ndarray:
-    """Cells (rows - 1, columns - 1) of which some corner is True."""
-    beside = nodes[:, :-1] | nodes[:, 1:]
-    return beside[:-1] | beside[1:]
+def over_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
+    """What a ufunc of two arrays, such as `numpy.maximum`, makes of the four corners of cells (rows - 1, columns - 1)."""
+    beside = combine(nodes[:, :-1], nodes[:, 1:])
+    return combine(beside[:-1], beside[1:])
 
 
 def near_sheet(across: np.ndarray) -> np.ndarray:
@@ -91,7 +79,11 @@ def near_sheet(across: np.ndarray) -> np.ndarray:
     ``across`` is the sheet's distance at the nodes in standard deviations, infinity where there is no surface.
     """
     seen = np.isfinite(across)
-    return any_corner(np.abs(across) < LIT_SIGMAS) | any_corner(seen & (across < 0)) & any_corner(seen & (across > 0))
+    close, before, behind = (
+        over_corners(np.logical_or, nodes)
+        for nodes in (np.abs(across) < LIT_SIGMAS, seen & (across < 0), seen & (across > 0))
+    )
+    return close | before & behind
 
 
 def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:

@@ -22,16 +22,7 @@ import numpy as np
 from twin.backend.arrays import Float, to_jit
 from twin.light.camera import RaySegment, View, ray_segments
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import (
-    NODE_SPACING_PX,
-    any_corner,
-    corner_extremes,
-    corner_mean,
-    lattice,
-    near_sheet,
-    pupil_shifts,
-    widened,
-)
+from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
 from twin.light.walk import Walker
@@ -206,13 +197,15 @@ class Renderer:
                 dr.eval(depth, haze, *across, *reached)
                 near = np.zeros_like(lit)
                 for sigmas, there in zip(across, reached, strict=True):
-                    near |= near_sheet(sigmas.numpy().reshape(shape)) & any_corner(there.numpy().reshape(shape))
+                    near |= near_sheet(sigmas.numpy().reshape(shape)) & over_corners(
+                        np.logical_or, there.numpy().reshape(shape)
+                    )
                 if self.effects.defocus and near.any():
                     blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
-                    reach = np.maximum(reach, np.where(near, corner_extremes(blur)[1], 0))
+                    reach = np.maximum(reach, np.where(near, over_corners(np.maximum, blur), 0))
                 lit |= near
             if moment is pose and dr.width(haze) > 1:
-                image = self._repeated(corner_mean(haze.numpy().reshape(shape)))
+                image = self._repeated(0.25 * over_corners(np.add, haze.numpy().reshape(shape)))
         return widened(lit, reach), image
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
@@ -269,8 +262,9 @@ class Renderer:
             some = min(most, walks - first)
             count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
             cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
-            keys = (dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1))
-            u, v = (mi.sample_tea_float32(dr.arange(mi.UInt32, count), key) for key in keys)
+            place = cast(UInt32, dr.arange(mi.UInt32, count))
+            keys = (cast(UInt32, dr.opaque(mi.UInt32, (place_seed + k) % 2**32)) for k in (0, 1))
+            u, v = (mi.sample_tea_float32(place, key) for key in keys)
             column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
             bundle = self.view.bundle(column + u * size_px - 0.5, row + v * size_px - 0.5)
             total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
@@ -286,14 +280,14 @@ class Renderer:
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
-        low, high = corner_extremes(nodes)
+        low, high = over_corners(np.minimum, nodes), over_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
             blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
-            changes = widened(changes, corner_extremes(blur)[1], cell_px=1)
+            changes = widened(changes, over_corners(np.maximum, blur), cell_px=1)
         if pose.travel is not None:
             changes[:] = True  # what moves by may change any pixel
-        image = corner_mean(nodes)
+        image = 0.25 * over_corners(np.add, nodes)
         for rows, columns in _parts(*np.nonzero(changes), spp=spp):
             fine = self._fine(self._evenly_lit, pose, rows, columns, ambient, spp=spp, shifted=True)
             image[rows, columns] = fine[0]

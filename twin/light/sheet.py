@@ -188,7 +188,8 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Ray
 def _power_along(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
     """Power behind the window per slope, and in total in W, of fan rays at slopes, angles and with shares (N,)."""
     lit = _fan_lit_angles(laser)
-    nodes = np.linspace(*np.interp(lit[[0, -1]], angle, slope), _NODES)
+    first, last = np.interp(lit[[0, -1]], angle, slope)
+    nodes = np.linspace(first, last, _NODES)
     angle_of, passes = _series(slope, angle, _SERIES_SLOPE), _series(slope, passed, 1e-6)
     density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
     between = np.union1d(lit, angle[(angle > lit[0]) & (angle < lit[-1])])

@@ -18,7 +18,7 @@ Left out: light that went by way of a mirror and was scattered or reflected by s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, cast
 
 import drjit as dr
@@ -62,9 +62,7 @@ class _Walks:
 
     def of(self, kept: UInt32) -> _Walks:
         """The walks with the given indices."""
-        return _Walks(
-            **{f.name: dr.gather(type(getattr(self, f.name)), getattr(self, f.name), kept) for f in fields(self)}
-        )
+        return _Walks(*(dr.gather(type(each), each, kept) for each in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -101,7 +99,7 @@ class Walker:
         )
         for step in range(_STEPS):
             walks, found, alive = self._step(walks, dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32))
-            dr.eval(found, alive, *(getattr(walks, f.name) for f in fields(walks)))
+            dr.eval(found, alive, *vars(walks).values())
             # Dr.Jit's threads would add in any order, which rounds differently every time.
             total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
             kept = cast(Any, dr.compress(alive))
@@ -117,7 +115,9 @@ class Walker:
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
-        rng = mi.PCG32(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+        rng: PCG32 = cast(Any, mi.PCG32)(
+            size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence)
+        )
         o, d, c = walks.origin, walks.direction, self.scattering.extinction
         si = self.objects.scene.ray_intersect(self.pose.ray(o, d))
         hit = si.is_valid()
