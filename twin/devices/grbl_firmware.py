@@ -84,8 +84,9 @@ def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machi
         30: machine_coordinates and motion == "G80",
         31: once == "G4" and "X" in values,
     }
-    for code in (code for code, wrong in refused.items() if wrong):
-        raise GrblError(code)
+    for code, wrong in refused.items():
+        if wrong:
+            raise GrblError(code)
 
 
 _DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}

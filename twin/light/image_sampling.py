@@ -68,22 +68,23 @@ def _kernel(x: np.ndarray) -> np.ndarray:
 
 
 def over_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
-    """What a ufunc of two arrays, such as `numpy.maximum`, makes of the four corners of cells (rows - 1, columns - 1)."""
+    """Four corners of every cell (rows - 1, columns - 1) combined by a ufunc of two arrays, such as `numpy.maximum`."""
     beside = combine(nodes[:, :-1], nodes[:, 1:])
     return combine(beside[:-1], beside[1:])
 
 
-def near_sheet(across: np.ndarray) -> np.ndarray:
+def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:
     """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes.
 
-    ``across`` is the sheet's distance at the nodes in standard deviations, infinity where there is no surface.
+    ``across`` is the sheet's distance at the nodes in standard deviations, infinity where there is no surface; cells
+    without a corner that the sheet has ``reached`` are left out.
     """
     seen = np.isfinite(across)
-    close, before, behind = (
-        over_corners(np.logical_or, nodes)
-        for nodes in (np.abs(across) < LIT_SIGMAS, seen & (across < 0), seen & (across > 0))
+    close, before, behind, there = (
+        over_corners(np.logical_or, np.broadcast_to(nodes, across.shape))
+        for nodes in (np.abs(across) < LIT_SIGMAS, seen & (across < 0), seen & (across > 0), reached)
     )
-    return close | before & behind
+    return there & (close | before & behind)
 
 
 def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import drjit as dr
@@ -197,9 +197,7 @@ class Renderer:
                 dr.eval(depth, haze, *across, *reached)
                 near = np.zeros_like(lit)
                 for sigmas, there in zip(across, reached, strict=True):
-                    near |= near_sheet(sigmas.numpy().reshape(shape)) & over_corners(
-                        np.logical_or, there.numpy().reshape(shape)
-                    )
+                    near |= near_sheet(sigmas.numpy().reshape(shape), there.numpy().reshape(shape))
                 if self.effects.defocus and near.any():
                     blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
                     reach = np.maximum(reach, np.where(near, over_corners(np.maximum, blur), 0))
@@ -262,8 +260,8 @@ class Renderer:
             some = min(most, walks - first)
             count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
             cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
-            place = cast(UInt32, dr.arange(mi.UInt32, count))
-            keys = (cast(UInt32, dr.opaque(mi.UInt32, (place_seed + k) % 2**32)) for k in (0, 1))
+            place: Any = dr.arange(mi.UInt32, count)
+            keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
             u, v = (mi.sample_tea_float32(place, key) for key in keys)
             column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
             bundle = self.view.bundle(column + u * size_px - 0.5, row + v * size_px - 0.5)

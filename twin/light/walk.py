@@ -115,9 +115,8 @@ class Walker:
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
-        rng: PCG32 = cast(Any, mi.PCG32)(
-            size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence)
-        )
+        random = cast(Any, mi.PCG32)
+        rng: PCG32 = random(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
         o, d, c = walks.origin, walks.direction, self.scattering.extinction
         si = self.objects.scene.ray_intersect(self.pose.ray(o, d))
         hit = si.is_valid()

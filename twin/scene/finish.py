@@ -40,40 +40,27 @@ _IRON = np.array(
 def iron_index(*, wavelength_nm: float) -> complex:
     """Refractive index n + i k of iron, for steel, relative to air; linear between the table's wavelengths.
 
-    Raises
-    ------
-    RangeError
-        The wavelength lies outside the table's visible part.
+    RangeError where the wavelength lies outside the table's visible part.
     """
     wavelength, n, k = _IRON
-    check_range(
-        "wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], "the table of Johnson and Christy (1974)"
-    )
+    source = "the table of Johnson and Christy (1974)"
+    check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], source)
     return complex(np.interp(wavelength_nm, wavelength, n), np.interp(wavelength_nm, wavelength, k))
 
 
-def normal_reflectance(relative_index: complex) -> float:
-    """Reflectance of a smooth face at normal incidence, |(m - 1) / (m + 1)|^2 (Fresnel)."""
-    return abs((relative_index - 1) / (relative_index + 1)) ** 2
-
-
 def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
-    """How an object scatters light in a medium, without its mirror share.
+    """BSDF of an object in a medium, without its mirror share.
 
-    Without ``gloss`` everything is diffuse: a body without its coat, and a metal with the reflectance of its smooth
-    face at normal incidence.
-
-    Raises
-    ------
-    DescriptionError
-        The texture is missing, unreadable, or its values lie outside 0 to 1.
-    RangeError
-        The wavelength lies outside the table of iron.
+    Without ``gloss`` everything is diffuse: a body without its coat, and a metal with the reflectance |(m - 1) /
+    (m + 1)|^2 of its smooth face at normal incidence (Fresnel). DescriptionError where the texture is missing,
+    unreadable, or its values lie outside 0 to 1; RangeError where the wavelength lies outside the table of iron.
     """
     if gloss and thing.finish != "diffuse":
         return _glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
-    metal = thing.finish == "metal"
-    scale = normal_reflectance(iron_index(wavelength_nm=wavelength_nm) / medium_index) if metal else 1.0
+    scale = 1.0
+    if thing.finish == "metal":
+        index = iron_index(wavelength_nm=wavelength_nm) / medium_index
+        scale = abs((index - 1) / (index + 1)) ** 2
     return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale)})
 
 
@@ -104,10 +91,7 @@ def _reflectance(thing: Placed, scale: float = 1.0) -> float | mi.Texture:
 def read_grey(path: str | Path) -> np.ndarray:
     """Grey values (H, W) of a picture, full scale as 1, taken as they are: they are linear, not gamma-coded.
 
-    Raises
-    ------
-    DescriptionError
-        The file is missing, no picture that Mitsuba reads, or its values lie outside 0 to 1.
+    DescriptionError where the file is missing, no picture that Mitsuba reads, or its values lie outside 0 to 1.
     """
     if not Path(path).is_file():
         raise DescriptionError(f"no texture at {path}")
@@ -117,9 +101,8 @@ def read_grey(path: str | Path) -> np.ndarray:
         picture.set_srgb_gamma(False)
         grey = np.array(picture.convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, False))
     except RuntimeError as error:
-        raise DescriptionError(
-            f"{path} is no picture that Mitsuba reads as a texture (PNG, JPEG, EXR, ...): {error}"
-        ) from error
+        readable = "picture that Mitsuba reads as a texture (PNG, JPEG, EXR, ...)"
+        raise DescriptionError(f"{path} is no {readable}: {error}") from error
     grey = grey.reshape(grey.shape[:2])
     if grey.size == 0 or not (np.isfinite(grey).all() and grey.min() >= 0 and grey.max() <= 1):
         raise DescriptionError(f"{path} has grey values outside 0 to 1; a texture multiplies the reflectance")

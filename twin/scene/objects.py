@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
+from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, UInt32, to_jit
 from twin.scene.description import (
     AnyObject,
     Block,
@@ -106,20 +106,14 @@ class Objects:
 def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
     """All objects of a scene in a medium, seen in the laser's light; without ``gloss`` diffuse and without mirrors.
 
-    Raises
-    ------
-    DescriptionError
-        A mesh or texture file is missing, unreadable or empty.
-    RangeError
-        The wavelength lies outside the table of a metal.
+    DescriptionError where a mesh or texture file is missing, unreadable or empty; RangeError where the wavelength lies
+    outside the table of a metal.
     """
     register_pattern()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
-    things, poses = scene.objects, scene.object_poses()
-    shapes = [
-        _shape(thing, pose, finish_bsdf(thing, gloss=gloss, **optics))
-        for thing, pose in zip(things, poses, strict=True)
-    ]
+    things = scene.objects
+    placed = list(zip(things, scene.object_poses(), strict=True))
+    shapes = [_shape(thing, pose, finish_bsdf(thing, gloss=gloss, **optics)) for thing, pose in placed]
     flat = np.zeros_like(_ALBEDO_COSINES), np.ones_like(_ALBEDO_COSINES)
     parts = [
         albedo_parts(thing, _ALBEDO_COSINES, **optics) if gloss and thing.finish != "diffuse" else flat
@@ -139,9 +133,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     whole = mi.load_dict(whole | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
     return Objects(
         scene=whole,
-        mirrors=tuple(
-            face for thing, pose in zip(things, poses, strict=True) if gloss for face in _mirror_faces(thing, pose)
-        ),
+        mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )
 
@@ -168,32 +160,27 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             matrix = pose.copy()
             if thing.texture is None:
                 matrix[:3, :3] = np.eye(3)  # Mitsuba takes a turned sphere's rounding for shear
-            matrix = matrix @ _scaled(*[thing.diameter_mm / 2] * 3)
-            kind = "sphere"
+            matrix, kind = matrix @ _scaled(*[thing.diameter_mm / 2] * 3), "sphere"
         case Block():
-            matrix = pose @ _scaled(*(side / 2 for side in thing.size_mm))
-            kind = "cube"
+            matrix, kind = pose @ _scaled(*(side / 2 for side in thing.size_mm)), "cube"
         case Pipe():
-            along = _CYLINDER_AXIS_TO_X @ _scaled(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
-            along[0, 3] = -thing.length_mm / 2
-            matrix = pose @ along
-            kind = "cylinder"
+            matrix = _CYLINDER_AXIS_TO_X @ _scaled(thing.diameter_mm / 2, thing.diameter_mm / 2, thing.length_mm)
+            matrix[0, 3] = -thing.length_mm / 2
+            matrix, kind = pose @ matrix, "cylinder"
         case CirclePlate() | TargetPlate() if thing.bow_mm != 0:
             return _mesh(thing, pose, bsdf)
         case CirclePlate() | TargetPlate():
             first, last = thing.bounds_mm()
-            half_width, half_height = (last - first) / 2
-            matrix = _FACING_SENSOR @ _scaled(half_width, half_height, 1)
+            matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
         case Mesh() | Head() | Weld():
             return _mesh(thing, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
         case Plate():
-            matrix = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1)
-            kind = "rectangle"
+            matrix, kind = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1), "rectangle"
         case _:
             assert_never(thing)
-    return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
+    return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
 
 
 def _mesh(thing: Mesh | Head | Weld | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
@@ -223,24 +210,17 @@ def _surface(thing: Mesh | Head | Weld | CirclePlate | TargetPlate) -> tuple[np.
         case CirclePlate() | TargetPlate():
             return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Mesh():
-            pass
+            return _surface_from_file(thing)
         case _:
             assert_never(thing)
-    vertices, faces, uv = _surface_from_file(thing.path)
-    if len(faces) == 0 or not np.isfinite(vertices).all():
-        raise DescriptionError(f"{thing.path} holds no usable surface: {len(faces)} faces")
-    if thing.texture is not None and uv is None:
-        raise DescriptionError(
-            f"{thing.path} has no texture coordinates for {thing.texture}: add them, or leave it out"
-        )
-    return thing.scale * vertices, faces, uv
 
 
-def _surface_from_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of all parts of a file.
 
     The parts are joined here, as trimesh copies their materials to join them, which needs an imaging library.
     """
+    path = thing.path
     if not Path(path).is_file():
         raise DescriptionError(f"no mesh at {path}")
     try:
@@ -248,8 +228,7 @@ def _surface_from_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
     except (ValueError, NotImplementedError, OSError) as error:
         raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
     assert isinstance(loaded, trimesh.Scene)  # as it was forced to be
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
-    uv: list[np.ndarray | None] = [np.zeros((0, 2))]
+    vertices, faces, uv, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros((0, 2))], 0
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
@@ -258,8 +237,14 @@ def _surface_from_file(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | 
             faces.append(part.faces + count)
             uv.append(getattr(part.visual, "uv", None))
             count += len(part.vertices)
+    corners, triangles = np.concatenate(vertices), np.concatenate(faces)
+    if len(triangles) == 0 or not np.isfinite(corners).all():
+        raise DescriptionError(f"{path} holds no usable surface: {len(triangles)} faces")
     known = [coordinates for coordinates in uv if coordinates is not None]
-    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(known) if len(known) == len(uv) else None
+    everywhere = len(known) == len(uv)
+    if thing.texture is not None and not everywhere:
+        raise DescriptionError(f"{path} has no texture coordinates for {thing.texture}: add them, or leave it out")
+    return thing.scale * corners, triangles, np.concatenate(known) if everywhere else None
 
 
 def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:

@@ -132,12 +132,8 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def weld_surface(weld: Weld) -> tuple[np.ndarray, np.ndarray]:
     """A plate in the x-y plane with weld beads on its front: vertices (V, 3) in mm and faces (F, 3) of an open surface.
 
-    Facets deviate from `weld_height` by `_SAG_MM`.
-
-    Raises
-    ------
-    DescriptionError
-        Ripples so small or steep on so long beads need too many vertices.
+    Facets deviate from `weld_height` by `_SAG_MM`. DescriptionError where ripples so small or steep on so long beads
+    need too many vertices.
     """
     # A chord over a step h of a curve of second derivative c deviates from it by c h^2 / 8.
     ripple = 0.5 * weld.ripple_height_mm * (2 * np.pi / weld.ripple_pitch_mm) ** 2

@@ -61,18 +61,18 @@ def grey_values(
     ``rng`` None leaves out all noise that changes from image to image, ``pattern`` None what differs from pixel to
     pixel. Shot noise of signal and dark current is Poisson's; blooming and the full well act before the readout, which
     adds its offset pattern and noise. Rounding is the only quantisation. Bands of rows have random numbers of their
-    own, so that the image does not depend on how many of them are made at a time.
-
-    Raises
-    ------
-    ImageError
-        ``electrons`` is not a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
+    own, so that the image does not depend on how many of them are made at a time. ImageError where ``electrons`` is not
+    a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
     """
     electrons = _checked(electrons, pattern)
     count = min(_BANDS, len(electrons))
     detectors, exposures = [detector] * count, [exposure_ms] * count
     patterns = [None] * count if pattern is None else pattern.bands(count)
-    rngs = [None] * count if rng is None else _fast_generators(rng, count)
+    rngs: list[np.random.Generator | None] = [None] * count
+    if rng is not None:
+        # They continue the given generator's seed; SFC64 is NumPy's fastest.
+        seeds = cast(np.random.SeedSequence, rng.bit_generator.seed_seq).spawn(count)
+        rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
     with ThreadPoolExecutor() as pool:
         charges = list(pool.map(_collected, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
         if detector.blooming > 0:
@@ -85,10 +85,10 @@ def _checked(electrons: np.ndarray, pattern: FixedPattern | None) -> np.ndarray:
     electrons = np.asarray(electrons, np.float32)
     if electrons.ndim != 2 or electrons.size == 0:
         raise ImageError(f"mean electrons have the shape {electrons.shape}; expected an image (H, W)")
-    lowest, highest = electrons.min(), electrons.max()
-    if not (lowest >= 0 and highest <= MOST_ELECTRONS):
+    least, most = electrons.min(), electrons.max()
+    if not (least >= 0 and most <= MOST_ELECTRONS):
         raise ImageError(
-            f"mean electrons run from {lowest:g} to {highest:g}; expected finite numbers from 0 to {MOST_ELECTRONS:g}"
+            f"mean electrons run from {least:g} to {most:g}; expected finite numbers from 0 to {MOST_ELECTRONS:g}"
         )
     if pattern is not None and pattern.gain.shape != electrons.shape:
         raise ImageError(
@@ -96,12 +96,6 @@ def _checked(electrons: np.ndarray, pattern: FixedPattern | None) -> np.ndarray:
             "with the image's height and width"
         )
     return electrons
-
-
-def _fast_generators(rng: np.random.Generator, count: int) -> list[np.random.Generator]:
-    """Independent generators that continue the given one's seed; SFC64 is NumPy's fastest."""
-    seeds = cast(np.random.SeedSequence, rng.bit_generator.seed_seq)
-    return [np.random.Generator(np.random.SFC64(seed)) for seed in seeds.spawn(count)]
 
 
 def _collected(
@@ -113,12 +107,10 @@ def _collected(
 ) -> np.ndarray:
     """Electrons of light and dark current that an exposure collects, before any are lost."""
     dark = np.float32(1e-3 * exposure_ms * detector.dark_current_e_per_s * detector.dark_current_growth())
-    if pattern is None:
-        mean = electrons + dark
-    else:
-        mean = electrons * pattern.gain
+    mean = electrons if pattern is None else electrons * pattern.gain
+    if pattern is not None:
         mean += pattern.hot_e_per_s * np.float32(1e-3 * exposure_ms)
-        mean += dark
+    mean = mean + dark
     return mean if rng is None else poisson_numbers(mean, rng)
 
 

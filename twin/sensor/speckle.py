@@ -46,27 +46,19 @@ class Speckle:
     """Speckle pattern of a camera in the light of a laser, for any position along the travel of the stage.
 
     A pattern depends on the seed, the travel and the pixel only: frames can be asked for in any order, and any part of
-    a frame alone. From ``2 renewal_mm`` of travel on it is a new one.
-
-    Parameters
-    ----------
-    camera
-        Its f-number N, focal length f, focus distance a, pixel size, image size and direction of the stripe are used.
-    wavelength_nm
-        Wavelength in air, the space between lens and image sensor.
-    seed
-        Not negative; other seeds give independent patterns.
-
-    Raises
-    ------
-    DesignError
-        If the lens is focused within its focal length, or stopped down so far that grains are wider than 64 pixels.
-    RangeError
-        If the wavelength is not finite, or below 1 nm.
+    a frame alone. From ``2 renewal_mm`` of travel on it is a new one. ``wavelength_nm`` is that in air, the space
+    between lens and image sensor; other seeds, which are not negative, give independent patterns. DesignError where the
+    lens is focused within its focal length, or stopped down so far that grains are wider than 64 pixels; RangeError
+    where the wavelength is not finite, or below 1 nm.
     """
 
     def __init__(self, camera: Camera, *, wavelength_nm: float, seed: int) -> None:
-        magnification = _magnification(camera)
+        focal, focus = camera.focal_length_mm, camera.focus_distance_mm
+        if focus <= focal:
+            raise DesignError(
+                f"focus_distance_mm {focus:g} is not beyond focal_length_mm {focal:g}: such a lens forms no image"
+            )
+        magnification = focal / (focus - focal)  # of the focused plane
         wavelength_mm = 1e-6 * float(_within("the wavelength in nm", wavelength_nm, 1.0, math.inf))
         grain_mm = wavelength_mm * camera.f_number * (1 + magnification)
         grain_px = grain_mm / (1e-3 * camera.pixel_size_um)
@@ -91,31 +83,16 @@ class Speckle:
         polarisation: ArrayLike,
         coherence: ArrayLike = 1.0,
     ) -> np.ndarray:
-        """Factors (P,), float32, not negative and of mean 1, for the laser's light in pixels.
+        """Factors (P,), float32, not negative and of mean 1, for the laser's light in pixels (P,) in any order.
 
         The patterns of two orthogonal polarisations add in intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, which
-        gives the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle Phenomena in Optics, Ch. 3). A finite coherence
-        multiplies it; averaging over the pixel's area does, too (`pixel_contrast`).
-
-        Parameters
-        ----------
-        rows, columns
-            Integers (P,), pixels of the image in any order.
-        travel_mm
-            Position along the stage. See `renewal_correlation` for how the pattern changes with it.
-        polarisation
-            Degree of polarisation P of the scattered light, (P,) or one for all, 0 to 1: 1 for bare metal, about 0 for
-            paint and plastics, in which light is scattered many times.
-        coherence
-            Contrast of the unintegrated pattern of one polarisation, (P,) or one for all, 0 to 1; see the function
-            `coherence`. Below 1e-4 it is taken for that.
-
-        Raises
-        ------
-        ImageError
-            If a pixel lies outside the image.
-        RangeError
-            If travel, polarisation or coherence is not finite or outside its range.
+        gives the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle Phenomena in Optics, Ch. 3) for the degree of
+        polarisation P of the scattered light, (P,) or one for all, 0 to 1: 1 for bare metal, about 0 for paint and
+        plastics, in which light is scattered many times. ``coherence``, (P,) or one for all, is the contrast of the
+        unintegrated pattern of one polarisation, 0 to 1 (see the function `coherence`), below 1e-4 taken for that; it
+        multiplies the contrast, as averaging over the pixel's area does (`pixel_contrast`). For how the pattern changes
+        with the travel see `renewal_correlation`. ImageError where a pixel lies outside the image, RangeError where
+        travel, polarisation or coherence is not finite or outside its range.
         """
         # Small integers would overflow where a pixel's place in the tile is counted.
         rows, columns = (np.asarray(values).astype(np.intp, casting="same_kind") for values in (rows, columns))
@@ -164,23 +141,11 @@ def coherence(
     Phenomena in Optics, Ch. 5). Light that enters the material travels farther than its roughness says: for
     ``roughness_um`` put half the standard deviation of its optical path then, with the index 1.
 
-    Parameters
-    ----------
-    roughness_um
-        Standard deviation of the surface's heights within a resolution cell, any shape.
-    linewidth_nm
-        Full width at half maximum of the laser's spectrum during an exposure; 0 for a coherent laser.
-    wavelength_nm
-        Mean wavelength in air.
-    index
-        Refractive index n of the medium before the surface, relative to air.
-    cosines
-        Cosines of the angles i and o between the surface's normal and the light that arrives and leaves.
-
-    Raises
-    ------
-    RangeError
-        If a value is not finite, or negative.
+    ``roughness_um`` is the standard deviation of the surface's heights within a resolution cell, of any shape;
+    ``linewidth_nm`` the full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent laser;
+    ``wavelength_nm`` the mean wavelength in air; ``index`` the medium's refractive index n relative to air; ``cosines``
+    those of the angles i and o between the surface's normal and the light that arrives and leaves. RangeError where a
+    value is not finite, or negative.
     """
     roughness = _within("the roughness in um", roughness_um, 0.0, math.inf)
     width = _within("the line width in nm", linewidth_nm, 0.0, math.inf)
@@ -306,16 +271,6 @@ def _look_weights(contrast: np.ndarray) -> np.ndarray:
     kept = ratio**order >= _FAINTEST_LOOK
     scale = (1 - ratio) / np.sqrt(1 - ratio ** (2 * kept.sum(axis=0)))
     return np.where(kept, scale * ratio**order, 0.0)
-
-
-def _magnification(camera: Camera) -> float:
-    """Magnification m = f / (a - f) of the focused plane."""
-    focal, focus = camera.focal_length_mm, camera.focus_distance_mm
-    if focus <= focal:
-        raise DesignError(
-            f"focus_distance_mm {focus:g} is not beyond focal_length_mm {focal:g}: such a lens forms no image"
-        )
-    return focal / (focus - focal)
 
 
 def _within(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:
