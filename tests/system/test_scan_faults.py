@@ -12,8 +12,7 @@ import pytest
 
 from tests.system.in_process import uwlts
 from tests.system.small_board import small_sensor, turned_board
-from twin.devices.bench import NAMES
-from twin.devices.serve import ServedTwin, serve
+from twin.devices.serve import NAMES, ServedTwin, serve
 from twin.scene.description import Scene, load_scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from tests.system.small_board import small_sensor, turned_board
-from twin.devices.bench import NAMES, Fault, Track, parse_fault
-from twin.devices.serve import ServedTwin, serve
+from twin.devices.serve import NAMES, Fault, ServedTwin, Track, parse_fault, serve
 from twin.options import Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene, load_scene

@@ -1,24 +1,236 @@
-"""Serves a scene as hardware: a Grbl controller on a pseudo terminal and a GigE Vision camera, joined by the bench."""
+"""Serves a scene as hardware: a Grbl controller on a pseudo terminal and a GigE Vision camera, joined by a bench.
 
+The bench renders what the camera sees of scene, stage and laser; faults NAME[:ARGUMENT][@FRAME] disturb it.
+"""
+
+import math
+import re
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from twin.devices.bench import Bench, FrameRates, Track, parse_fault
 from twin.devices.gige_camera import GigeCamera
-from twin.devices.grbl_controller import GrblController
+from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
-from twin.scene.description import altered
-from uwlts.model.errors import DescriptionError
+from twin.scene.description import Motion, Shot, altered
+from uwlts.model.errors import DescriptionError, DesignError
+from uwlts.model.sensor import Stage
+
+if TYPE_CHECKING:  # it needs Mitsuba
+    from twin.recording.studio import Studio
 
 _STEPS_PER_MM, _TRAVEL = 100, 130
 _WATCH_S = 0.2
+
+
+_FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A fault's argument unless given, None where it takes none, and which arguments it takes."""
+
+    argument: float | None = None
+    whole: bool = True
+    signed: bool = False
+
+
+_KINDS = {
+    **dict.fromkeys(("drop", "repeat", "cut"), _Kind(1)),
+    "delay": _Kind(1.0, whole=False),
+    **dict.fromkeys(("camera-disconnect", "stage-disconnect", "mute", "stall"), _Kind()),
+    "stop-short": _Kind(40),
+    "lose-steps": _Kind(40, signed=True),
+    "alarm": _Kind(1),
+    **dict.fromkeys(("hold", "restart", "garbage", "break-laser"), _Kind()),
+}
+NAMES = tuple(_KINDS)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that comes with a frame, counted from 1 as the camera is asked for them."""
+
+    name: str
+    argument: float | None
+    frame: int
+
+    @property
+    def ahead(self) -> bool:
+        """Whether it has to be injected before its frame is begun, which is when the one before is done."""
+        return self.name == "delay"
+
+    def inject(self, stage: GrblController, camera: GigeCamera) -> None:
+        """Let it happen."""
+        value = 1 if self.argument is None else self.argument
+        match self.name:
+            case "drop" | "repeat" | "cut":
+                camera.inject(self.name, int(value))
+            case "delay":
+                camera.inject("delay", delay_s=value)
+            case "camera-disconnect":
+                camera.disconnect()
+            case _:
+                stage.inject(self.name, value)
+
+    def __str__(self) -> str:
+        return f"{self.name}{'' if self.argument is None else f':{self.argument:g}'} at frame {self.frame}"
+
+
+def parse_fault(text: str) -> Fault:
+    """A fault from NAME[:ARGUMENT][@FRAME], by default of the kind's own argument with the first frame.
+
+    DescriptionError where there is no such fault, or its argument is none.
+    """
+    found = _FORM.fullmatch(text)
+    if not found or found["name"] not in _KINDS:
+        raise DescriptionError(f"'{text}' is no fault: write NAME[:ARGUMENT][@FRAME] with one of {', '.join(NAMES)}")
+    kind, argument = _KINDS[found["name"]], found["argument"]
+    if argument is not None and kind.argument is None:
+        raise DescriptionError(f"the fault {found['name']} takes no argument, '{argument}' was given")
+    value = kind.argument
+    if argument is not None:
+        try:
+            value = int(argument) if kind.whole else float(argument)
+        except ValueError as error:
+            wanted = "a whole number" if kind.whole else "a number of seconds"
+            raise DescriptionError(f"the argument of {found['name']} is '{argument}', not {wanted}") from error
+        if not math.isfinite(value) or (value <= 0 and not kind.signed):
+            raise DescriptionError(f"the argument of {found['name']} is '{argument}'; it must be positive")
+    return Fault(found["name"], value, int(found["frame"] or 1))
+
+
+# Keeps the random numbers of the walks, which follow the place, apart from those of the noise, which follow the frame.
+_WALKS, _NOISE = 0, 1
+
+
+@dataclass(frozen=True)
+class Track:
+    """Place of the scene's motion on the stage: it starts at ``start_mm`` of the stage's own positions."""
+
+    motion: Motion
+    start_mm: float
+
+    @classmethod
+    def on(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
+        """The motion in the middle of the travel, on a whole step, unless ``start_mm`` says where it starts.
+
+        DescriptionError where the motion does not lie within the travel.
+        """
+        way_mm = (motion.count - 1) * motion.step_mm
+        if start_mm is None:
+            start_mm = round((stage.travel_mm - way_mm) / 2 / stage.resolution_mm) * stage.resolution_mm
+        low, high = sorted((start_mm, start_mm + way_mm))
+        # A motion as long as the travel may lie beyond its end by half the step to which its start was rounded.
+        if not -stage.resolution_mm <= low <= high <= stage.travel_mm + stage.resolution_mm:
+            raise DescriptionError(
+                f"the scene's motion would run from {low:g} to {high:g} mm of the stage, whose travel is 0 to "
+                f"{stage.travel_mm:g} mm: start it elsewhere, or shorten it"
+            )
+        return cls(motion, start_mm)
+
+    @property
+    def offset_mm(self) -> float:
+        """Stage position of the scene's position 0."""
+        return self.start_mm - self.motion.start_mm
+
+    def shot(self, position_mm: float, light: Literal["lamp", "laser"]) -> Shot:
+        """The shot at a position of the stage; errors of the stage between the scan's positions are interpolated."""
+        scene_mm, motion = position_mm - self.offset_mm, self.motion
+        error_mm = 0.0
+        if motion.position_errors_mm:
+            places = motion.start_mm + motion.step_mm * np.arange(motion.count)
+            order = np.argsort(places)
+            error_mm = float(np.interp(scene_mm, places[order], np.array(motion.position_errors_mm)[order]))
+        return Shot(stage_mm=scene_mm, travelled_mm=scene_mm + error_mm, light=light)
+
+
+@dataclass(frozen=True)
+class FrameRates:
+    """Numbers of frames made and rendered, and the times in s that rendered and repeated ones took."""
+
+    frames: int = 0
+    rendered: int = 0
+    rendering_s: float = 0.0
+    repeating_s: float = 0.0
+
+    def __str__(self) -> str:
+        repeated = self.frames - self.rendered
+        parts = [f"{self.frames} frames"]
+        if self.rendered:
+            parts.append(f"{self.rendered} rendered at {self.rendered / self.rendering_s:.1f} frames/s")
+        if repeated:
+            parts.append(f"{repeated} of the same place at {repeated / self.repeating_s:.1f} frames/s")
+        return ", ".join(parts)
+
+
+class Bench:
+    """Frames of a studio for a stage whose ``state()`` is true at the moment of the call; used by one thread.
+
+    ``track`` is where the scene lies on the stage; the lamp is on while the laser is off if ``lamp``. DesignError where
+    the detector does not have 8 bit.
+    """
+
+    def __init__(self, studio: "Studio", *, state: Callable[[], StageState], track: Track, lamp: bool):
+        bits = studio.sensor.detector.bits
+        if bits != 8:
+            raise DesignError(f"the served camera gives 8 bit, the sensor's detector {bits}: set bits = 8")
+        self.rates = FrameRates()
+        self._studio, self._state, self._track, self._lamp = studio, state, track, lamp
+        self._travelled_mm = math.nan
+        self._seen: dict[str, np.ndarray] = {}
+
+    def frame(self, exposure_ms: float) -> np.ndarray:
+        """Image (height_px, width_px) of uint8 of this moment; noise differs from call to call."""
+        began, state, known = time.perf_counter(), self._state(), len(self._seen)
+        at_rest = self._track.shot(state.position_mm, "laser").travelled_mm == self._travelled_mm
+        light = exposure_ms * self._electrons_per_ms(state)
+        noise_seed = [self._studio.options.seed, _NOISE, self.rates.frames]
+        image = self._studio.detected(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
+        seconds, rates = time.perf_counter() - began, replace(self.rates, frames=self.rates.frames + 1)
+        if at_rest and len(self._seen) == known:
+            self.rates = replace(rates, repeating_s=rates.repeating_s + seconds)
+        else:
+            self.rates = replace(rates, rendered=rates.rendered + 1, rendering_s=rates.rendering_s + seconds)
+        return image
+
+    def _electrons_per_ms(self, state: StageState) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W), without noise; the latest place's are kept."""
+        travelled_mm = self._track.shot(state.position_mm, "laser").travelled_mm
+        if travelled_mm != self._travelled_mm:
+            self._travelled_mm, self._seen = travelled_mm, {}
+        if state.power == 0:
+            return self._light("lamp" if self._lamp else "day", state)
+        laser = self._light("laser", state)
+        if state.power >= 1:
+            return laser
+        # A laser frame holds the daylight, which a weaker laser leaves as it is.
+        day = self._light("day", state)
+        return day + np.float32(state.power) * np.maximum(laser - day, 0)
+
+    def _light(self, light: Literal["lamp", "laser", "day"], state: StageState) -> np.ndarray:
+        if light not in self._seen:
+            shot, options = (
+                self._track.shot(state.position_mm, "laser" if light == "laser" else "lamp"),
+                self._studio.options,
+            )
+            # Whole um, which are all different places; seeds must not be negative.
+            place = round(1e3 * shot.travelled_mm) % 2**32
+            seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
+            self._seen[light] = (
+                self._studio.daylight_electrons_per_ms(shot)
+                if light == "day"
+                else self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
+            )
+        return self._seen[light]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from scipy.special import chdtrc
 
 from tests.virtual_sensors import clear, gauss_legendre
 from twin.backend.arrays import to_jit, to_numpy
-from twin.light.phase_functions import NODES, node_angles, tabulated
-from twin.light.water import Scattering
+from twin.light.water import NODES, Scattering, node_angles, tabulated
 from uwlts.model.phase_functions import (
     FournierForand,
     HenyeyGreenstein,
