@@ -19,8 +19,7 @@ from cyclopts import App, Parameter
 import twin
 import uwlts
 from twin.options import CPU
-from twin.scene.campaign import campaign_names
-from twin.scene.description import load_scene, scene_names
+from twin.scene.description import load_scene
 from uwlts.model.library import names
 from uwlts.model.waters import WATERS
 from uwlts.runtime.console import run
@@ -176,12 +175,11 @@ def scenes() -> None:
 
     Example: twin scenes
     """
-    for name in scene_names():
+    for name in names():
         scene = load_scene(name)
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
-    print(f"sensors: {', '.join(names('sensors'))}")
-    print(f"campaigns: {', '.join(campaign_names())}")
-    print(f"studies: {', '.join(names('studies'))}")
+    for folder in ("sensors", "campaigns", "studies"):
+        print(f"{folder}: {', '.join(names(folder))}")
     print(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
     for name, water in WATERS.items():
         print(f"  {name}: {water.sentence}")

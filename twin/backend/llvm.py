@@ -94,9 +94,8 @@ def prepare_llvm() -> LlvmLibrary:
         if major < MINIMUM_MAJOR:
             held = f"libLLVM {major}.{minor}.{patch}" if major > 0 else "no libLLVM"
             raise SetupError(
-                f"Dr.Jit was imported before prepare_llvm() and holds {held}, but version {MINIMUM_MAJOR} or newer is "
-                f"needed. Call twin.backend.llvm.prepare_llvm() before the first import of drjit or mitsuba, or set "
-                f"{VARIABLE}."
+                f"Dr.Jit was imported with {held}, but version {MINIMUM_MAJOR} or newer is needed: call "
+                f"twin.backend.llvm.prepare_llvm() before the first import of drjit or mitsuba, or set {VARIABLE}"
             )
         return LlvmLibrary(Path(os.environ.get(VARIABLE, "libLLVM.so")), (major, minor, patch))
     library = find_llvm()
@@ -183,14 +182,14 @@ def describe(library: str) -> dict[str, object]:
         return {"fault": f"it does not load: {error}"}
     if not hasattr(handle, "LLVMContextCreate"):
         return {"fault": "it is no libLLVM: it lacks the function LLVMContextCreate"}
+    wanted = f"version {MINIMUM_MAJOR} or newer is needed"
     if not hasattr(handle, "LLVMGetVersion"):
-        return {"fault": f"too old: it has no LLVMGetVersion; version {MINIMUM_MAJOR} or newer is needed"}
+        return {"fault": f"too old: it has no LLVMGetVersion; {wanted}"}
     numbers = [ctypes.c_uint() for _ in range(3)]
     handle.LLVMGetVersion(*map(ctypes.byref, numbers))
     version = [number.value for number in numbers]
     if version[0] < MINIMUM_MAJOR:
-        stated = ".".join(map(str, version))
-        return {"fault": f"version {stated}; version {MINIMUM_MAJOR} or newer is needed"}
+        return {"fault": f"version {'.'.join(map(str, version))}; {wanted}"}
     return {"version": version, "companions": companions}
 
 

@@ -26,7 +26,7 @@ _LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
 
 
 def image_packets(
-    image: np.ndarray, *, time_ns: int, number: int, region: tuple[int, int, int, int], packet_bytes: int
+    image: np.ndarray, time_ns: int, *, number: int, region: tuple[int, int, int, int], packet_bytes: int
 ) -> list[bytes]:
     """Leader, parts of the region, and trailer of an image (H, W) of uint8.
 
@@ -190,7 +190,14 @@ class GigeCamera:
         if self._server is not None:
             return
         library = self._library
-        _refuse_second_camera()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+            try:
+                trial.bind((LOOPBACK, PORT))
+            except OSError as error:  # Aravis does not report it
+                raise HardwareError(
+                    f"UDP port {PORT} of {LOOPBACK} cannot be used ({error.strerror}): another camera is served there; "
+                    "end that program first"
+                ) from error
         self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stream.bind((LOOPBACK, 0))
         # Aravis would also listen at the broadcast address of all networks, which is held while the camera starts.
@@ -237,14 +244,10 @@ class GigeCamera:
             names = (_Register.STREAM_IP, _Register.STREAM_PORT, _Register.PACKET_SIZE)
             host, port, packet_bytes = map(self._read, names)
             x, y, width, height = map(self._read, _REGION)
+            region = x, y, width, height
         if not dropped:
-            packets = image_packets(
-                shot.image,
-                time_ns=shot.time_ns,
-                number=self._number,
-                region=(x, y, width, height),
-                packet_bytes=packet_bytes & 0xFFFF,
-            )
+            size = packet_bytes & 0xFFFF
+            packets = image_packets(shot.image, shot.time_ns, number=self._number, region=region, packet_bytes=size)
             if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]
@@ -301,18 +304,14 @@ class GigeCamera:
         self._library.arv_fake_camera_read_register(self._camera, register, ctypes.byref(number))
         return number.value
 
-    def close(self) -> None:
-        """End the service."""
-        self._stopping.set()
-        self.disconnect()
-        self._maker_thread.shutdown(cancel_futures=True)
-
     def __enter__(self) -> Self:
         self.connect()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._stopping.set()
+        self.disconnect()
+        self._maker_thread.shutdown(cancel_futures=True)
 
 
 def _functions() -> SimpleNamespace:
@@ -323,15 +322,3 @@ def _functions() -> SimpleNamespace:
         function.restype, function.argtypes = result, arguments
         setattr(functions, name, function)
     return functions
-
-
-def _refuse_second_camera() -> None:
-    """Check that the port is free, which Aravis does not report."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
-        try:
-            trial.bind((LOOPBACK, PORT))
-        except OSError as error:
-            raise HardwareError(
-                f"UDP port {PORT} of {LOOPBACK} cannot be used ({error.strerror}): another camera is served there; "
-                "end that program first"
-            ) from error

@@ -18,7 +18,7 @@ Left out: light that went by way of a mirror and was scattered or reflected by s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import drjit as dr
@@ -139,8 +139,12 @@ class Walker:
         towards_laser = [-light.at(vertex).direction for light in self.lights]
         found *= walks.strength
         strength = walks.strength * passed
-        promise = strength * self._promise(d, towards_laser, in_water) / _SURVIVES_FROM
-        survival = dr.minimum(promise, 1.0)
+        # It may find more light than one in any direction: scattered on, it may run towards the laser.
+        promise = mi.Float(1.0)
+        for towards in towards_laser if self._scatters else ():
+            ahead = 4 * math.pi * self.scattering.phase(_one_minus_cosine(towards, d))
+            promise = dr.maximum(promise, dr.select(in_water, ahead, 1.0))
+        survival = dr.minimum(strength * promise / _SURVIVES_FROM, 1.0)
         alive = (strength > 0) & (rng.next_float32() < survival)
         strength = dr.select(alive, strength / survival, 0.0)
 
@@ -154,11 +158,8 @@ class Walker:
             if self._scatters:
                 density *= 1 - _TOWARDS_LASER
                 for towards in towards_laser:
-                    density += (
-                        lobes
-                        * dr.select(in_water, 1, 1 - mirror)
-                        * self.scattering.phase(_one_minus_cosine(towards, onward))
-                    )
+                    share = lobes * dr.select(in_water, 1, 1 - mirror)
+                    density += share * self.scattering.phase(_one_minus_cosine(towards, onward))
             return value, density
 
         may_connect = alive if self.effects.secondary_light else alive & ~reflected
@@ -184,27 +185,16 @@ class Walker:
         strength *= gain
         alive &= (strength > 0) & dr.isfinite(strength)
         away = walks.away | ~specular
-        following = _Walks(
-            mi.Point3f(vertex + onward * dr.select(in_water, 0.0, _CLEAR_MM)),
-            onward,
-            strength,
-            walks.weight,
-            walks.cell,
-            walks.number,
-            dr.select(specular | ~away, 0.0, density),
-            away,
-            reflected,
+        following = replace(
+            walks,
+            origin=mi.Point3f(vertex + onward * dr.select(in_water, 0.0, _CLEAR_MM)),
+            direction=onward,
+            strength=strength,
+            density=dr.select(specular | ~away, 0.0, density),
+            away=away,
+            reflected=reflected,
         )
         return following, found, alive
-
-    def _promise(self, d: Vector3f, towards_laser: list[Vector3f], in_water: Bool) -> Float:
-        """How much more light a walk may find than one in any direction: scattered on, it may run towards the laser."""
-        promise = mi.Float(1.0)
-        if self._scatters:
-            for towards in towards_laser:
-                ahead = 4 * math.pi * self.scattering.phase(_one_minus_cosine(towards, d))
-                promise = dr.maximum(promise, dr.select(in_water, ahead, 1.0))
-        return promise
 
     def _scattered_by_sheet(
         self, light: Light, o: Point3f, d: Vector3f, length: Float, active: Bool, u: Float

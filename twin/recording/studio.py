@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.light.pose import Travel
-from twin.light.renderer import LaserFrame, Renderer
+from twin.light.renderer import Renderer
 from twin.options import Options
 from twin.recording.truth import FrameTruth, depth_map, no_stripe, true_stripe
 from twin.scene.description import Printed, Scene, Shot, altered
@@ -77,11 +77,8 @@ class Studio:
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
-        self._pattern = (
-            fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
-            if options.effects.fixed_pattern
-            else None
-        )
+        pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
+        self._pattern = pattern if options.effects.fixed_pattern else None
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
         shortest_s = max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
         motion = scene.motion
@@ -122,7 +119,19 @@ class Studio:
         if shot.light == "lamp":
             return self._electrons(self.renderer.irradiance("lamp", self.pose(shot), spp=spp, travel=travel))
         frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
-        return self._electrons(frame.irradiance(self._grain(frame, shot) if self.options.effects.speckle else 1.0))
+        if not self.options.effects.speckle:
+            return self._electrons(frame.irradiance())
+        laser = self.sensor.laser
+        contrast = coherence(
+            frame.roughness_um,
+            linewidth_nm=laser.linewidth_nm,
+            wavelength_nm=laser.wavelength_nm,
+            index=self.medium.refractive_index(laser.wavelength_nm),
+        )
+        factors = self._speckle.factors(
+            frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
+        )
+        return self._electrons(frame.irradiance(factors))
 
     def daylight_electrons_per_ms(self, shot: Shot) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) that are left when laser and lamp are off."""
@@ -133,19 +142,6 @@ class Studio:
     def _electrons(self, irradiance: np.ndarray) -> np.ndarray:
         sensor = self.sensor
         return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
-
-    def _grain(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
-        """Speckle factors (P,) of the stripe's pixels."""
-        laser = self.sensor.laser
-        contrast = coherence(
-            frame.roughness_um,
-            linewidth_nm=laser.linewidth_nm,
-            wavelength_nm=laser.wavelength_nm,
-            index=self.medium.refractive_index(laser.wavelength_nm),
-        )
-        return self._speckle.factors(
-            frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
-        )
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Image number ``index`` of the scan with what a capture records of it."""

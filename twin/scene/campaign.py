@@ -10,7 +10,7 @@ from pydantic import Field
 
 from twin.scene.description import Block, Motion, Printed, Scene, altered, load_scene
 from uwlts.model.errors import DescriptionError
-from uwlts.model.library import find, load_sensor, names, read_table, validated
+from uwlts.model.library import find, load_sensor, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor
 
 FOLDER = "campaigns"
@@ -94,11 +94,6 @@ def load_campaign(name_or_path: str | Path) -> Campaign:
     recordings = tuple(altered(each, scene=from_folder(each.scene)) for each in campaign.recordings)
     sensor, as_built = from_folder(campaign.sensor), from_folder(campaign.as_built)
     return altered(campaign, sensor=sensor, as_built=as_built, recordings=recordings)
-
-
-def campaign_names() -> list[str]:
-    """Names of the campaigns that ship with the package."""
-    return names(FOLDER)
 
 
 def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 from scipy.spatial.transform import Rotation
 
 from uwlts.model.errors import DescriptionError
-from uwlts.model.library import find, names, read_table, validated
+from uwlts.model.library import find, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Positive, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
@@ -447,11 +447,6 @@ class Scene(Description):
         """Transforms (4, 4) from each object's own frame to the scene's."""
         whole = self.placements[self.placement].matrix()
         return [whole @ thing.matrix() for thing in self.objects]
-
-
-def scene_names() -> list[str]:
-    """Names of the scenes that ship with the package."""
-    return names()
 
 
 def load_scene(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -187,8 +187,8 @@ class _Tile:
     def __init__(self, along_px: int, grain_px: float) -> None:
         least = math.ceil(_TILE_GRAINS * grain_px)
         apart = math.ceil(2 * grain_px)  # the ends of the stripe are neighbours in the tile
-        self.across_px = _fast_length(max(_TILE_PX, least))
-        self.along_px = _fast_length(max(along_px + apart, least))
+        self.across_px = cast(int, fft.next_fast_len(max(_TILE_PX, least)))
+        self.along_px = cast(int, fft.next_fast_len(max(along_px + apart, least)))
         # Sums of so many samples per pixel, corrected as in `_over_pixels`, meet `pixel_contrast` to 1 %.
         self._samples = math.ceil(1.2 / grain_px + 0.7)
         across, along = (_frequencies(length / grain_px) for length in (self.across_px, self.along_px))
@@ -206,11 +206,6 @@ class _Tile:
         field = np.asarray(fft.ifft(field, rows, axis=0, norm="forward", overwrite_x=True))
         fine = np.square(np.real(field)) + np.square(np.imag(field))
         return _over_pixels(np.ascontiguousarray(_over_pixels(fine, self._samples).T), self._samples)
-
-
-def _fast_length(least: int) -> int:
-    """The smallest length of at least so many samples whose Fourier transform is fast."""
-    return cast(Any, fft.next_fast_len(least))
 
 
 def _frequencies(grains: float) -> np.ndarray:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import scene_of
-from twin.scene.campaign import Campaign, Imperfections, Take, _Drawn, campaign_names, load_campaign, takes
+from twin.scene.campaign import Campaign, Imperfections, Take, _Drawn, load_campaign, takes
 from twin.scene.description import load_scene
 from uwlts.model.errors import DescriptionError
-from uwlts.model.library import load_sensor
+from uwlts.model.library import load_sensor, names
 
 SIZES = {
     "circle_centre_std_mm": 0.002,
@@ -350,8 +350,8 @@ PLANE = '[[recordings]]\nscene = "plane"\n'
 
 
 def test_shipped_campaigns_can_be_drawn():
-    assert "thesis" in campaign_names()
-    for name in campaign_names():
+    assert "thesis" in names("campaigns")
+    for name in names("campaigns"):
         shipped = load_campaign(name)
         assert len(takes(shipped, seed=0)) >= len(shipped.recordings)
 

@@ -8,14 +8,14 @@ from tests.virtual_sensors import altered, plate, scene_of
 from twin.light.renderer import Renderer
 from twin.options import Options
 from twin.recording.studio import check_scene, medium_of
-from twin.scene.description import Motion, Pose, Scene, load_scene, scene_names
+from twin.scene.description import Motion, Pose, Scene, load_scene
 from twin.scene.objects import Objects, build_objects
 from uwlts.model.errors import DescriptionError, RangeError
 from uwlts.model.library import library_folder, load_sensor, names
 from uwlts.model.sensor import Sensor
 
 SENSORS = names("sensors")
-PLACES = [(scene, place) for scene in scene_names() for place in load_scene(scene).placements]
+PLACES = [(scene, place) for scene in names() for place in load_scene(scene).placements]
 
 
 def built(scene: Scene) -> Objects:
@@ -24,7 +24,7 @@ def built(scene: Scene) -> Objects:
 
 def test_the_library_is_not_empty():
     assert {"thesis", "thesis-as-built"} <= set(SENSORS)
-    assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(scene_names())
+    assert {"plane", "spheres", "step", "pipe", "head", "weld", "target"} <= set(names())
     assert len(PLACES) > 15
 
 
