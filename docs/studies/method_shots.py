@@ -100,8 +100,7 @@ class Rendered:
 @cache
 def render(place: Place) -> Rendered:
     """The place's light: the stripe with many samples, the light around it with all effects of the place."""
-    from twin.recording.studio import Studio
-    from twin.recording.truth import true_stripe
+    from twin.recording.studio import Studio, true_stripe
 
     scene, sensor = place.scene(), place.sensor()
     still = place.effects.without("noise", "speckle")

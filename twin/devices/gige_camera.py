@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Literal, Self
 
@@ -104,12 +103,8 @@ _FUNCTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class _Shot:
-    """An image with the time in ns at which its exposure began."""
-
-    image: np.ndarray
-    time_ns: int
+_Shot = tuple[np.ndarray, int]
+"""An image with the time in ns at which its exposure began."""
 
 
 class GigeCamera:
@@ -247,7 +242,7 @@ class GigeCamera:
             region = x, y, width, height
         if not dropped:
             size = packet_bytes & 0xFFFF
-            packets = image_packets(shot.image, shot.time_ns, number=self._number, region=region, packet_bytes=size)
+            packets = image_packets(*shot, number=self._number, region=region, packet_bytes=size)
             if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]
@@ -297,7 +292,7 @@ class GigeCamera:
         image = self._frame(exposure_ms)
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
-        return _Shot(image, began_ns)
+        return image, began_ns
 
     def _read(self, register: int) -> int:
         number = c_uint32()

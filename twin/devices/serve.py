@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from twin.devices.gige_camera import GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
-from twin.scene.description import Motion, Shot, altered
+from twin.scene.description import Light, Motion, Shot, altered
 from uwlts.model.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:  # it needs Mitsuba
 
 _STEPS_PER_MM, _TRAVEL = 100, 130
 _WATCH_S = 0.2
-
-
 _FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
 
 
@@ -142,7 +140,7 @@ class Track:
         """Stage position of the scene's position 0."""
         return self.start_mm - self.motion.start_mm
 
-    def shot(self, position_mm: float, light: Literal["lamp", "laser"]) -> Shot:
+    def shot(self, position_mm: float, light: Light) -> Shot:
         """The shot at a position of the stage; errors of the stage between the scan's positions are interpolated."""
         scene_mm, motion = position_mm - self.offset_mm, self.motion
         error_mm = 0.0
@@ -216,20 +214,13 @@ class Bench:
         day = self._light("day", state)
         return day + np.float32(state.power) * np.maximum(laser - day, 0)
 
-    def _light(self, light: Literal["lamp", "laser", "day"], state: StageState) -> np.ndarray:
+    def _light(self, light: Light, state: StageState) -> np.ndarray:
         if light not in self._seen:
-            shot, options = (
-                self._track.shot(state.position_mm, "laser" if light == "laser" else "lamp"),
-                self._studio.options,
-            )
+            shot, options = self._track.shot(state.position_mm, light), self._studio.options
             # Whole um, which are all different places; seeds must not be negative.
             place = round(1e3 * shot.travelled_mm) % 2**32
             seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
-            self._seen[light] = (
-                self._studio.daylight_electrons_per_ms(shot)
-                if light == "day"
-                else self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
-            )
+            self._seen[light] = self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
         return self._seen[light]
 
 

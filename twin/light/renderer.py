@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import drjit as dr
@@ -28,6 +28,7 @@ from twin.light.sheet import Sheet
 from twin.light.walk import Walker
 from twin.light.water import Scattering, single_scattering
 from twin.options import ALL, Effects
+from twin.scene.description import Light as LightName
 from twin.scene.description import Scene
 from twin.scene.objects import build_objects
 from uwlts.model.placement import camera_from_object, check_design
@@ -95,26 +96,17 @@ class Renderer:
         self._reach_mm = 4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3]))
 
     def irradiance(
-        self,
-        light: Literal["lamp", "laser"],
-        scene_from_object: np.ndarray,
-        *,
-        spp: int,
-        seed: int = 0,
-        travel: Travel | None = None,
+        self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> np.ndarray:
         """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
 
+        With "day" laser and lamp are off.
         ``spp`` samples are taken per lit pixel, the same places in every pixel; ``seed`` chooses the random walks.
         Equal arguments give equal images.
         """
         if light == "laser":
             return self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
-        return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp)
-
-    def daylight(self, scene_from_object: np.ndarray, *, spp: int) -> np.ndarray:
-        """What falls on the image sensor with laser and lamp off, (H, W) in W/mm2, as `irradiance`."""
-        return self._lamp_frame(SensorPose(scene_from_object), spp=spp, ambient=True)
+        return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
 
     def laser_frame(
         self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None

@@ -1,20 +1,23 @@
-"""A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
+"""A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth.
+
+The truth of a frame is the true stripe centres of all profile lines, the points of the surface there, and depths.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.light.pose import Travel
+from twin.backend.arrays import Float, to_jit, to_numpy
+from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import Renderer
 from twin.options import Options
-from twin.recording.truth import FrameTruth, depth_map, no_stripe, true_stripe
-from twin.scene.description import Printed, Scene, Shot, altered
-from twin.scene.pattern import shift_points
+from twin.scene.description import Light, Printed, Scene, Shot, altered
+from twin.scene.finish import shift_points
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
@@ -22,13 +25,19 @@ from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
-from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
+from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 
 Progress = Callable[[int, int], None]
 PROBE_SPP = 16
 """Samples per lit pixel of the images from which the exposure follows."""
 BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
+
+
+_FALSE_POSITIONS = 5
+"""Within one pixel the distance bends by about 1e-2 of its change: each step gains two digits."""
+_TOLERANCE_MM = 5e-4
+"""A root is where the surface truly passes the sheet's middle; across a depth edge the distance jumps instead."""
 
 
 def medium_of(sensor: Sensor, scene: Scene) -> Medium:
@@ -77,8 +86,9 @@ class Studio:
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
-        pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
-        self._pattern = pattern if options.effects.fixed_pattern else None
+        self._pattern = None
+        if options.effects.fixed_pattern:
+            self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
         shortest_s = max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
         motion = scene.motion
@@ -100,7 +110,7 @@ class Studio:
         transform[:3, 3] = shot.travelled_mm * self.scene.motion.unit_direction()
         return transform
 
-    def travel(self, light: Literal["lamp", "laser"]) -> Travel | None:
+    def travel(self, light: Light) -> Travel | None:
         """How the sensor travels during an exposure; None where it stands still."""
         motion, detector = self.scene.motion, self.sensor.detector
         if motion.speed_mm_per_s == 0 or not self.options.effects.motion:
@@ -116,8 +126,10 @@ class Studio:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) of a shot."""
-        if shot.light == "lamp":
-            return self._electrons(self.renderer.irradiance("lamp", self.pose(shot), spp=spp, travel=travel))
+        if shot.light == "day" and not (self.options.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
+            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        if shot.light != "laser":
+            return self._electrons(self.renderer.irradiance(shot.light, self.pose(shot), spp=spp, travel=travel))
         frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
         if not self.options.effects.speckle:
             return self._electrons(frame.irradiance())
@@ -132,12 +144,6 @@ class Studio:
             frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
         )
         return self._electrons(frame.irradiance(factors))
-
-    def daylight_electrons_per_ms(self, shot: Shot) -> np.ndarray:
-        """Mean photo-electrons per ms (H, W) that are left when laser and lamp are off."""
-        if not (self.options.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
-            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return self._electrons(self.renderer.daylight(self.pose(shot), spp=self.options.spp))
 
     def _electrons(self, irradiance: np.ndarray) -> np.ndarray:
         sensor = self.sensor
@@ -168,9 +174,9 @@ class Studio:
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
         return grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
 
-    def truth(self, shot: Shot) -> FrameTruth:
+    def truth(self, shot: Shot) -> "FrameTruth":
         """What every profile line of a shot truly shows."""
-        if shot.light == "lamp":
+        if shot.light != "laser":
             return no_stripe(self.sensor.camera.lines())
         return true_stripe(self.renderer, self.pose(shot), travel=self.travel("laser"))
 
@@ -191,7 +197,7 @@ class Studio:
         in_medium = outside / self.medium.refractive_index(wavelength)
         return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
-    def _exposure(self, light: Literal["lamp", "laser"]) -> float:
+    def _exposure(self, light: Light) -> float:
         """Exposure in ms as described, or so that the first, middle or last shot just reaches the wanted level."""
         wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
         if wanted != "auto":
@@ -206,6 +212,101 @@ class Studio:
         longest = self.sensor.exposure.longest_ms
         level = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
         return min(longest, level / brightest) if brightest > 0 else longest
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """Truth of one frame, as in `uwlts.storage.truth.Truth` without the frames' axis."""
+
+    centre_px: np.ndarray
+    point_mm: np.ndarray
+    normal: np.ndarray
+    status: np.ndarray
+    crossings: np.ndarray
+
+
+def no_stripe(lines: int) -> FrameTruth:
+    """Truth of a frame without laser light."""
+    nothing = np.full(lines, np.nan)
+    empty = np.zeros(lines, np.uint8)
+    return FrameTruth(
+        nothing, np.full((lines, 3), np.nan), np.full((lines, 3), np.nan), empty + TruthStatus.NO_STRIPE, empty
+    )
+
+
+def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
+    """True stripe of a frame, by false position on Mitsuba's own hit points along every profile line.
+
+    It is what chief rays see in the middle of the exposure.
+    """
+    camera = renderer.sensor.camera
+    pose = SensorPose(scene_from_object, travel)
+    along_width = camera.stripe_along == "width"
+    rows, columns = renderer.lit_pixels(pose)
+    line, cell = (columns, rows) if along_width else (rows, columns)
+    truth = no_stripe(camera.lines())
+    if len(line) == 0:
+        return truth
+
+    def position(across: Float, at: Float) -> tuple[Float, Float]:
+        return (at, across) if along_width else (across, at)
+
+    def travelled(across: Float, at: Float) -> Float | None:
+        return None if travel is None else travel.at(position(across, at)[1], 0.5)
+
+    def distance(across: Float, at: Float) -> Float:
+        bundle = renderer.view.bundle(*position(across, at))
+        ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
+        hit = renderer.objects.scene.ray_intersect_preliminary(ray)
+        light = renderer.sheet.at(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
+        return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
+
+    at, middle = to_jit(mi.Float, line), to_jit(mi.Float, cell)
+    below, above = distance(middle - 0.5, at), distance(middle + 0.5, at)
+    dr.eval(below, above)
+    below, above = below.numpy(), above.numpy()
+    bracketed = (below <= 0) != (above <= 0)
+    bracketed &= np.isfinite(below) & np.isfinite(above)
+    line, cell, below, above = line[bracketed], cell[bracketed], below[bracketed], above[bracketed]
+    if len(line) == 0:
+        return truth
+    at, low, high = to_jit(mi.Float, line), to_jit(mi.Float, cell - 0.5), to_jit(mi.Float, cell + 0.5)
+    below, above = to_jit(mi.Float, below), to_jit(mi.Float, above)
+    for _ in range(_FALSE_POSITIONS):
+        centre = low + (high - low) * below / (below - above)
+        found = distance(centre, at)
+        same_side = (found <= 0) == (below <= 0)
+        low, below = dr.select(same_side, centre, low), dr.select(same_side, found, below)
+        high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
+        dr.eval(low, high, below, above)  # one small kernel five times instead of a large one
+    centre = low + (high - low) * below / (below - above)
+    dr.eval(centre)
+    bundle = renderer.view.bundle(*position(centre, at))
+    brightness = renderer.laser(pose, bundle, travelled(centre, at))
+    si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction, travelled(centre, at)))
+    offset = distance(centre, at)
+    dr.eval(centre, brightness, si.p, si.n, offset)
+    brightness = brightness.numpy()
+    good = (np.abs(offset.numpy()) < _TOLERANCE_MM) & (brightness > 0)
+    dimmest_first = np.flatnonzero(good)[np.argsort(brightness[good], kind="stable")]
+    chosen = line[dimmest_first]
+    np.add.at(truth.crossings, chosen, 1)
+    truth.centre_px[chosen] = centre.numpy()[dimmest_first]
+    truth.point_mm[chosen] = to_numpy(si.p)[dimmest_first]
+    truth.normal[chosen] = to_numpy(si.n)[dimmest_first]
+    truth.status[chosen] = TruthStatus.VISIBLE
+    return truth
+
+
+def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
+    """Camera-frame z in mm (H, W), float32, of the surface that every pixel's centre sees; NaN where there is none."""
+    camera = renderer.sensor.camera
+    x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
+    bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
+    ray = SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
+    hit = renderer.objects.scene.ray_intersect_preliminary(ray)
+    depth = renderer.view.depth_mm(mi.Point3f(bundle.origin + bundle.direction * hit.t))
+    return dr.select(hit.is_valid() & (bundle.weight > 0), depth, dr.nan).numpy().reshape(x.shape)
 
 
 def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], *, first: Shot) -> Truth:

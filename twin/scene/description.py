@@ -21,6 +21,7 @@ from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
 Reflectance = Annotated[float, Field(ge=0, le=1)]
+Light = Literal["lamp", "laser", "day"]
 Finish = Literal["diffuse", "painted", "pvc", "metal"]
 
 TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
@@ -394,11 +395,11 @@ class Motion(Description):
 
 @dataclass(frozen=True)
 class Shot:
-    """One image to take: recorded and true position of the stage in mm, and the light that is on."""
+    """One image to take: recorded and true position of the stage in mm, and the light that is on beside the day's."""
 
     stage_mm: float
     travelled_mm: float
-    light: Literal["lamp", "laser"]
+    light: Light
 
 
 class Scene(Description):

@@ -1,20 +1,31 @@
-"""Finishes of surfaces under water as Mitsuba's BSDFs of all but the mirror image."""
+"""Finishes of surfaces under water as Mitsuba's BSDFs of all but the mirror image.
+
+Patterns of calibration targets are textures that are evaluated exactly: a bitmap's texels would blur the edges.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from pydantic import TypeAdapter
 
-from twin.backend.arrays import Float
-from twin.scene.description import Flat, Placed, Printed
-from twin.scene.pattern import pattern_texture
+from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
+from twin.scene.description import AnyObject, Flat, Placed, Printed
 from uwlts.model.errors import DescriptionError
 from uwlts.model.media import check_range
 
+_SHIFT = "point_shift_mm"
+_CELLS_PER_PATCH = 4
+"""Cells of the grid that lists the patches near a place: so many that most cells list at most three patches."""
+_PATCH_VALUES = 6
+"""Columns of the table of patches."""
+_ROUNDING_MM = 1e-3
+"""Places on a plate of 1 m are rounded by less than this in 32 bits."""
 COAT_INDEX = {"painted": 1.50, "pvc": 1.54}
 """Relative to air: an alkyd or acrylic binder, and rigid PVC."""
 
@@ -147,3 +158,133 @@ def square_on(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     straight = mi.SurfaceInteraction3f(si)
     straight.wi = mi.Vector3f(0.0, 0.0, 1.0)
     return straight
+
+
+def pattern_texture(plate: Printed) -> mi.Texture:
+    """Reflectance of a printed plate, for a variant with `register_pattern`."""
+    return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json()})
+
+
+def register_pattern() -> None:
+    """Make the texture ``target_pattern`` known to the selected Mitsuba variant."""
+
+    class TargetPattern(mi.Texture):
+        """Reflectance of a printed plate whose uv run from 0 to 1 over its bounds.
+
+        At each place the print is shifted by the error of the nearest point of the target. Points are taken to lie on
+        a lattice along x and y.
+        """
+
+        def __init__(self, props: mi.Properties):
+            mi.Texture.__init__(self, props)
+            self.plate = cast(Printed, TypeAdapter(AnyObject).validate_json(str(props["plate"])))
+            target, (first, last) = self.plate.described_target(), self.plate.bounds_mm()
+            self.middle, self.size, self.first = ((first + last) / 2).tolist(), (last - first).tolist(), first.tolist()
+            self.points_end = target.indices.max(axis=0).tolist()
+            corner, beside = target.points_at(np.array([(0, 0), (1, 1)]))[:, :2]
+            self.corner_point, self.spacing = corner.tolist(), (beside - corner).tolist()
+            self.shift_mm = to_jit(mi.Float, printed_shifts(self.plate).ravel())
+            patches = _patch_table(self.plate)
+            lists, self.cell_mm = _patches_by_cell(patches, first, last)
+            self.rows, self.columns, self.depth = lists.shape
+            self.lists, self.patches = to_jit(mi.UInt32, lists.ravel()), to_jit(mi.Float, patches.ravel())
+
+        def traverse(self, cb: mi.TraversalCallback) -> None:
+            cb.put(_SHIFT, self.shift_mm, mi.ParamFlags.NonDifferentiable)
+
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            pass
+
+        def eval(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            return self.eval_1(si, active)
+
+        def eval_1(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
+            x = self.middle[0] + (si.uv.x - 0.5) * self.size[0]
+            y = self.middle[1] + (0.5 - si.uv.y) * self.size[1]
+            i, j = (
+                dr.clip(dr.round((place - first) / step), 0, end)
+                for place, first, step, end in zip(
+                    (x, y), self.corner_point, self.spacing, self.points_end, strict=True
+                )
+            )
+            point = 2 * mi.UInt32(j * (self.points_end[0] + 1) + i)
+            shift_x, shift_y = (dr.gather(mi.Float, self.shift_mm, point + k, active) for k in (0, 1))
+            column = dr.clip(dr.floor((x - shift_x - self.first[0]) / self.cell_mm), 0, self.columns - 1)
+            row = dr.clip(dr.floor((y - shift_y - self.first[1]) / self.cell_mm), 0, self.rows - 1)
+            start = mi.UInt32((row * self.columns + column) * self.depth)
+            value = mi.Float(self.plate.reflectance)
+            for k in range(self.depth):
+                entry = dr.gather(mi.UInt32, self.lists, start + k, active) * _PATCH_VALUES
+                middle_x, middle_y, half_width, aspect, is_round, reflectance = (
+                    dr.gather(mi.Float, self.patches, entry + i, active) for i in range(_PATCH_VALUES)
+                )
+                u, v = x - middle_x - shift_x, aspect * (y - middle_y - shift_y)
+                in_box = (dr.abs(u) <= half_width) & (dr.abs(v) <= half_width)
+                inside = dr.select(is_round > 0, dr.norm(mi.Vector2f(u, v)) < half_width, in_box)
+                value = dr.select(inside, reflectance, value)
+            return value
+
+        def mean(self) -> Float:
+            return mi.Float(self.plate.reflectance)
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return f"TargetPattern[{type(self.plate.described_target()).__name__}]"
+
+    mi.register_texture("target_pattern", TargetPattern)
+
+
+def _patch_table(plate: Printed) -> np.ndarray:
+    """Middle, half width, width over height, roundness and reflectance (N + 1, 6) of patches; the last is never hit."""
+    ink, gap = plate.ink_and_gap_reflectance()
+    patches = plate.described_target().patches()
+    low, high = (
+        np.array([(getattr(p, f"x_{end}_mm"), getattr(p, f"y_{end}_mm")) for p in patches]) for end in ("min", "max")
+    )
+    width, height = (high - low).T
+    kinds = [(p.round, ink if p.ink else gap) for p in patches]
+    table = np.column_stack([(low + high) / 2, width / 2, width / height, kinds])
+    return np.concatenate([table, [(0.0, 0.0, -1.0, 1.0, 0.0, 0.0)]])
+
+
+def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, float]:
+    """Numbers (rows, columns, depth) of the patches that reach into each cell of a grid, and the cells' side in mm.
+
+    They are in the order of printing; lists are filled up with the patch that is never hit.
+    """
+    middle, half = patches[:-1, :2], patches[:-1, 2:3] / np.column_stack([np.ones(len(patches) - 1), patches[:-1, 3]])
+    cell_mm = float(np.sqrt(np.prod(last - first) / (_CELLS_PER_PATCH * len(middle))))
+    columns, rows = np.ceil((last - first) / cell_mm).astype(int).tolist()
+    start = np.floor((middle - half - first - _ROUNDING_MM) / cell_mm).astype(int).clip(min=0)
+    stop = np.floor((middle + half - first + _ROUNDING_MM) / cell_mm).astype(int) + 1
+    found: list[list[int]] = [[] for _ in range(rows * columns)]
+    for number, ((i, j), (k, m)) in enumerate(zip(start, stop, strict=True)):
+        for row in range(j, min(m, rows)):
+            for column in range(i, min(k, columns)):
+                found[row * columns + column].append(number)
+    lists = np.full((rows * columns, max(map(len, found))), len(middle))
+    for cell, numbers in zip(lists, found, strict=True):
+        cell[: len(numbers)] = numbers
+    return lists.reshape(rows, columns, -1), cell_mm
+
+
+def printed_shifts(plate: Printed) -> np.ndarray:
+    """Offsets (rows, columns, 2) in mm of a target's points from where they are described, along x and y."""
+    return plate.centre_std_mm * _standard_normal(plate, 0)
+
+
+def shift_points(scene: mi.Scene, plate: Printed, *, mm_per_px: float, image: int) -> None:
+    """Move the points of a scene's only target to where they lie in one image, detection errors included."""
+    noise = mm_per_px * plate.detection_std_px * _standard_normal(plate, 1, image)
+    parameters = mi.traverse(scene)
+    (key,) = (key for key in dict(parameters) if key.endswith(_SHIFT))
+    parameters[key] = to_jit(mi.Float, (printed_shifts(plate) + noise).ravel())
+    parameters.update()
+
+
+def _standard_normal(plate: Printed, *stream: int) -> np.ndarray:
+    """Random numbers (rows, columns, 2) for the errors of a target's points."""
+    columns, rows = plate.described_target().indices.max(axis=0) + 1
+    return np.random.default_rng([plate.errors_seed, *stream]).standard_normal((rows, columns, 2))

@@ -27,8 +27,7 @@ from twin.scene.description import (
     TargetPlate,
     Weld,
 )
-from twin.scene.finish import albedo_parts, finish_bsdf, square_on
-from twin.scene.pattern import register_pattern
+from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
 from twin.scene.shapes import bowed_plate, head_surface, weld_surface
 from uwlts.model.errors import DescriptionError
 

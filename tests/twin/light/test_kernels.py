@@ -7,7 +7,7 @@ import pytest
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
-from twin.recording.truth import true_stripe
+from twin.recording.studio import true_stripe
 from twin.scene.description import load_scene
 
 

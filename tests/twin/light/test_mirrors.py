@@ -9,7 +9,7 @@ import pytest
 from tests.virtual_sensors import block, clear, image_of, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.truth import true_stripe
+from twin.recording.studio import true_stripe
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus

@@ -9,8 +9,7 @@ from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sens
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.options import NONE, Options
-from twin.recording.studio import Studio
-from twin.recording.truth import true_stripe
+from twin.recording.studio import Studio, true_stripe
 from uwlts.model.errors import DesignError
 
 ALONG_X = np.array([1.0, 0.0, 0.0])

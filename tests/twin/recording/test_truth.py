@@ -21,7 +21,7 @@ from tests.virtual_sensors import (
 )
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.truth import FrameTruth, depth_map, true_stripe
+from twin.recording.studio import FrameTruth, depth_map, true_stripe
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.storage.truth import TruthStatus
 

@@ -15,7 +15,7 @@ from twin.light.renderer import Renderer
 from twin.options import NONE
 from twin.recording.studio import with_window
 from twin.scene.description import TargetPlate
-from twin.scene.pattern import pattern_texture, printed_shifts, register_pattern
+from twin.scene.finish import pattern_texture, printed_shifts, register_pattern
 from uwlts.model.sensor import Sensor
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
 
