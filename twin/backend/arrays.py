@@ -43,6 +43,11 @@ def to_numpy(vector: Point3f) -> np.ndarray:
     return np.stack([component.numpy() for component in vector], axis=1)
 
 
+def scalar_transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
+    """A transform (4, 4) of a shape, fixed in the scene."""
+    return mi.ScalarTransform4f(matrix)
+
+
 def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:
     """A transform (4, 4) whose numbers are not compiled into kernels."""
     opaque = mi.Matrix4f(matrix)

@@ -11,7 +11,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point2f, Point3f, SurfaceInteraction3f, Vector3f, to_jit, to_numpy
+from twin.backend.arrays import (
+    Bool,
+    Float,
+    Point2f,
+    Point3f,
+    SurfaceInteraction3f,
+    Vector3f,
+    scalar_transform,
+    to_jit,
+    to_numpy,
+)
 from twin.light.pose import Rays, SensorPose
 from twin.scene.objects import Objects
 from uwlts.model.errors import DesignError
@@ -128,7 +138,7 @@ class WindowFaces:
             )
             to_world[:3, 3] = centre
             bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
-            self._faces.append(mi.load_dict({"type": "disk", "to_world": mi.ScalarTransform4f(to_world), "bsdf": bsdf}))
+            self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
 
     def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
         """Send rays from the module's side through both faces; the weight of those that do not pass is 0.

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, UInt32, to_jit
+from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import (
     AnyObject,
     Block,
@@ -179,7 +179,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             matrix, kind = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1), "rectangle"
         case _:
             assert_never(thing)
-    return mi.load_dict({"type": kind, "to_world": mi.ScalarTransform4f(matrix), "bsdf": bsdf})
+    return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
 
 
 def _mesh(thing: Mesh | Head | Weld | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
@@ -227,7 +227,8 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     except (ValueError, NotImplementedError, OSError) as error:
         raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
     assert isinstance(loaded, trimesh.Scene)  # as it was forced to be
-    vertices, faces, uv, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [np.zeros((0, 2))], 0
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
+    uv: list[np.ndarray | None] = [np.zeros((0, 2))]
     for node in loaded.graph.nodes_geometry:
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
@@ -266,5 +267,6 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
             assert_never(thing)
 
 
-def _scaled(x: float, y: float, z: float) -> np.ndarray:
-    return np.diag([x, y, z, 1.0])
+def _scaled(*factors: float) -> np.ndarray:
+    """The transform (4, 4) that scales by factors along x, y and z."""
+    return np.diag([*factors, 1.0])
