@@ -48,7 +48,10 @@ def obtain(
         if os.environ.get(choice):
             raise
         nothing_found = error
-    target = _writable_folder(folders)
+    standing = {folder: next(parent for parent in (folder, *folder.parents) if parent.exists()) for folder in folders}
+    target = next((folder for folder, existing in standing.items() if os.access(existing, os.W_OK)), None)
+    if target is None:
+        raise SetupError(f"no folder to unpack libraries into: none of {list(map(str, folders))} can be written to")
     refusals = []
     for way in (partial(_install_packages, choose), partial(_unpack_packages, choose), partial(_unpack_wheel, wheel)):
         try:
@@ -135,15 +138,6 @@ def _copy_libraries(unpacked: Path, target: Path) -> None:
                 part.replace(target / library.name)
     except OSError as error:
         raise SetupError(f"cannot write to {target}: {error}") from error
-
-
-def _writable_folder(folders: Sequence[Path]) -> Path:
-    """The first of some folders, there or not, that the user can write to; SetupError if there is none."""
-    for folder in folders:
-        existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
-        if os.access(existing, os.W_OK):
-            return folder
-    raise SetupError(f"no folder to unpack libraries into: none of {[str(each) for each in folders]} can be written to")
 
 
 def run_command(

@@ -18,6 +18,7 @@ import time
 import tty
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from twin.devices.grbl_firmware import GrblFirmware
 
@@ -47,9 +48,9 @@ class GrblController:
     """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
 
     ``settings`` by number replace `BENCH_SETTINGS`. The stage stands at ``position_mm`` when the power comes on, and
-    time runs ``speed_up`` times as fast. ``options`` are the code letters of the build in ``$I``; ``boot_s`` is the
-    controller's own time from a restart to the greeting, that of the Uno's boot loader. ``resets_when_opened``: as the
-    Uno does through DTR. ``gated``: the laser's supply is cut while the port is closed.
+    time runs ``speed_up`` times as fast. ``build`` is what `GrblFirmware` takes of its version, options and time to
+    boot. ``resets_when_opened``: as the Uno does through DTR. ``gated``: the laser's supply is cut while the port is
+    closed.
     """
 
     def __init__(
@@ -58,25 +59,16 @@ class GrblController:
         settings: Mapping[int, float] | None = None,
         position_mm: float = 100.0,
         speed_up: float = 1.0,
-        version: str = "1.1h",
-        options: str = "V",
-        boot_s: float = 1.6,
         resets_when_opened: bool = True,
         gated: bool = False,
+        **build: Any,
     ):
         self._speed_up, self._origin = speed_up, time.monotonic()
         self._lock, self._ending = threading.RLock(), threading.Event()
         self._resets_when_opened, self._gated, self._port_open = resets_when_opened, gated, False
         self._powered, self._muted, self._laser_broken = True, False, False
-        self._firmware = GrblFirmware(
-            {**BENCH_SETTINGS, **(settings or {})},
-            position_mm=position_mm,
-            version=version,
-            options=options,
-            boot_s=boot_s,
-            clock=self._now,
-            say=self._say,
-        )
+        all_settings = {**BENCH_SETTINGS, **(settings or {})}
+        self._firmware = GrblFirmware(all_settings, position_mm=position_mm, clock=self._now, say=self._say, **build)
 
     def __enter__(self) -> "GrblController":
         self._master, slave = os.openpty()

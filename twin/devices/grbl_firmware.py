@@ -98,7 +98,8 @@ class GrblFirmware:
     """One controller. Not safe between threads.
 
     All ``settings`` are given by number. The stage stands at ``position_mm`` when the power comes on. ``options`` are
-    the code letters of the build, ``boot_s`` is the time from a restart to the greeting. ``clock`` returns the
+    the code letters of the build in ``$I``, ``boot_s`` is the time from a restart to the greeting, that of the Uno's
+    boot loader. ``clock`` returns the
     controller's time in s, ``say`` takes the bytes for the computer.
     """
 
@@ -107,11 +108,11 @@ class GrblFirmware:
         settings: Mapping[int, float],
         *,
         position_mm: float,
-        version: str,
-        options: str,
-        boot_s: float,
         clock: Callable[[], float],
         say: Callable[[bytes], None],
+        version: str = "1.1h",
+        options: str = "V",
+        boot_s: float = 1.6,
     ):
         self._settings, self._version, self._options, self._boot_s = dict(settings), version, options, boot_s
         self._now, self._say = clock, say

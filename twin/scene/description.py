@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
@@ -74,8 +74,13 @@ class Placed(Pose):
     roughness_um: NotNegative | None = None
     texture: str | None = None
 
+    _no_texture: ClassVar[str] = ""
+    """Reason for which objects of a class have no texture."""
+
     @model_validator(mode="after")
-    def _alpha_has_a_gloss(self) -> "Placed":
+    def _has_what_its_finish_and_shape_take(self) -> Self:
+        if self.texture is not None and self._no_texture:
+            raise ValueError(f"texture {self.texture} {self._no_texture}")
         if self.finish == "diffuse" and self.alpha is not None:
             raise ValueError(f"alpha {self.alpha:g} roughens a gloss, but finish 'diffuse' has none: leave alpha out")
         return self
@@ -90,7 +95,7 @@ class Placed(Pose):
 
     def mirror_share(self) -> float:
         """Share of light that is reflected as by a plane mirror."""
-        return 0.0
+        return getattr(self, "mirror", 0.0)
 
     def polarisation(self) -> float:
         """Degree of polarisation of scattered laser light: 1 from a metal or mirror, 0 out of a diffuse body."""
@@ -114,10 +119,6 @@ class Flat(Placed):
         if self.mirror > 0 and self.finish in ("painted", "pvc"):
             raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
         return self
-
-    def mirror_share(self) -> float:
-        """Share of light that is reflected as by a plane mirror."""
-        return self.mirror
 
 
 class Sphere(Placed):
@@ -161,11 +162,7 @@ class Mesh(Placed):
 class FreeForm(Placed):
     """Base of free-form surfaces of a shape of their own. They have no uv coordinates for a texture."""
 
-    @model_validator(mode="after")
-    def _has_no_texture(self) -> "FreeForm":
-        if self.texture is not None:
-            raise ValueError(f"texture {self.texture} on a surface without uv coordinates: leave it out, or use a mesh")
-        return self
+    _no_texture: ClassVar[str] = "on a surface without uv coordinates: leave it out, or use a mesh"
 
 
 class Head(FreeForm):
@@ -240,11 +237,7 @@ class Printed(Placed, ABC):
     detection_std_px: NotNegative = 0.0
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
-    @model_validator(mode="after")
-    def _has_one_pattern(self) -> Self:
-        if self.texture is not None:
-            raise ValueError(f"texture {self.texture} on a plate with a printed pattern: use it on a 'plate'")
-        return self
+    _no_texture: ClassVar[str] = "on a plate with a printed pattern: put it on an object of kind 'plate'"
 
     @abstractmethod
     def described_target(self) -> Target:

@@ -64,7 +64,19 @@ def grey_values(
     own, so that the image does not depend on how many of them are made at a time. ImageError where ``electrons`` is not
     a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
     """
-    electrons = _checked(electrons, pattern)
+    electrons = np.asarray(electrons, np.float32)
+    if electrons.ndim != 2 or electrons.size == 0:
+        raise ImageError(f"mean electrons have the shape {electrons.shape}; expected an image (H, W)")
+    least, most = electrons.min(), electrons.max()
+    if not (least >= 0 and most <= MOST_ELECTRONS):
+        raise ImageError(
+            f"mean electrons run from {least:g} to {most:g}; expected finite numbers from 0 to {MOST_ELECTRONS:g}"
+        )
+    if pattern is not None and pattern.gain.shape != electrons.shape:
+        raise ImageError(
+            f"the fixed pattern is of {pattern.gain.shape} pixels, the image of {electrons.shape}: make the pattern "
+            "with the image's height and width"
+        )
     count = min(_BANDS, len(electrons))
     detectors, exposures = [detector] * count, [exposure_ms] * count
     patterns = [None] * count if pattern is None else pattern.bands(count)
@@ -79,23 +91,6 @@ def grey_values(
             bloomed = spilled(np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming)
             charges = np.array_split(bloomed, count)
         return np.concatenate(list(pool.map(_digitised, charges, detectors, patterns, rngs)))
-
-
-def _checked(electrons: np.ndarray, pattern: FixedPattern | None) -> np.ndarray:
-    electrons = np.asarray(electrons, np.float32)
-    if electrons.ndim != 2 or electrons.size == 0:
-        raise ImageError(f"mean electrons have the shape {electrons.shape}; expected an image (H, W)")
-    least, most = electrons.min(), electrons.max()
-    if not (least >= 0 and most <= MOST_ELECTRONS):
-        raise ImageError(
-            f"mean electrons run from {least:g} to {most:g}; expected finite numbers from 0 to {MOST_ELECTRONS:g}"
-        )
-    if pattern is not None and pattern.gain.shape != electrons.shape:
-        raise ImageError(
-            f"the fixed pattern is of {pattern.gain.shape} pixels, the image of {electrons.shape}: make the pattern "
-            "with the image's height and width"
-        )
-    return electrons
 
 
 def _collected(
