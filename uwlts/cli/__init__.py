@@ -3,11 +3,11 @@
 import sys
 
 # Importing them adds their commands.
-from uwlts.cli import calibration, files, measuring, quality, recording
+from uwlts.cli import calibration, measuring, recording
 from uwlts.cli.options import app
 from uwlts.runtime.console import run
 
-__all__ = ["app", "calibration", "files", "main", "measuring", "quality", "recording"]
+__all__ = ["app", "calibration", "main", "measuring", "recording"]
 
 
 def main() -> None:

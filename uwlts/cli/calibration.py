@@ -1,10 +1,27 @@
-"""Commands that calibrate."""
+"""Commands that calibrate, and about the quality of a calibration: model comparison, certificate and verification."""
 
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 import uwlts
-from uwlts.cli.options import Coefficients, Files, Flag, Method, any_stage, app, say, show, stripe_options, warn
+from uwlts.cli.options import (
+    CalibrationOut,
+    Coefficients,
+    Files,
+    Flag,
+    Index,
+    Method,
+    Overwrite,
+    Workers,
+    any_stage,
+    app,
+    say,
+    show,
+    stripe_options,
+    warn,
+)
 from uwlts.model.errors import DescriptionError
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable
@@ -21,12 +38,12 @@ def calibrate(
     unknown_sizes: Flag = False,
     joint: Flag = False,
     live: Path | None = None,
-    out: Path,
+    out: CalibrationOut,
     refractions: Literal[1, 2] = 2,
     poses: Literal["stage-normal", "stage", "free"] = "stage-normal",
     distortion: Coefficients = ("k1", "k2"),
-    index: float | None = None,
-    method: Method | None = None,
+    index: Index = None,
+    method: Method = None,
     camera: str | None = None,
     stage: str | None = None,
     port: int = 8080,
@@ -63,8 +80,6 @@ def calibrate(
     live
         Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, in place of captures:
         leads through the images, rejects bad ones with the reason, and records the good ones beside the calibration.
-    out
-        Calibration file to write.
     refractions
         2: window of known thickness, air images taken without it. 1: one interface, air images taken through the
         window. The joint calibration takes this from the captures.
@@ -73,10 +88,6 @@ def calibrate(
         free direction, as always in the joint calibration. free: every image has a pose of its own.
     distortion
         Distortion coefficients to estimate; the others stay 0.
-    index
-        Refractive index of the medium, in place of the one that follows from the captures.
-    method
-        How the stripe's centre is found.
     camera
         Guided: address of the camera, in place of the plan's.
     stage
@@ -128,11 +139,14 @@ def calibrate(
             stripe=stripe_options(method),
             progress=any_stage(progress),
         )
+    advice = [] if calibration.joint is None else advice_lines(calibration)
     uwlts.write_calibration(out, calibration, overwrite=overwrite)
-    show(calibration_lines(calibration))
-    if calibration.joint is not None:
-        show(advice_lines(calibration))
-    warn(*calibration.origin().warnings)
+    _finish(out, [*calibration_lines(calibration), *advice], calibration.origin().warnings)
+
+
+def _finish(out: Path, lines: Iterable[str], warnings: Iterable[str]) -> None:
+    show(lines)
+    warn(*warnings)
     print(f"wrote {out}")
 
 
@@ -144,8 +158,8 @@ def refresh(
     out: Path | None = None,
     index: float | None = None,
     index_std: float | None = None,
-    method: Method | None = None,
-    overwrite: Flag = False,
+    method: Method = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Adapt a joint calibration to new water, or water of another temperature, by images of a step in it.
 
@@ -167,10 +181,6 @@ def refresh(
     index_std
         Standard uncertainty of that index, in place of what follows from the sensor's description; 0.001 if hardly
         anything is known of the water.
-    method
-        How the stripe's centre is found.
-    overwrite
-        Replace an existing file.
     """
     from uwlts.calibration.joint.next_shot import advice_lines
 
@@ -186,15 +196,13 @@ def refresh(
             progress=any_stage(progress),
         )
     uwlts.write_calibration(path, result.calibration, overwrite=overwrite)
-    show(line for change in result.changes for line in change.lines())
-    show(advice_lines(result.calibration))
-    warn(*result.warnings)
-    print(f"wrote {path}")
+    changes = (line for change in result.changes for line in change.lines())
+    _finish(path, [*changes, *advice_lines(result.calibration)], result.warnings)
 
 
 @app.command
 def polynomials(
-    *, target: Files, out: Path, degree: int = 6, method: Method | None = None, overwrite: Flag = False
+    *, target: Files, out: CalibrationOut, degree: int = 6, method: Method = None, overwrite: Overwrite = False
 ) -> None:
     """Calibrate by polynomials, position to Z and Z to Y for each profile line, completely in the medium of use.
 
@@ -205,14 +213,8 @@ def polynomials(
     target
         Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor along Z:
         at every stage position one image under the lamp and one with the laser.
-    out
-        Calibration file to write.
     degree
         Degree of the polynomials; there must be more stage positions.
-    method
-        How the stripe's centre is found.
-    overwrite
-        Replace an existing file.
     """
     from uwlts.report.inventory import polynomial_lines
 
@@ -222,6 +224,129 @@ def polynomials(
             target, degree=degree, stripe=stripe_options(method), progress=any_stage(progress)
         )
     uwlts.write_calibration(out, result.calibration, overwrite=overwrite)
-    show(polynomial_lines(result.calibration))
-    warn(*result.warnings)
-    print(f"wrote {out}")
+    _finish(out, polynomial_lines(result.calibration), result.warnings)
+
+
+@app.command
+def models(
+    *,
+    air: Files = (),
+    water: Files = (),
+    step: Files = (),
+    out: Path | None = None,
+    poses: Literal["stage", "free"] = "stage",
+    index: Index = None,
+    method: Method = None,
+    workers: Workers = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare models of the sensor by how well each predicts images that its calibration has not seen.
+
+    One refraction or two, window tilted or not, sheet with bow or turned by the laser's window or not, distortion:
+    each model is calibrated without every fourth image, and without the nearest and the farthest ones.
+
+    Example: uwlts models --air target-air.h5 --water target-water.h5 --step step-*.h5 --out models.html
+
+    Parameters
+    ----------
+    air
+        Captures of the target in air, as for uwlts calibrate.
+    water
+        The same in the medium of use.
+    step
+        Captures of the step standard in the medium of use.
+    out
+        Page to write, with the figures as JSON beside it.
+    poses
+        stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
+    """
+    from uwlts.report.model_comparison import content_of, lines_of
+    from uwlts.report.page_toolkit import refuse_unsuitable_page
+
+    if out is not None:
+        refuse_unsuitable_page(out, example="models.html", overwrite=overwrite)
+    with progress_bar("comparing models") as progress:
+        comparison = uwlts.compare_models(
+            air=air,
+            water=water,
+            step=step,
+            poses=poses,
+            index=index,
+            stripe=stripe_options(method),
+            workers=workers,
+            progress=any_stage(progress),
+        )
+    show(lines_of(content_of(comparison)))
+    warn(*comparison.warnings)
+    if out is not None:
+        uwlts.write_models(out, comparison, overwrite=overwrite)
+        print(f"wrote {out} and {out.with_suffix('.json').name}")
+
+
+@app.command
+def certificate(
+    calibration: Path,
+    *,
+    out: Path | None = None,
+    before: Path | None = None,
+    check: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a calibration's certificate: evidence, calibrated volume, uncertainty of lengths, weak parameters.
+
+    A page to read and print, and beside it the same as sealed JSON. With --check it is verified instead: exit code 1
+    if the certificate was changed or belongs to another calibration.
+
+    Example: uwlts certificate calibration.json --out certificate.html
+
+    Example: uwlts certificate calibration.json --check certificate.json
+
+    Parameters
+    ----------
+    calibration
+        Calibration file; only a joint one has uncertainties.
+    out
+        Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
+    before
+        Another calibration of the same sensor to set beside it.
+    check
+        Certificate (JSON) to verify against the calibration.
+    """
+    from uwlts.report.certificate import certificate_lines
+
+    if check is not None:
+        if out is not None or before is not None:
+            raise DescriptionError("--check verifies and writes nothing: give it without --out and --before")
+        against = uwlts.check_certificate(check, calibration)
+        print("\n".join(against) or f"{check} is as it was issued, and is about {calibration}")
+        if against:
+            sys.exit(1)
+        return
+    page, content = uwlts.write_certificate(calibration, out=out, before=before, overwrite=overwrite)
+    show(certificate_lines(content))
+    print(f"wrote {page} and {page.with_suffix('.json').name}")
+
+
+@app.command
+def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> None:
+    """Measure a known object and answer pass or fail: exit code 0 or 1.
+
+    Each calibrated size must agree with its certificate within both uncertainties (E_n at most 1, ISO/IEC 17043) and,
+    with a limit, conform to it beyond doubt (ISO 14253-1).
+
+    Example: uwlts verify step.h5 --calibration calibration.json --limit 0.05
+
+    Parameters
+    ----------
+    capture
+        Scan of an artefact with calibrated sizes.
+    calibration
+        Calibration of the sensor; a joint one holds its uncertainty.
+    limit
+        Largest permissible error in mm.
+    """
+    verification = uwlts.verify(capture, calibration, limit_mm=limit)
+    print(verification.text)
+    print("pass" if verification.passed else "FAIL")
+    if not verification.passed:
+        sys.exit(1)

@@ -1,10 +1,10 @@
-"""Commands from captures to evaluated point clouds."""
+"""Commands from captures to evaluated point clouds, and about sensors and files."""
 
 from pathlib import Path
 from typing import Literal
 
 import uwlts
-from uwlts.cli.options import Flag, Method, app, show, stripe_options
+from uwlts.cli.options import CalibrationOut, Flag, Index, Method, Overwrite, Workers, app, show, stripe_options, warn
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable
 
@@ -15,10 +15,10 @@ def reconstruct(
     *,
     calibration: Path,
     out: Path,
-    index: float | None = None,
-    method: Method | None = None,
+    index: Index = None,
+    method: Method = None,
     peak: Literal["strongest", "first", "last"] = "strongest",
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Turn a capture into a point cloud.
 
@@ -33,14 +33,8 @@ def reconstruct(
     out
         Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a joint
         calibration its uncertainty.
-    index
-        Refractive index of the medium, in place of the one that follows from the capture.
-    method
-        How the stripe's centre is found.
     peak
         Which of several stripes on a line counts.
-    overwrite
-        Replace an existing file.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
@@ -67,7 +61,7 @@ def evaluate(
     artefact: Path | None = None,
     truth: Path | None = None,
     coloured: Path | None = None,
-    overwrite: Flag = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare a cloud with its artefact's calibrated values, and point by point with a truth file.
 
@@ -85,8 +79,6 @@ def evaluate(
         Ground truth of the capture, if it was rendered.
     coloured
         Also write the cloud with the deviation of every point to this file.
-    overwrite
-        Replace existing files.
     """
     from uwlts.report.inventory import evaluation_lines
 
@@ -143,7 +135,7 @@ def thesis(
     *,
     published: str = "thesis-tables",
     trials: int = 100,
-    workers: int | None = None,
+    workers: Workers = None,
     joint: Flag = False,
     again: Flag = False,
     overwrite: Flag = False,
@@ -163,8 +155,6 @@ def thesis(
         Published tables: name or path of a TOML file.
     trials
         Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
-    workers
-        Scans measured at a time; as many as there are processors unless given.
     joint
         Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without Monte
         Carlo; writes report.html and summary.json.
@@ -187,3 +177,96 @@ def thesis(
     print(written.headline.rstrip())
     page, *others = written.files
     print(f"wrote {page}, {', '.join(file.name for file in others)}")
+
+
+@app.command
+def design(sensor: str, *, medium: str) -> None:
+    """Print what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
+
+    Example: uwlts design thesis --medium water
+
+    Parameters
+    ----------
+    sensor
+        Name or path of a sensor description.
+    medium
+        One of the sensor's media.
+    """
+    from uwlts.report.inventory import table_lines
+
+    show(table_lines(uwlts.design(sensor, medium=medium)))
+
+
+@app.command
+def nominal(sensor: str, *, medium: str, out: CalibrationOut, overwrite: Overwrite = False) -> None:
+    """Write the calibration that a sensor would have if it were built exactly as described.
+
+    Example: uwlts nominal thesis --medium water --out nominal.json
+
+    Parameters
+    ----------
+    sensor
+        Name or path of a sensor description.
+    medium
+        One of the sensor's media; the laser's window may turn the sheet in it.
+    """
+    uwlts.write_calibration(out, uwlts.nominal(sensor, medium=medium), overwrite=overwrite)
+    print(f"wrote {out}")
+
+
+@app.command
+def info(path: str) -> None:
+    """Describe a file: a capture, cloud, calibration, evaluation, or a sensor description (by name or path).
+
+    Example: uwlts info capture.h5
+
+    Parameters
+    ----------
+    path
+        File, or name of a shipped sensor such as thesis.
+    """
+    print(uwlts.describe(path))
+
+
+@app.command(name="import")
+def import_images(folder: Path, *, out: Path, description: Path | None = None, overwrite: Overwrite = False) -> None:
+    """Turn a folder of images of any camera into a capture.
+
+    Example: uwlts import photographs --out target.h5
+
+    Parameters
+    ----------
+    folder
+        Folder of PNG, TIFF, BMP or JPEG images.
+    out
+        Capture to write.
+    description
+        TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless given.
+    """
+    with progress_bar(f"importing {folder.name}") as progress:
+        imported = uwlts.import_images(folder, out, description=description, overwrite=overwrite, progress=progress)
+    warn(*imported.warnings)
+    print(f"wrote {out} with {imported.laser} laser and {imported.lamp} lamp images")
+
+
+@app.command
+def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", overwrite: Flag = False) -> None:
+    """Write a capture as a folder of images that `uwlts import` reads back, or a cloud in another format.
+
+    Example: uwlts export scan.ply --out scan.laz
+
+    Parameters
+    ----------
+    file
+        Capture (.h5) or cloud (.ply or .h5).
+    out
+        New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
+        .e57.
+    images
+        Format of a capture's images; both keep all bits.
+    overwrite
+        Replace an existing cloud.
+    """
+    with progress_bar(f"exporting {file.name}") as progress:
+        written = uwlts.export(file, out, images=images, overwrite=overwrite, progress=progress)
+    print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")

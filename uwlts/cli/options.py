@@ -22,13 +22,20 @@ Coefficients = Annotated[
     tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
 ]
 # The names of uwlts.stripe.methods, which is not imported for a command's help.
-Method = Literal["centre-of-mass", "profile-fit", "quadratic", "zero-crossing"]
+MethodName = Literal["centre-of-mass", "profile-fit", "quadratic", "zero-crossing"]
+Method = Annotated[MethodName | None, Parameter(help="How the stripe's centre is found.")]
+Index = Annotated[
+    float | None, Parameter(help="Refractive index of the medium, in place of the one that follows from the captures.")
+]
+Workers = Annotated[
+    int | None, Parameter(help="Processes that work at the same time; one for each processor unless given.")
+]
+Overwrite = Annotated[bool, Parameter(negative="", help="Replace existing files.")]
+CalibrationOut = Annotated[Path, Parameter(help="Calibration file to write.")]
 
 
-def stripe_options(
-    method: Method | None, peak: Literal["strongest", "first", "last"] = "strongest"
-) -> "uwlts.StripeOptions":
-    """How stripes are found, with the default method unless one is given."""
+def stripe_options(method: Method, peak: Literal["strongest", "first", "last"] = "strongest") -> "uwlts.StripeOptions":
+    """Options of finding stripes, with the default method unless one is given."""
     from uwlts.stripe import PeakRule
 
     options = uwlts.StripeOptions

@@ -18,7 +18,13 @@ from uwlts.model.errors import OutputError
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
-from uwlts.report.certificate_volume import LengthUncertainty, change_from, form_of, in_use, require_same_sensor
+from uwlts.report.certificate_volume import (
+    LengthUncertainty,
+    change_from,
+    in_use,
+    require_same_sensor,
+    uncertainty_maps,
+)
 from uwlts.report.numbers import as_fine_as, fixed
 from uwlts.report.page_toolkit import (
     COLOURS,
@@ -123,18 +129,9 @@ def _pictures(
     if not content.lengths:
         return drawn
     region = regions(calibration)[0]
-    form = form_of(in_use(calibration, region))
-    maps = {
-        f"u({axis}), {name}": values[..., "XYZ".index(axis)]
-        for name, values in (("calibration", form.calibration_mm), ("single point", form.point_mm))
-        for axis in "YZX"
-    }
-    maps |= {
-        f"u of {form.short_mm:g} mm along Y": form.along_y_mm,
-        f"u of {form.short_mm:g} mm along Z": form.along_z_mm,
-    }
+    mesh, maps = uncertainty_maps(in_use(calibration, region))
     drawn["lengths"] = length_chart(content.lengths)
-    drawn["maps"] = [heat_map(title, form.at_mm, 1e3 * values) for title, values in maps.items()]
+    drawn["maps"] = [heat_map(title, mesh, 1e3 * values) for title, values in maps.items()]
     if before is not None:
         change = change_from(calibration, before[1], region)
         drawn["largest_change_um"] = 1e3 * change.largest_mm
@@ -244,7 +241,7 @@ def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
         for colour, axis in zip(COLOURS, "XYZ", strict=False):
             along = {each.length_mm: 1e3 * getattr(each, name) for each in lengths if each.axis == axis}
             if along:
-                ax.plot(along.keys(), along.values(), "o-", color=colour, label=f"along {axis}")
+                ax.plot(list(along), list(along.values()), "o-", color=colour, label=f"along {axis}")
         ax.set(title=title, xlabel="length / mm", ylabel="expanded uncertainty (k = 2) / µm")
         ax.set_ylim(bottom=0)
     legend_below(figure)

@@ -110,25 +110,13 @@ def ends_over(region: Region, axis: str, length_mm: float) -> np.ndarray:
     return np.array(found).reshape(-1, 2, 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Form:
-    """Standard uncertainties in mm over a mesh (R, C) of the sheet, whose Y and Z are ``at_mm`` (R, C, 2).
+def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Y and Z (R, C, 2) of a mesh of the sheet, and maps of standard uncertainties (R, C) over it, mm, by their titles.
 
-    ``calibration_mm`` and ``point_mm`` (R, C, 3) are those of X, Y and Z of a point, by the calibration alone and with
-    the stripe's noise. ``along_y_mm`` and ``along_z_mm`` (R, C) are those of the length ``short_mm``, which fits well
-    into the volume, by the calibration and about each point as far as the volume reaches.
+    For points they are those of the coordinates of the form, without a rigid motion of the whole volume: by the
+    calibration alone, and with the stripe's noise. For a length that fits well into the volume they are those by the
+    calibration, about each point as far as the volume reaches.
     """
-
-    at_mm: np.ndarray
-    calibration_mm: np.ndarray
-    point_mm: np.ndarray
-    short_mm: float
-    along_y_mm: np.ndarray
-    along_z_mm: np.ndarray
-
-
-def form_of(use: InUse) -> Form:
-    """The form's uncertainty in a calibration's region."""
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
     points = points_at(use.calibration, use.known, at)
@@ -137,19 +125,19 @@ def form_of(use: InUse) -> Form:
     values, vectors = np.linalg.eigh(use.covariance / np.outer(scale, scale))
     root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     moved = without_rigid_motion(at, (points.by_parameters @ root).transpose(2, 0, 1))
-    calibration = np.sqrt(np.sum(moved**2, axis=0)).reshape(*mesh.shape[:2], 3)
-    noise = (points.by_px * use.noise_px).reshape(calibration.shape)
+    calibration = np.sqrt(np.sum(moved**2, axis=0))
+    shown = {"calibration": calibration, "single point": np.hypot(calibration, points.by_px * use.noise_px)}
+    maps = {
+        f"u({axis}), {name}": values[:, "XYZ".index(axis)].reshape(mesh.shape[:2])
+        for name, values in shown.items()
+        for axis in "YZX"
+    }
     longest = _SHORT_SHARE * float(np.ptp(use.region.outline_mm, axis=0).min())
     power = 10.0 ** np.floor(np.log10(longest))
     short = float(max(step * power for step in (1, 2, 5) if step * power <= longest))
-    return Form(
-        at_mm=mesh,
-        calibration_mm=calibration,
-        point_mm=np.hypot(calibration, noise),
-        short_mm=short,
-        along_y_mm=_of_short(use, mesh, np.array([short, 0.0])),
-        along_z_mm=_of_short(use, mesh, np.array([0.0, short])),
-    )
+    for axis, length in (("Y", (short, 0.0)), ("Z", (0.0, short))):
+        maps[f"u of {short:g} mm along {axis}"] = _of_length(use, mesh, np.array(length))
+    return mesh, maps
 
 
 def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
@@ -162,7 +150,7 @@ def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
     return (flat - (flat @ basis) @ basis.T).reshape(moved.shape)
 
 
-def _of_short(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
+def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Standard uncertainty (R, C) of a length (2,) whose middle is at each point of the mesh, or as near as it fits."""
     middle = mesh.reshape(-1, 2).copy()
     low, high = use.region.outline_mm[:, 1].min(), use.region.outline_mm[:, 1].max()

@@ -123,19 +123,21 @@ def describe(path: str | Path) -> str:
         The file is missing, foreign or damaged.
     """
     name, path = str(path), Path(path)
-    suffixes = [s for s in path.suffixes if s != ".part"]
-    if suffixes[-2:] == [".truth", ".h5"]:
-        return "\n".join(truth_lines(*read_truth(path)))
-    if is_cloud(path):
-        return "\n".join(cloud_lines(read_cloud(path)))
-    if suffixes[-1:] == [".h5"]:
-        with Capture(path) as capture:
-            return "\n".join(capture_lines(capture))
-    if suffixes[-1:] == [".json"]:
-        return "\n".join(_json_lines(path))
-    if suffixes and suffixes[-1] != ".toml":
-        raise DescriptionError(f"{path}: expected a .h5, .ply, .json or .toml file, or the name of a sensor")
-    return "\n".join(sensor_lines(load_sensor(name)))
+    match [s for s in path.suffixes if s != ".part"]:
+        case [*_, ".truth", ".h5"]:
+            lines = truth_lines(*read_truth(path))
+        case _ if is_cloud(path):
+            lines = cloud_lines(read_cloud(path))
+        case [*_, ".h5"]:
+            with Capture(path) as capture:
+                lines = capture_lines(capture)
+        case [*_, ".json"]:
+            lines = _json_lines(path)
+        case [] | [*_, ".toml"]:
+            lines = sensor_lines(load_sensor(name))
+        case _:
+            raise DescriptionError(f"{path}: expected a .h5, .ply, .json or .toml file, or the name of a sensor")
+    return "\n".join(lines)
 
 
 def _json_lines(path: Path) -> list[str]:

@@ -50,6 +50,7 @@ COLOURS = (BLUE, "#d9822b", "#2e8b57", RED, "#7b4fa3", "#5b6770", "#12a3a8", "#a
 """Colours of the lines of one figure, in order."""
 
 _STYLE: dict[Any, Any] = {
+    "axes.prop_cycle": f"cycler(color={list(COLOURS)})",
     "font.size": 9.0,
     "axes.edgecolor": INK,
     "axes.labelcolor": INK,
@@ -70,7 +71,7 @@ _SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "page"}
 
 
 def render_page(package: str, template: str, /, *, interactive: FigureCollector | None = None, **values: Any) -> str:
-    """Return the page that a template makes of values.
+    """Text of a page from a template and values.
 
     Parameters
     ----------
@@ -86,11 +87,16 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     folders = [PackageLoader(package, ""), PackageLoader("uwlts.report", "templates")]
     environment = Environment(loader=ChoiceLoader(folders), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["minus"] = typographic
-    scripts = [] if interactive is None else interactive.scripts
+    scripts, plotly = [] if interactive is None else interactive.scripts, ""
+    if scripts:
+        from plotly.offline import get_plotlyjs
+
+        # Nothing in plotly's script may look like the script's end.
+        plotly = Markup(get_plotlyjs().replace("</script", "<\\/script"))
     return environment.get_template(template).render(
         page_style=Markup((Path(__file__).with_name("templates") / "style.css").read_text(encoding="utf-8")),
         page_figures=scripts,
-        page_plotly=_plotly_source() if scripts else "",
+        page_plotly=plotly,
         **values,
     )
 
@@ -98,10 +104,7 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
 def write_page(path: str | Path, text: str, *, beside: str | None = None, overwrite: bool = False) -> None:
     """Write a page, and a JSON text beside it if one is given, each whole or not at all.
 
-    Raises
-    ------
-    OutputError
-        A file exists and ``overwrite`` is not given, or cannot be written.
+    Raises OutputError: a file exists and ``overwrite`` is not given, or cannot be written.
     """
     with ExitStack() as stack:
         if beside is not None:
@@ -113,7 +116,7 @@ def write_page(path: str | Path, text: str, *, beside: str | None = None, overwr
 
 
 def json_beside(page: Path) -> Path:
-    """Where the JSON of a page is written."""
+    """Path of the JSON of a page."""
     return page.with_suffix(".json")
 
 
@@ -127,10 +130,7 @@ def refuse_unsuitable_page(page: Path, *, example: str, overwrite: bool) -> None
 
 @dataclass(frozen=True)
 class InteractiveFigure:
-    """Place of an interactive figure in a page.
-
-    ``still`` is the address of a picture that replaces a ``webgl`` figure in print.
-    """
+    """Place of an interactive figure in a page; ``still`` is the address of a picture that replaces it in print."""
 
     number: int
     caption: str
@@ -148,10 +148,7 @@ class FigureCollector:
     def add(
         self, figure: go.Figure, caption: str = "", *, webgl: bool = False, still: str | None = None
     ) -> InteractiveFigure:
-        """Keep a plotly figure with a height in its layout; the result is what the ``chart`` component shows.
-
-        Figures with ``webgl`` are drawn only near the screen, as browsers keep few of them.
-        """
+        """Keep a plotly figure that has a height; those with ``webgl`` are drawn near the screen, browsers keep few."""
         # Within a script element nothing is escaped, and nothing may look like its end.
         text = figure.to_json(validate=False) or ""
         self.scripts.append(Markup(text.replace("<", "\\u003c")))
@@ -196,30 +193,21 @@ def new_figure(
 ) -> tuple[Figure, list[Axes]]:
     """A matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
     import matplotlib
-    from cycler import cycler
 
-    figure, style = figure_of(width, height), dict(_STYLE)
-    style["axes.prop_cycle"] = cycler(color=COLOURS)
-    with matplotlib.rc_context(style):
+    figure = figure_of(width, height)
+    with matplotlib.rc_context(_STYLE):
         return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios).flat)
 
 
 def legend_below(figure: Figure, *, columns: int = 4) -> None:
     """One legend below all axes of a figure, each label once."""
-    entries = {}
+    handles = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    if entries:
-        figure.legend(
-            entries.values(),
-            entries.keys(),
-            loc="outside lower left",
-            ncols=columns,
-            fontsize=9,
-            frameon=False,
-            labelcolor=INK,
-        )
+            handles.setdefault(label, handle)
+    if handles:
+        style = {"loc": "outside lower left", "fontsize": 9, "frameon": False, "labelcolor": INK}
+        figure.legend(handles.values(), handles.keys(), ncols=columns, **style)
 
 
 def svg_of(drawn: Drawn) -> Markup:
@@ -234,15 +222,15 @@ def png_of(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
     """A matplotlib figure, or that of axes, as PNG; with ``few_colours`` of 256 colours, in a third of the room."""
     # The software's name with its version would change the file.
     data = _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
-    if few_colours:
-        from PIL import Image
+    if not few_colours:
+        return data
+    from PIL import Image
 
-        with Image.open(io.BytesIO(data)) as picture, io.BytesIO() as smaller:
-            # Of Pillow's methods the octree takes a fifth of the others' time.
-            reduced = picture.convert("RGB").quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-            reduced.save(smaller, "png")
-            return smaller.getvalue()
-    return data
+    smaller = io.BytesIO()
+    # Of Pillow's methods the octree takes a fifth of the others' time.
+    reduced = Image.open(io.BytesIO(data)).convert("RGB")
+    reduced.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(smaller, "png")
+    return smaller.getvalue()
 
 
 def _saved(drawn: Drawn, **options: Any) -> bytes:
@@ -276,10 +264,3 @@ def typographic(text: str) -> str:
     if text == MISSING:
         return "\N{EN DASH}"
     return "\N{MINUS SIGN}" + text[1:] if text.startswith("-") else text
-
-
-def _plotly_source() -> Markup:
-    """Plotly's script, with nothing in it that looks like the script's end."""
-    from plotly.offline import get_plotlyjs
-
-    return Markup(get_plotlyjs().replace("</script", "<\\/script"))

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from uwlts.report import plot
-from uwlts.report.gather import Campaign, Measurement
+from uwlts.report.gather import Campaign
 from uwlts.report.page_toolkit import new_figure, png_of
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import written_aside
@@ -73,20 +73,19 @@ class MeasurementPictures:
 
 
 def draw_pictures(campaign: Campaign) -> list[MeasurementPictures]:
-    """The pictures of a campaign's measurements, in order; CaptureError where an image of a capture is damaged."""
-    return [MeasurementPictures(each.name, _stripe_png(each), _cloud_png(each)) for each in campaign.measurements]
-
-
-def _cloud_png(measurement: Measurement) -> bytes | None:
-    return None if measurement.cloud is None else png_of(plot.cloud(measurement.cloud), few_colours=True)
-
-
-def _stripe_png(measurement: Measurement) -> bytes | None:
-    if measurement.capture is None:
-        return None
-    with Capture(measurement.capture.path) as capture:
-        view = stripe_view(capture)
-    return None if view is None else png_of(stripe_picture(view))
+    """Pictures of a campaign's measurements, in order; CaptureError where an image of a capture is damaged."""
+    drawn = []
+    for measurement in campaign.measurements:
+        view = stripe = cloud = None
+        if measurement.capture is not None:
+            with Capture(measurement.capture.path) as capture:
+                view = stripe_view(capture)
+        if view is not None:
+            stripe = png_of(stripe_picture(view))
+        if measurement.cloud is not None:
+            cloud = png_of(plot.cloud(measurement.cloud), few_colours=True)
+        drawn.append(MeasurementPictures(measurement.name, stripe, cloud))
+    return drawn
 
 
 def write_pictures(
@@ -94,10 +93,7 @@ def write_pictures(
 ) -> list[Path]:
     """Write ``stripe-NAME.png`` and ``cloud-NAME.png`` of every measurement that has them; returns what was written.
 
-    Raises
-    ------
-    OutputError
-        The folder is missing, or a picture exists and ``overwrite`` is not given.
+    Raises OutputError: the folder is missing, or a picture exists and ``overwrite`` is not given.
     """
     written = []
     for each in pictures:

@@ -1,7 +1,7 @@
 """The key figures of a campaign, and their file summary.json."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ class KeyFigure(_Stored):
     """An error of every measurement, its largest or the published ones, and the mean of their absolute values."""
 
     mean_abs: float | None
-    by_measurement: dict[str, float | tuple[float, ...]]
+    by_measurement: Mapping[str, float | tuple[float, ...]]
 
 
 class _KeyFigures(_Stored):

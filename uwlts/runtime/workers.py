@@ -19,6 +19,7 @@ from concurrent.futures import wait as wait_for_futures
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -147,7 +148,7 @@ class _Processes(Workers):
 
     def __init__(self, count: int, *, threads: int):
         self.count, self._threads = count, threads
-        self._processes: list[_Process] = []
+        self._processes: set[_Process] = set()
 
     def __enter__(self) -> "_Processes":
         return self
@@ -184,22 +185,15 @@ class _Processes(Workers):
         waiting = enumerate(jobs)
         busy: dict[object, tuple[_Process, int, Job]] = {}
         idle = deque(self._processes)
-        more = True
-        while more or busy:
-            while len(busy) < self.count:
-                try:
-                    number, job = next(waiting)
-                except StopIteration:
-                    more = False
-                    break
-                if not idle:
-                    idle.append(_Process(self._threads))
-                    self._processes.append(idle[-1])
-                process = idle.popleft()
+        while True:
+            for number, job in islice(waiting, self.count - len(busy)):
+                process = idle.popleft() if idle else _Process(self._threads)
+                self._processes.add(process)
                 busy[process.connection] = process, number, job
                 process.give(work, job)
-            # Without a connection `wait` would wait for ever.
-            for connection in wait([process.connection for process, _, _ in busy.values()]) if busy else ():
+            if not busy:
+                return
+            for connection in wait([process.connection for process, _, _ in busy.values()]):
                 process, number, job = busy[connection]
                 match process.message():
                     case ("message", message):
@@ -353,11 +347,7 @@ class _Cluster(Workers):
         """See `Workers.completed`."""
         waiting, running = iter(jobs), dict[Future[Result], Job]()
         while True:
-            while len(running) < self.count * _AHEAD:
-                try:
-                    job = next(waiting)
-                except StopIteration:
-                    break
+            for job in islice(waiting, self.count * _AHEAD - len(running)):
                 running[self._executor.submit(function, job)] = job
             if not running:
                 return

@@ -29,9 +29,9 @@ from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.report.certificate_volume import (
     change_from,
     ends_over,
-    form_of,
     in_use,
     length_uncertainties,
+    uncertainty_maps,
     without_rigid_motion,
 )
 from uwlts.storage.calibration_file import read_calibration, write_calibration
@@ -197,13 +197,14 @@ def test_rigid_motions_leave_the_form():
 
 
 def test_the_form_is_known_better_than_single_points(use):
-    form = form_of(use)
-    assert form.calibration_mm.shape == (17, 21, 3)
-    assert (form.point_mm >= form.calibration_mm).all()
-    assert 0 < form.calibration_mm[..., 1:].max() < 0.05
+    mesh, maps = uncertainty_maps(use)
+    assert mesh.shape == (17, 21, 2) and all(values.shape == (17, 21) for values in maps.values())
+    for axis in "XYZ":
+        assert (maps[f"u({axis}), single point"] >= maps[f"u({axis}), calibration"]).all()
+    assert 0 < max(maps[f"u({axis}), calibration"].max() for axis in "YZ") < 0.05
     # 0.1 px of noise: some 15 µm across the line, which is far more than the calibration leaves open.
-    assert np.median(form.point_mm[..., 2]) > 2 * np.median(form.calibration_mm[..., 2])
-    assert form.short_mm in (20.0, 50.0)
+    assert np.median(maps["u(Z), single point"]) > 2 * np.median(maps["u(Z), calibration"])
+    assert {f"u of {length} mm along Y" in maps for length in (20, 50)} == {True, False}
 
 
 def test_lengths_shown_where_they_are_measured_stay_in_the_volume(use):
