@@ -3,11 +3,11 @@
 import sys
 
 # Importing them adds their commands.
-from uwlts.cli import calibration, measuring, recording
+from uwlts.cli import calibration, measuring
 from uwlts.cli.options import app
 from uwlts.runtime.console import run
 
-__all__ = ["app", "calibration", "main", "measuring", "recording"]
+__all__ = ["app", "calibration", "main", "measuring"]
 
 
 def main() -> None:

@@ -59,45 +59,31 @@ def calibrate(
 
     Example: uwlts calibrate --water target-water.h5 --out calibration.json
 
-    Parameters
-    ----------
-    air
-        Captures of the target in air: at every stage position one image under the lamp and one with the laser. If all
-        are taken in the medium of use, and without steps, the calibration has a single viewpoint for that medium.
-    water
-        The same in the medium of use, seen through the window, whose distance is estimated too.
-    step
-        Captures of the step standard in the medium of use; without any the calibration is for air only.
-    scan
-        Scans of spheres, a plane or a pipe that stand still: round objects determine the stage's direction and the
-        water's index, better if their size is known; a plane determines what bends it.
-    new_water
-        The scans were taken in other water than the target, or on another day: estimate its index too.
-    unknown_sizes
-        Estimate diameters and spacings of what was scanned, even if its description states their uncertainty.
-    joint
-        Estimate all parameters together; the sensor's description states what is known before and how well.
-    live
-        Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, in place of captures:
-        leads through the images, rejects bad ones with the reason, and records the good ones beside the calibration.
-    refractions
-        2: window of known thickness, air images taken without it. 1: one interface, air images taken through the
-        window. The joint calibration takes this from the captures.
-    poses
-        stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same with a
-        free direction, as always in the joint calibration. free: every image has a pose of its own.
-    distortion
-        Distortion coefficients to estimate; the others stay 0.
-    camera
-        Guided: address of the camera, in place of the plan's.
-    stage
-        Guided: serial port of the stage, in place of the plan's.
-    port
-        Guided: port of the page for the browser; the next free one is taken if it is in use.
-    resume
-        Guided: continue with what is recorded.
-    overwrite
-        Replace an existing file; guided, and without resume, its captures too.
+    Args:
+        air: Captures of the target in air: at every stage position one image under the lamp and one with the laser. If
+            all are taken in the medium of use, and without steps, the calibration has a single viewpoint for that
+            medium.
+        water: The same in the medium of use, seen through the window, whose distance is estimated too.
+        step: Captures of the step standard in the medium of use; without any the calibration is for air only.
+        scan: Scans of spheres, a plane or a pipe that stand still: round objects determine the stage's direction and
+            the water's index, better if their size is known; a plane determines what bends it.
+        new_water: The scans were taken in other water than the target, or on another day: estimate its index too.
+        unknown_sizes: Estimate diameters and spacings of what was scanned, even if its description states their
+            uncertainty.
+        joint: Estimate all parameters together; the sensor's description states what is known before and how well.
+        live: Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, in place of
+            captures: leads through the images, rejects bad ones with the reason, and records the good ones beside the
+            calibration.
+        refractions: 2: window of known thickness, air images taken without it. 1: one interface, air images taken
+            through the window. The joint calibration takes this from the captures.
+        poses: stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same
+            with a free direction, as always in the joint calibration. free: every image has a pose of its own.
+        distortion: Distortion coefficients to estimate; the others stay 0.
+        camera: Guided: address of the camera, in place of the plan's.
+        stage: Guided: serial port of the stage, in place of the plan's.
+        port: Guided: port of the page for the browser; the next free one is taken if it is in use.
+        resume: Guided: continue with what is recorded.
+        overwrite: Replace an existing file; guided, and without resume, its captures too.
     """
     from uwlts.calibration.joint.next_shot import advice_lines
     from uwlts.optics.window import require_index
@@ -168,19 +154,14 @@ def refresh(
 
     Example: uwlts refresh calibration.json --step step-today.h5 --out today.json
 
-    Parameters
-    ----------
-    calibration
-        Joint calibration of the sensor.
-    step
-        Captures of the step standard in the new water.
-    out
-        Calibration to write; CALIBRATION.refreshed.json unless given.
-    index
-        Refractive index of the new water as far as it is known, in place of the one that follows from the captures.
-    index_std
-        Standard uncertainty of that index, in place of what follows from the sensor's description; 0.001 if hardly
-        anything is known of the water.
+    Args:
+        calibration: Joint calibration of the sensor.
+        step: Captures of the step standard in the new water.
+        out: Calibration to write; CALIBRATION.refreshed.json unless given.
+        index: Refractive index of the new water as far as it is known, in place of the one that follows from the
+            captures.
+        index_std: Standard uncertainty of that index, in place of what follows from the sensor's description; 0.001 if
+            hardly anything is known of the water.
     """
     from uwlts.calibration.joint.next_shot import advice_lines
 
@@ -208,13 +189,10 @@ def polynomials(
 
     Example: uwlts polynomials --target target-water.h5 --out polynomials.json
 
-    Parameters
-    ----------
-    target
-        Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor along Z:
-        at every stage position one image under the lamp and one with the laser.
-    degree
-        Degree of the polynomials; there must be more stage positions.
+    Args:
+        target: Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor
+            along Z: at every stage position one image under the lamp and one with the laser.
+        degree: Degree of the polynomials; there must be more stage positions.
     """
     from uwlts.report.inventory import polynomial_lines
 
@@ -247,18 +225,13 @@ def models(
 
     Example: uwlts models --air target-air.h5 --water target-water.h5 --step step-*.h5 --out models.html
 
-    Parameters
-    ----------
-    air
-        Captures of the target in air, as for uwlts calibrate.
-    water
-        The same in the medium of use.
-    step
-        Captures of the step standard in the medium of use.
-    out
-        Page to write, with the figures as JSON beside it.
-    poses
-        stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
+    Args:
+        air: Captures of the target in air, as for uwlts calibrate.
+        water: The same in the medium of use.
+        step: Captures of the step standard in the medium of use.
+        out: Page to write, with the figures as JSON beside it.
+        poses: stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its
+            own.
     """
     from uwlts.report.model_comparison import content_of, lines_of
     from uwlts.report.page_toolkit import refuse_unsuitable_page
@@ -301,16 +274,11 @@ def certificate(
 
     Example: uwlts certificate calibration.json --check certificate.json
 
-    Parameters
-    ----------
-    calibration
-        Calibration file; only a joint one has uncertainties.
-    out
-        Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
-    before
-        Another calibration of the same sensor to set beside it.
-    check
-        Certificate (JSON) to verify against the calibration.
+    Args:
+        calibration: Calibration file; only a joint one has uncertainties.
+        out: Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
+        before: Another calibration of the same sensor to set beside it.
+        check: Certificate (JSON) to verify against the calibration.
     """
     from uwlts.report.certificate import certificate_lines
 
@@ -336,14 +304,10 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
 
     Example: uwlts verify step.h5 --calibration calibration.json --limit 0.05
 
-    Parameters
-    ----------
-    capture
-        Scan of an artefact with calibrated sizes.
-    calibration
-        Calibration of the sensor; a joint one holds its uncertainty.
-    limit
-        Largest permissible error in mm.
+    Args:
+        capture: Scan of an artefact with calibrated sizes.
+        calibration: Calibration of the sensor; a joint one holds its uncertainty.
+        limit: Largest permissible error in mm.
     """
     verification = uwlts.verify(capture, calibration, limit_mm=limit)
     print(verification.text)

@@ -1,12 +1,117 @@
-"""Commands from captures to evaluated point clouds, and about sensors and files."""
+"""Commands that record and measure, from scans to evaluated point clouds, and commands about sensors and files."""
 
+import sys
 from pathlib import Path
 from typing import Literal
 
 import uwlts
-from uwlts.cli.options import CalibrationOut, Flag, Index, Method, Overwrite, Workers, app, show, stripe_options, warn
+from uwlts.cli.options import (
+    CalibrationOut,
+    Flag,
+    Index,
+    Method,
+    Overwrite,
+    Workers,
+    app,
+    say,
+    show,
+    stripe_options,
+    warn,
+)
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable
+
+
+@app.command
+def scan(
+    plan: Path,
+    *,
+    out: Path,
+    camera: str | None = None,
+    stage: str | None = None,
+    home: Flag = False,
+    unlock: Flag = False,
+    watch: Flag = False,
+    calibration: Path | None = None,
+    resume: Flag = False,
+    overwrite: Flag = False,
+) -> None:
+    """Record a scan with a camera and a stage into a capture.
+
+    Moves, lets the stage settle, switches the laser, takes an image and stores it with the position read back. The plan
+    is checked against travel and volume before anything moves; the laser goes off however the scan ends.
+
+    Example: uwlts scan plan.toml --camera gige:192.168.1.10 --stage /dev/ttyACM0 --home --out scan.h5
+
+    Args:
+        plan: TOML file with sensor, medium, positions, lights and exposures (docs/how-to/scan.md).
+        out: Capture to write.
+        camera: Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti, replay:PATH.
+        stage: Serial port of the stage, in place of the plan's.
+        home: Find the limit switch first.
+        unlock: Take the stage's position as it is, without homing.
+        watch: Show the recording in a browser meanwhile, as uwlts watch does.
+        calibration: Watched: calibration of the sensor, or one by polynomials, for the cloud.
+        resume: Continue an interrupted scan.
+        overwrite: Replace an existing capture.
+    """
+    with progress_bar(f"scanning {plan.stem}") as progress:
+        seen = uwlts.scan(
+            plan,
+            out,
+            camera=camera,
+            stage=stage,
+            home=home,
+            unlock=unlock,
+            watch=watch,
+            calibration=calibration,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            report=say,
+            warn=warn,
+        )
+    warn(*seen.warnings())
+    exposures = ", ".join(f"{light} {value:.3g} ms" for light, value in seen.exposure_ms.items())
+    print(f"wrote {out}, {seen.found} of {seen.lines} profile lines with a stripe; exposure {exposures or 'as before'}")
+
+
+@app.command
+def watch(capture: Path, *, calibration: Path | None = None, host: str = "127.0.0.1", port: int = 8080) -> None:
+    """Show a recording while it grows, in a browser: the latest image with its stripe, and the cloud so far.
+
+    Example: uwlts watch scan.h5 --calibration calibration.json
+
+    Args:
+        capture: Capture that is being recorded, or is to be.
+        calibration: Calibration of the sensor, or one by polynomials, for the cloud.
+        host: Address at which the page is served; the default can be reached from this machine only.
+        port: Port of the page; the next free one is taken if it is in use.
+    """
+    uwlts.watch(capture, calibration=calibration, host=host, port=port, report=say)
+
+
+@app.command
+def doctor(*, folder: Path = Path(), camera: str | None = None, stage: str | None = None) -> None:
+    """Examine libraries, libLLVM, cameras, serial ports, permissions and speed of this machine, with advice.
+
+    Ends with exit code 1 if something required, or something named here, is missing or does not work.
+
+    Example: uwlts doctor --camera gige: --stage /dev/ttyACM0
+
+    Args:
+        folder: Where captures are to be written; 64 MB are, and removed.
+        camera: Address of a camera to take ten frames with: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
+        stage: Serial port of a stage to ask for its version, settings and state. It is not moved and the laser stays
+            off, but an Arduino Uno restarts: home before the next scan.
+    """
+    from uwlts.doctor import print_findings
+
+    with progress_bar("examining") as progress:
+        findings = uwlts.examine(folder, camera=camera, stage=stage, progress=progress)
+    print_findings(findings)
+    if any(each.status == "missing" for each in findings):
+        sys.exit(1)
 
 
 @app.command
@@ -24,17 +129,12 @@ def reconstruct(
 
     Example: uwlts reconstruct scan.h5 --calibration calibration.json --out scan.ply
 
-    Parameters
-    ----------
-    capture
-        Capture of a scan.
-    calibration
-        Calibration of the sensor, or one by polynomials.
-    out
-        Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a joint
-        calibration its uncertainty.
-    peak
-        Which of several stripes on a line counts.
+    Args:
+        capture: Capture of a scan.
+        calibration: Calibration of the sensor, or one by polynomials.
+        out: Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a
+            joint calibration its uncertainty.
+        peak: Which of several stripes on a line counts.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
@@ -67,18 +167,12 @@ def evaluate(
 
     Example: uwlts evaluate spheres.ply --truth spheres.truth.h5 --out spheres.evaluation.json
 
-    Parameters
-    ----------
-    cloud
-        Point cloud (.ply or .h5).
-    out
-        Evaluation to write (JSON).
-    artefact
-        TOML file with the artefact's kind and calibrated values, in place of those in the capture.
-    truth
-        Ground truth of the capture, if it was rendered.
-    coloured
-        Also write the cloud with the deviation of every point to this file.
+    Args:
+        cloud: Point cloud (.ply or .h5).
+        out: Evaluation to write (JSON).
+        artefact: TOML file with the artefact's kind and calibrated values, in place of those in the capture.
+        truth: Ground truth of the capture, if it was rendered.
+        coloured: Also write the cloud with the deviation of every point to this file.
     """
     from uwlts.report.inventory import evaluation_lines
 
@@ -109,18 +203,12 @@ def report(
 
     Example: uwlts report runs/demo --reference thesis
 
-    Parameters
-    ----------
-    folder
-        Folder of the campaign.
-    reference
-        Published values to set beside the measured ones: name (thesis) or path of a TOML file.
-    out
-        Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
-    pictures
-        Also write every measurement's stripe and cloud as PNG files into this folder.
-    overwrite
-        Replace an existing report, summary and pictures.
+    Args:
+        folder: Folder of the campaign.
+        reference: Published values to set beside the measured ones: name (thesis) or path of a TOML file.
+        out: Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
+        pictures: Also write every measurement's stripe and cloud as PNG files into this folder.
+        overwrite: Replace an existing report, summary and pictures.
     """
     from uwlts.report.tables import print_table
 
@@ -147,21 +235,14 @@ def thesis(
 
     Example: uwlts thesis runs/thesis
 
-    Parameters
-    ----------
-    folder
-        Folder of the campaigns.
-    published
-        Published tables: name or path of a TOML file.
-    trials
-        Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
-    joint
-        Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without Monte
-        Carlo; writes report.html and summary.json.
-    again
-        Evaluate campaigns anew that have results already.
-    overwrite
-        Replace an existing report.
+    Args:
+        folder: Folder of the campaigns.
+        published: Published tables: name or path of a TOML file.
+        trials: Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
+        joint: Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without
+            Monte Carlo; writes report.html and summary.json.
+        again: Evaluate campaigns anew that have results already.
+        overwrite: Replace an existing report.
     """
     with progress_bar(f"evaluating {folder.name}") as progress:
         written = uwlts.evaluate_thesis(
@@ -185,12 +266,9 @@ def design(sensor: str, *, medium: str) -> None:
 
     Example: uwlts design thesis --medium water
 
-    Parameters
-    ----------
-    sensor
-        Name or path of a sensor description.
-    medium
-        One of the sensor's media.
+    Args:
+        sensor: Name or path of a sensor description.
+        medium: One of the sensor's media.
     """
     from uwlts.report.inventory import table_lines
 
@@ -203,12 +281,9 @@ def nominal(sensor: str, *, medium: str, out: CalibrationOut, overwrite: Overwri
 
     Example: uwlts nominal thesis --medium water --out nominal.json
 
-    Parameters
-    ----------
-    sensor
-        Name or path of a sensor description.
-    medium
-        One of the sensor's media; the laser's window may turn the sheet in it.
+    Args:
+        sensor: Name or path of a sensor description.
+        medium: One of the sensor's media; the laser's window may turn the sheet in it.
     """
     uwlts.write_calibration(out, uwlts.nominal(sensor, medium=medium), overwrite=overwrite)
     print(f"wrote {out}")
@@ -220,10 +295,8 @@ def info(path: str) -> None:
 
     Example: uwlts info capture.h5
 
-    Parameters
-    ----------
-    path
-        File, or name of a shipped sensor such as thesis.
+    Args:
+        path: File, or name of a shipped sensor such as thesis.
     """
     print(uwlts.describe(path))
 
@@ -234,14 +307,11 @@ def import_images(folder: Path, *, out: Path, description: Path | None = None, o
 
     Example: uwlts import photographs --out target.h5
 
-    Parameters
-    ----------
-    folder
-        Folder of PNG, TIFF, BMP or JPEG images.
-    out
-        Capture to write.
-    description
-        TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless given.
+    Args:
+        folder: Folder of PNG, TIFF, BMP or JPEG images.
+        out: Capture to write.
+        description: TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless
+            given.
     """
     with progress_bar(f"importing {folder.name}") as progress:
         imported = uwlts.import_images(folder, out, description=description, overwrite=overwrite, progress=progress)
@@ -255,17 +325,12 @@ def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", ove
 
     Example: uwlts export scan.ply --out scan.laz
 
-    Parameters
-    ----------
-    file
-        Capture (.h5) or cloud (.ply or .h5).
-    out
-        New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
-        .e57.
-    images
-        Format of a capture's images; both keep all bits.
-    overwrite
-        Replace an existing cloud.
+    Args:
+        file: Capture (.h5) or cloud (.ply or .h5).
+        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
+            .e57.
+        images: Format of a capture's images; both keep all bits.
+        overwrite: Replace an existing cloud.
     """
     with progress_bar(f"exporting {file.name}") as progress:
         written = uwlts.export(file, out, images=images, overwrite=overwrite, progress=progress)

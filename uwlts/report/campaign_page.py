@@ -20,7 +20,7 @@ from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_
 from uwlts.report.page_toolkit import Comparison, FigureCollector, Tile, png_data_uri, render_page, svg_of, write_page
 from uwlts.report.pictures import MeasurementPictures, draw_pictures, write_pictures
 from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
-from uwlts.report.tables import Row, parameter_table, residual_table, summary_table, true_window_distance
+from uwlts.report.tables import Row, parameter_table, residual_table, summary_table
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
 _CAPTIONS = {
@@ -113,7 +113,7 @@ def report_page(
         explanations=explanations(rows, reference),
         measurements=[_measurement(measurement, each, collected) for measurement, each in drawn],
         calibration=_calibrations(campaign) if campaign.calibrations else None,
-        true_window=true_window_distance(campaign) is not None,
+        true_window=campaign.true_window_mm is not None,
         seconds=svg_of(plot.seconds(campaign.seconds)) if campaign.seconds else None,
         seconds_in_all=sum(campaign.seconds.values()),
         provenance=_provenance(campaign),
@@ -223,7 +223,7 @@ def _calibrations(campaign: Campaign) -> dict[str, Any]:
         "parameters": parameter_table(campaign),
         "residuals": residual_table(campaign.calibrations),
         "warnings": warnings,
-        "curve": _drawn(plot.window_curves, by_name, true_mm=true_window_distance(campaign)),
+        "curve": _drawn(plot.window_curves, by_name, true_mm=campaign.true_window_mm),
         "groups": groups,
     }
 

@@ -20,6 +20,7 @@ from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium
 from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
+from uwlts.report.numbers import numbers_in
 from uwlts.storage.files import read_json, sha256_of
 
 FORMAT = "uwlts-certificate"
@@ -180,7 +181,7 @@ class SequentialCertificate(Certificate):
     remark: str
     use: str
     media: tuple[CalibratedMedium, ...]
-    residuals: dict[str, dict[str, JsonValue]]
+    residuals: dict[str, dict[str, int | float]]
     sha256: str = ""
 
 
@@ -188,20 +189,9 @@ AnyCertificate = JointCertificate | SequentialCertificate
 
 
 def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
-    """The sealed content of a certificate.
+    """Sealed content of a certificate of the calibration in a file, issued at a time in ISO 8601.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    path : path
-        Its file.
-    issued : str
-        When, in ISO 8601.
-
-    Raises
-    ------
-    CalibrationError
-        Its joint estimate is damaged.
+    Raises CalibrationError: its joint estimate is damaged.
     """
     base = Certificate(
         format=FORMAT,
@@ -230,14 +220,14 @@ def certificate_lines(content: AnyCertificate) -> list[str]:
     if content.remark is not None:
         return [content.remark]
     assert isinstance(content, JointCertificate)
-    longest = {row.axis: row for row in content.lengths}
-    volume = content.validity[0]
+    longest, volume = {row.axis: row for row in content.lengths}, content.validity[0]
+    near, far = volume.camera_depth_mm
+    lengths = [
+        f"{1e3 * row.calibration_mm:.1f} µm of {row.length_mm:g} mm along {row.axis}" for row in longest.values()
+    ]
     return [
-        f"in {volume.name}, {volume.camera_depth_mm[0]:.0f} to {volume.camera_depth_mm[1]:.0f} mm from the "
-        "camera's pupil, expanded uncertainty (k = 2) by the calibration: "
-        + ", ".join(
-            f"{1e3 * row.calibration_mm:.1f} µm of {row.length_mm:g} mm along {axis}" for axis, row in longest.items()
-        ),
+        f"in {volume.name}, {near:.0f} to {far:.0f} mm from the camera's pupil, expanded uncertainty (k = 2) by the "
+        f"calibration: {', '.join(lengths)}",
         *content.cannot_tell,
         *(f"next: {shot.advice}" for shot in content.next_shots[:1]),
     ]
@@ -249,23 +239,18 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
         return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
-    std = calibration.figures("camera").get("std")
-    known = std if isinstance(std, dict) else {}
+    std = numbers_in(calibration.figures("camera").get("std"))
     values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
-    rows = [_row(parameter_of(name), value, _number(known.get(name))) for name, value in values.items()]
+    rows = [_row(parameter_of(name), value, std.get(name)) for name, value in values.items()]
     if window is not None:
-        distance_std = _number(calibration.figures("window").get("std_mm"))
+        distance_std = numbers_in(calibration.figures("window")).get("std_mm")
         rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, distance_std))
         if window.refractions == 2:
             rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm))
             rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index))
     return tuple(rows)
-
-
-def _number(value: JsonValue) -> float | None:
-    return value if isinstance(value, int | float) else None
 
 
 def _row(key: ParameterKey, value: float, std: float | None = None, before: float | None = None) -> ParameterRow:
@@ -282,12 +267,11 @@ def _row(key: ParameterKey, value: float, std: float | None = None, before: floa
 
 def _sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
     window = calibration.window
-    rms: dict[str, dict[str, JsonValue]] = {}
+    rms = {}
     for step in calibration.residuals:
-        figures = calibration.figures(step)
-        shown = {key: figures[key] for key in figures if key in ("rms_px", "rms_mm", "max_mm", "images")}
-        if numbers := {key: value for key, value in shown.items() if _number(value) is not None}:
-            rms[step] = numbers
+        figures = numbers_in(calibration.figures(step)).items()
+        if shown := {key: value for key, value in figures if key in ("rms_px", "rms_mm", "max_mm", "images")}:
+            rms[step] = shown
     return SequentialCertificate(
         **dict(base),
         remark=NOT_JOINT,

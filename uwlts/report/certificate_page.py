@@ -93,10 +93,7 @@ def certificate_page(
 ) -> str:
     """The page as text; ``before`` is another calibration of the sensor with its name, set beside this one.
 
-    Raises
-    ------
-    CalibrationError
-        The joint estimate is damaged, or the other calibration is of another sensor.
+    Raises CalibrationError: the joint estimate is damaged, or the other calibration is of another sensor.
     """
     if before is not None:
         require_same_sensor(calibration, before[1])
@@ -175,15 +172,9 @@ def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool 
     size = np.ptp(at_mm.reshape(-1, 2), axis=0)
     figure, (ax,) = new_figure(3.7, float(np.clip(2.4 * size[1] / size[0], 1.5, 4.0)) + 0.8)
     limit = max(float(np.abs(values).max()), 1e-9)
-    drawn = ax.pcolormesh(
-        *np.moveaxis(at_mm, -1, 0),
-        values,
-        shading="gouraud",
-        rasterized=True,
-        cmap=DEVIATIONS if signed else "Blues",
-        vmin=-limit if signed else 0,
-        vmax=limit,
-    )
+    colours: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit} if signed else {"cmap": "Blues", "vmin": 0}
+    y, z = np.moveaxis(at_mm, -1, 0)
+    drawn = ax.pcolormesh(y, z, values, shading="gouraud", rasterized=True, vmax=limit, **colours)
     ax.set(title=title, xlabel="Y / mm", ylabel="Z / mm, away from the sensor", aspect="equal")
     ax.invert_yaxis()
     ax.grid(visible=False)

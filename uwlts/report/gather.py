@@ -92,10 +92,7 @@ class Campaign:
     def main_digest(self) -> str | None:
         """Digest of the calibration that most clouds were made with; of equally many the first calibration's."""
         used = Counter(m.digest for m in self.measurements if m.digest is not None)
-        own = [calibration.digest for calibration in self.calibrations]
-        if not used:
-            return own[0] if own else None
-        return max(used, key=lambda digest: (used[digest], -own.index(digest) if digest in own else -len(own)))
+        return max([*(c.digest for c in self.calibrations), *used], key=used.__getitem__, default=None)
 
     @property
     def main_calibration(self) -> GatheredCalibration | None:
@@ -114,6 +111,11 @@ class Campaign:
         same = all((s.camera, s.laser) == (mounted[0].camera, mounted[0].laser) for s in mounted)
         return mounted[0] if mounted and same else None
 
+    @property
+    def true_window_mm(self) -> float | None:
+        """Distance of the camera's window as set in the twin; None as `true_sensor`."""
+        return None if self.true_sensor is None else self.true_sensor.camera.window.distance_mm
+
 
 def gather_campaign(folder: str | Path) -> Campaign:
     """Read a campaign's folder.
@@ -122,18 +124,16 @@ def gather_campaign(folder: str | Path) -> Campaign:
     ``NAME.evaluation.json``, calibrations ``calibration*.json``, times ``seconds.json``. A cloud names its capture in
     its metadata; otherwise the capture of the same name is taken.
 
-    Raises
-    ------
-    CaptureError
-        The folder is missing or holds nothing to report, or a file (named in the message) is damaged.
+    Raises CaptureError: the folder is missing or holds nothing to report, or a file (named in the message) is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise CaptureError(f"there is no folder {folder}; give the folder that holds the campaign's files")
     in_hdf5 = list(_files(folder, "*.h5", but=_TRUTH))
     captures = {path.name: _capture(path) for path in in_hdf5 if not is_cloud(path)}
-    calibrations = [_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)]
-    calibrations.sort(key=lambda found: (len(found.name), found.name))
+    read = {path.stem: read_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)}
+    by_length = sorted(read, key=lambda name: (len(name), name))
+    calibrations = [GatheredCalibration(name, read[name], calibration_digest(read[name])) for name in by_length]
     clouds = {path.stem: read_cloud(path) for path in [*filter(is_cloud, in_hdf5), *_files(folder, "*.ply")]}
     judged = {path.name.removesuffix(_EVALUATION): read_evaluation(path) for path in _files(folder, f"*{_EVALUATION}")}
     if not (clouds or judged or calibrations):
@@ -169,11 +169,6 @@ def _capture(path: Path) -> GatheredCapture:
     with Capture(path) as capture:
         laser = tuple(np.flatnonzero(capture.laser_on).tolist())
         return GatheredCapture(path, capture.header, len(capture), laser)
-
-
-def _calibration(path: Path) -> GatheredCalibration:
-    calibration = read_calibration(path)
-    return GatheredCalibration(path.stem, calibration, calibration_digest(calibration))
 
 
 def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, PointCloud | None]:

@@ -16,18 +16,7 @@ from uwlts.model.library import load_sensor
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
-from uwlts.optics.design import (
-    depth_mm,
-    depth_per_pixel_mm,
-    line_length_mm,
-    line_needed_mm,
-    measuring_volume,
-    nominal_setup,
-    scheimpflug_angle_rad,
-    speckle_limit_um,
-    thesis_factor,
-    window_thickness_mm,
-)
+from uwlts.optics import design as formulas
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.calibration_file import read_calibration, read_polynomials
@@ -55,37 +44,39 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[Quantity]:
     DescriptionError
         The sensor or the medium is unknown, or the description cannot be read.
     DesignError
-        As `nominal_setup`.
+        As `uwlts.optics.design.nominal_setup`.
     """
     sensor = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
     camera = sensor.camera
-    setup, leaning = nominal_setup(sensor, sensor.medium(medium))
+    setup, leaning = formulas.nominal_setup(sensor, sensor.medium(medium))
     window, tangent = setup.window, math.tan(setup.triangulation_angle_rad)
     sides = {"width": camera.width_px, "height": camera.height_px}
     along = sides.pop(camera.stripe_along)
     (across,) = sides.values()
-    standoff, outer = float(depth_mm(setup, 0.0)), window.outer_mm
-    per_pixel = float(depth_per_pixel_mm(setup, 0.0))
-    by_factor = float(depth_per_pixel_mm(replace(setup, window=thesis_factor(window.medium_index)), 0.0))
-    near, far = measuring_volume(setup, side_px=across)
-    near_line, line, far_line = line_length_mm(
+    standoff, outer = float(formulas.depth_mm(setup, 0.0)), window.outer_mm
+    per_pixel = float(formulas.depth_per_pixel_mm(setup, 0.0))
+    by_factor = float(
+        formulas.depth_per_pixel_mm(replace(setup, window=formulas.thesis_factor(window.medium_index)), 0.0)
+    )
+    near, far = formulas.measuring_volume(setup, side_px=across)
+    near_line, line, far_line = formulas.line_length_mm(
         setup, np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer]), side_px=along
     )
     apparent = float(window.reach_mm(standoff))
-    tilt = scheimpflug_angle_rad(
+    tilt = formulas.scheimpflug_angle_rad(
         triangulation_angle_rad=math.atan(window.medium_index * tangent),
         magnification=camera.focal_length_mm / apparent,
     )
-    speckle = speckle_limit_um(
+    speckle = formulas.speckle_limit_um(
         wavelength_nm=sensor.laser.wavelength_nm,
         focal_length_mm=camera.focal_length_mm,
         f_number=camera.f_number,
         distance_mm=apparent,
     )
-    glass = window_thickness_mm(
+    glass = formulas.window_thickness_mm(
         pressure_mpa=1.0, unsupported_diameter_mm=camera.window.aperture_diameter_mm, strength_mpa=60.0
     )
-    needed = line_needed_mm(pipe_diameter_mm=300.0, passes=5)
+    needed = formulas.line_needed_mm(pipe_diameter_mm=300.0, passes=5)
     snell = "with Snell's law"
     return [
         Quantity("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),

@@ -68,7 +68,13 @@ class ModelComparisonContent(_Content):
 
 def content_of(comparison: Comparison) -> ModelComparisonContent:
     """All figures of a comparison."""
-    choice = comparison.choice
+    choice, score, polynomials = comparison.choice, comparison.polynomials, comparison.why_none
+    if score is not None:
+        polynomials = (
+            f"polynomials, fitted to the target in {score.medium} alone, miss stripes in {score.images} images inside "
+            f"the calibrated volume by {small_length(score.all_mm)} ± {small_length(score.std_mm)}, the simplest model "
+            f"by {small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not measure"
+        )
     return ModelComparisonContent(
         format="uwlts-models",
         version=1,
@@ -77,41 +83,24 @@ def content_of(comparison: Comparison) -> ModelComparisonContent:
         software=f"uwlts {uwlts.__version__}",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         held_out={where: len(split.held) for where, split in choice.ways.items()},
-        models=[_row(comparison, judged) for judged in choice.judged],
+        models=[_row(choice, judged) for judged in choice.judged],
         best=choice.best().words(),
         simplest=choice.simplest().words(),
-        polynomials=comparison.polynomials,
-        verdicts=[*verdicts(choice), _of_polynomials(comparison)],
+        polynomials=score,
+        verdicts=[*verdicts(choice), polynomials],
         warnings=comparison.warnings,
     )
 
 
-def _row(comparison: Comparison, judged: Judged) -> ModelRow:
-    choice, model = comparison.choice, judged.candidate.words()
+def _row(choice: Choice, judged: Judged) -> ModelRow:
+    row = ModelRow(model=judged.candidate.words(), parameters=judged.parameters)
     if judged.reason:
-        return ModelRow(model=model, parameters=judged.parameters, reason=judged.reason)
-    scores = {}
+        return row.model_copy(update={"reason": judged.reason})
+    scores: dict[str, object] = {}
     for where, score in judged.scores.items():
         cost = adds(choice, judged.candidate, choice.best(), where)
         scores[where] = HeldOutScore(**vars(score), adds_mm=cost and cost[0], adds_std_mm=cost and cost[1])
-    return ModelRow(
-        model=model,
-        parameters=judged.parameters,
-        inside=scores[INSIDE],
-        outside=scores[OUTSIDE],
-        as_good=judged.candidate in choice.as_good(),
-    )
-
-
-def _of_polynomials(comparison: Comparison) -> str:
-    score = comparison.polynomials
-    if score is None:
-        return comparison.why_none
-    return (
-        f"polynomials, fitted to the target in {score.medium} alone, miss stripes in {score.images} images inside the "
-        f"calibrated volume by {small_length(score.all_mm)} ± {small_length(score.std_mm)}, the simplest model by "
-        f"{small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not measure"
-    )
+    return row.model_copy(update=scores | {"as_good": judged.candidate in choice.as_good()})
 
 
 def lines_of(content: ModelComparisonContent) -> list[str]:
@@ -205,12 +194,9 @@ def verdicts(choice: Choice) -> list[str]:
         without = known.get(replace(usual, **{name: DIMENSIONS[name][0]}))
         if without is None:
             continue
-        if without.reason:
-            said.append(f"{part} is needed: {lacking} there is no calibration, {without.reason}")
-        elif costs := _costs(choice, without, usual):
-            said.append(f"{part} is needed: {lacking} {costs}")
-        else:
-            said.append(f"{part} is not needed: {lacking} images held out are predicted as well")
+        loss = f"there is no calibration, {without.reason}" if without.reason else _costs(choice, without, usual)
+        found = f"needed: {lacking} {loss}" if loss else f"not needed: {lacking} images held out are predicted as well"
+        said.append(f"{part} is {found}")
     return [*said, _of_distortion(choice, list(known)), *_chosen(choice)]
 
 

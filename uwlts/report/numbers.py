@@ -61,6 +61,11 @@ def number_list(value: Any) -> list[float | None] | None:
     return value if isinstance(value, list) and all(each is None or is_number(each) for each in value) else None
 
 
+def numbers_in(table: Any) -> dict[str, float]:
+    """The finite numbers in a table from JSON by their names; none if the value is no table."""
+    return {name: value for name, value in table.items() if is_number(value)} if isinstance(table, dict) else {}
+
+
 def entries_of(table: Mapping[str, Any], group: str = "") -> Iterator[tuple[str, str, Any]]:
     """Group, name and value of the entries of nested tables; a group is the names of its tables."""
     for name, value in table.items():

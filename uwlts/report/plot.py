@@ -108,6 +108,8 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     style: dict[str, Any] = {"s": size, "linewidths": 0, "depthshade": False, "rasterized": True}
     if values is None:
         ax.scatter(*points.T, color=PLAIN, **style)
+        if bar is not None:
+            bar.remove()
     else:
         values = values[order]
         known = np.isfinite(values)
@@ -116,8 +118,6 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
             ax.legend(loc="upper left", bbox_to_anchor=(0, 1), bbox_transform=legend_at, markerscale=3, frameon=False)
         drawn = ax.scatter(*points[known].T, c=values[known], **style, **scale)
         ax.figure.colorbar(drawn, cax=bar, ax=None if bar else ax, label=label)
-    if bar is not None and values is None:
-        bar.remove()
     for axis, name, start, end in zip((ax.xaxis, ax.yaxis, ax.zaxis), "XYZ", low, high, strict=True):
         axis.set_label_text(f"{name} / mm")
         axis.labelpad = 18
@@ -159,8 +159,8 @@ def _coloured_by(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, 
 def view_direction() -> np.ndarray:
     """Unit vector (3,) in the OCS along which clouds are looked at."""
     azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
-    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    return np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
 def cloud_limits(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -266,17 +266,15 @@ def stripe(
         Show the brightest part of the stripe, with linear grey values and the centres joined.
     """
     grey = image.image if isinstance(image, Frame) else image
-    if ax is None:
-        _, (ax,) = new_figure(11.2, 4.0)
+    ax = _axes(ax, 11.2, 4.0)
     names = ("column u / px", "row v / px")
     if stripe is not None and stripe.stripe_along == "height":
         grey, names = grey.T, names[::-1]
-    ax.imshow(
-        grey.astype(np.float32) if enlarged else np.sqrt(np.maximum(grey.astype(np.float32), 0)),
-        cmap="gray",
-        interpolation="nearest" if enlarged else "antialiased",
-        vmin=0,
-    )
+    grey_values = grey.astype(np.float32)
+    if enlarged:
+        ax.imshow(grey_values, cmap="gray", interpolation="nearest", vmin=0)
+    else:
+        ax.imshow(np.sqrt(np.maximum(grey_values, 0)), cmap="gray", interpolation="antialiased", vmin=0)
     ax.set(xlabel=names[0], ylabel=names[1])
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(integer=True))
@@ -492,8 +490,7 @@ def _window_curve(calibration: Calibration) -> np.ndarray | None:
 
 def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
     """Draw the time in s of each stage by its name."""
-    if ax is None:
-        _, (ax,) = new_figure(8.0, 0.8 + 0.3 * len(seconds))
+    ax = _axes(ax, 8.0, 0.8 + 0.3 * len(seconds))
     bars = ax.barh([plain_text(name) for name in seconds], list(seconds.values()), color="#7fa6cc")
     ax.bar_label(bars, [f"{value:.3g} s" for value in seconds.values()], padding=4)
     ax.invert_yaxis()
@@ -502,5 +499,5 @@ def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _axes(ax: Axes | None) -> Axes:
-    return new_figure()[1][0] if ax is None else ax
+def _axes(ax: Axes | None, *size: float) -> Axes:
+    return new_figure(*size)[1][0] if ax is None else ax

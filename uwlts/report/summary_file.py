@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict
 from uwlts.measurement.evaluation import TruthComparisons, TruthFigures
 from uwlts.metrology.evaluation import Quantity
 from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
-from uwlts.report.tables import true_window_distance
 from uwlts.storage.files import written_aside
 
 KEY_FIGURES = {
@@ -179,7 +178,7 @@ def _mean_abs(values: Iterable[float]) -> float | None:
 def _window(campaign: Campaign) -> WindowDistance:
     found = campaign.main_calibration
     window = None if found is None else found.calibration.window
-    true = None if window is not None and window.refractions == 1 else true_window_distance(campaign)
+    true = None if window is not None and window.refractions == 1 else campaign.true_window_mm
     return WindowDistance(estimated=None if window is None else window.distance_mm, true=true)
 
 

@@ -14,7 +14,7 @@ from rich.text import Text
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.gather import CALIBRATION, Campaign, GatheredCalibration, Measurement, Reference
-from uwlts.report.numbers import as_fine_as, entries_of, fixed, is_number, plain, unit_of, words_of
+from uwlts.report.numbers import as_fine_as, entries_of, fixed, is_number, numbers_in, plain, unit_of, words_of
 from uwlts.report.page_toolkit import MISSING, Comparison
 from uwlts.report.plot import SHORT_LIST
 
@@ -113,18 +113,12 @@ def _window_rows(campaign: Campaign, reference: Reference | None) -> list[Row]:
             continue
         # A single interface stands for the whole window: its distance has no true value.
         plate = window.refractions == 2
-        true = true_window_distance(campaign) if plate else None
+        true = campaign.true_window_mm if plate else None
         published = reference.values((CALIBRATION,), "window_distance_mm") if reference is not None and plate else ()
         error = None if true is None else window.distance_mm - true
         quantity = "window distance" if plate else "interface distance (1 refraction)"
         rows.append(Row(found.name, quantity, true, window.distance_mm, error, published))
     return rows
-
-
-def true_window_distance(campaign: Campaign) -> float | None:
-    """Distance of the camera's window as set in the twin; None without truth files, or where they disagree."""
-    sensor = campaign.true_sensor
-    return None if sensor is None else sensor.camera.window.distance_mm
 
 
 def parameter_table(campaign: Campaign) -> Comparison:
@@ -151,8 +145,7 @@ def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> Comp
 
 def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
-    stored = calibration.figures("camera").get("std")
-    std = {key: each for key, each in stored.items() if is_number(each)} if isinstance(stored, dict) else {}
+    std = numbers_in(calibration.figures("camera").get("std"))
     table = {}
     for words, value, names in (
         ("focal length, x", camera.fx_px, ("fx", "f")),
@@ -169,8 +162,8 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     table["sheet's distance from the camera", "mm"] = fixed(sheet.offset_mm)
     if window is not None:
         table["refractions", ""] = str(window.refractions)
-        known = calibration.figures("window").get("std_mm")
-        table["window distance d", "mm"] = _with_std(window.distance_mm, known if is_number(known) else None, 3)
+        known = numbers_in(calibration.figures("window")).get("std_mm")
+        table["window distance d", "mm"] = _with_std(window.distance_mm, known, 3)
         cosine = float(window.normal[2] / np.linalg.norm(window.normal))
         table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
         if window.refractions == 2:

@@ -34,7 +34,7 @@ Send = Callable[[Any], None]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 _GRACE_S = 5.0
-"""How long a process may take to leave its files in order before it is killed."""
+"""Time in which a process may leave its files in order before it is killed."""
 
 _AHEAD = 2
 """Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
@@ -42,23 +42,14 @@ _AHEAD = 2
 
 @dataclass(frozen=True)
 class Lost:
-    """A job whose process ended before it did, with the reason.
-
-    ``by_error`` marks an error of the program, whose traceback stands on standard error.
-    """
+    """A job whose process ended first, with the reason; an error of the program (``by_error``) shows its traceback."""
 
     reason: str
     by_error: bool = False
 
 
 class Workers(ABC):
-    """Workers that do jobs many at a time, for as many rounds of jobs as needed; made by `open_workers`.
-
-    Attributes
-    ----------
-    count : int
-        How many work at the same time.
-    """
+    """Workers that do ``count`` jobs at a time, for as many rounds of jobs as needed; made by `open_workers`."""
 
     count: int
 
@@ -217,19 +208,21 @@ def _without_messages(function: Callable[[Job], Result], job: Job, send: Send) -
 
 
 class _Process:
-    """A process and the connection to it."""
+    """A process, which starts when it is given its first job, and the connection to it."""
 
     def __init__(self, threads: int):
         context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe()
+        self.connection, self._theirs = context.Pipe()
         # Not a daemon, which could start no processes of its own; it watches its parent itself.
-        self._process = context.Process(target=_serve, args=(theirs,))
-        _start(self._process, threads)
-        theirs.close()
+        self._process = context.Process(target=_serve, args=(self._theirs,))
+        self._threads = threads
         self._work: Callable[[Any, Send], Any] | None = None
 
     def give(self, work: Callable[[Any, Send], Any], job: Any) -> None:
         """Hand over a job, and what to do with it where that is new."""
+        if self._process.pid is None:
+            _start(self._process, self._threads)
+            self._theirs.close()
         # If the process has ended, `message` reports it.
         with suppress(BrokenPipeError):
             if work is not self._work:
@@ -253,6 +246,8 @@ class _Process:
 
     def stop(self, *, at_once: bool) -> None:
         """Ask the process to end, after its job or at once."""
+        if self._process.pid is None:
+            return
         if at_once:
             self._process.terminate()
         else:
@@ -261,9 +256,10 @@ class _Process:
 
     def end(self, deadline: float) -> None:
         """Wait until a time of the monotonic clock for the process to end, then kill it."""
-        self._process.join(max(0.0, deadline - time.monotonic()))
-        self._process.kill()
-        self._process.join()
+        if self._process.pid is not None:
+            self._process.join(max(0.0, deadline - time.monotonic()))
+            self._process.kill()
+            self._process.join()
         self.connection.close()
 
 
