@@ -177,7 +177,7 @@ _PARTS = {
 
 
 def adds(choice: Choice, candidate: Candidate, other: Candidate, where: str) -> tuple[float, float] | None:
-    """What a model misses besides another, in quadrature, in mm with its standard error; None where it is as good."""
+    """Additional misses of a model against another, in quadrature, mm with standard error; None where it is as good."""
     tally = choice.tallies[where]
     if choice.no_worse(candidate, other, where):
         return None
@@ -214,7 +214,7 @@ def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
 
 
 def _costs(choice: Choice, without: Judged, usual: Candidate) -> str:
-    """Where and by how much a model is worse; nothing where it is as good."""
+    """Ways of holding out in which a model is worse, and by how much; empty where it is as good."""
     found = {where: adds(choice, without.candidate, usual, where) for where in without.scores}
     parts = [
         f"{small_length(cost[0])} ± {small_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     Drawn = Figure | SubFigure | Axes
 
 MISSING = "-"
-"""What stands for a missing value in tables of text."""
+"""Stands for a missing value in tables of text."""
 
 INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b5303c"
 """Colours of text, notes, grid lines, and of the main and the contrasting line; those of ``style.css``."""

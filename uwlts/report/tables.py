@@ -112,11 +112,11 @@ def _window_rows(campaign: Campaign, reference: Reference | None) -> list[Row]:
         if window is None:
             continue
         # A single interface stands for the whole window: its distance has no true value.
-        plate = window.refractions == 2
-        true = campaign.true_window_mm if plate else None
-        published = reference.values((CALIBRATION,), "window_distance_mm") if reference is not None and plate else ()
+        pane = window.refractions == 2
+        true = campaign.true_window_mm if pane else None
+        published = reference.values((CALIBRATION,), "window_distance_mm") if reference is not None and pane else ()
         error = None if true is None else window.distance_mm - true
-        quantity = "window distance" if plate else "interface distance (1 refraction)"
+        quantity = "window distance" if pane else "interface distance (1 refraction)"
         rows.append(Row(found.name, quantity, true, window.distance_mm, error, published))
     return rows
 

@@ -27,18 +27,10 @@ def own_folders(name: str) -> list[Path]:
 
 
 def load_with_companions(library: str) -> tuple[ctypes.CDLL, list[str]]:
-    """Load a library by its path, or by its name from wherever the system has it.
+    """Load a library by its path, or by its name from wherever the system has it; OSError if it cannot be loaded.
 
-    Returns
-    -------
-    ctypes.CDLL, list of str
-        The library, and the paths of those it needs and the system lacks, which were taken from the library's own
-        folder, in loading order.
-
-    Raises
-    ------
-    OSError
-        It cannot be loaded.
+    Returned with it, in loading order, are the paths of the libraries that it needs and the system lacks, which were
+    taken from its own folder.
     """
     companions: list[str] = []
     asked: set[str] = set()
@@ -66,10 +58,7 @@ def file_of(name: str, folder: Path) -> Path | None:
 def load_aravis() -> ctypes.CDLL:
     """Aravis 0.8: the library named by the variable UWLTS_LIBARAVIS, else the system's, else one in an own folder.
 
-    Raises
-    ------
-    SetupError
-        It is not there or does not load; the message says how to install it.
+    Raises SetupError: it is not there or does not load; the message says how to install it.
     """
     if chosen := os.environ.get(ARAVIS_VARIABLE):
         try:

@@ -64,10 +64,7 @@ class Workers(ABC):
         Jobs are taken from ``jobs`` only shortly before they are begun. A job whose process dies is done once more; if
         its process dies again, its result is `Lost`. What a job raises leaves this function.
 
-        Raises
-        ------
-        SetupError
-            The cluster is gone, or a job fails unexpectedly; its traceback stands on standard error.
+        Raises SetupError: the cluster is gone, or a job fails unexpectedly; its traceback stands on standard error.
         """
 
 
@@ -80,10 +77,7 @@ def open_workers(
     ``patience_s`` is how long the scheduler at the address may take to answer. Processes share the machine's threads.
     When an exception leaves the body, KeyboardInterrupt stops the jobs that are under way; no process is left.
 
-    Raises
-    ------
-    SetupError
-        Dask is not installed, or no scheduler answers at the address, or it has no workers.
+    Raises SetupError: Dask is not installed, or no scheduler answers at the address, or it has no workers.
     """
     if scheduler is not None:
         with _cluster(scheduler, patience_s) as cluster:
@@ -109,12 +103,7 @@ def work_through(
     ``workers`` is the number of processes, one per processor unless given; with 1, jobs run in this process. Each
     process does linear algebra in one thread, unless the environment sets another number.
 
-    Raises
-    ------
-    Error, OSError
-        As the first job that fails raises it.
-    SetupError
-        A process has ended before its job.
+    Raises Error or OSError as the first job that fails; SetupError: a process has ended before its job.
     """
     if workers == 1:
         return [work(job, on_message) for job in jobs]
