@@ -225,7 +225,7 @@ def test_commands_are_answered_while_an_image_is_made(scene, camera):
     assert camera.grab(WAIT_S).image[0, 1] == 5
 
 
-def test_an_image_that_cannot_be_made_is_left_out_and_told(served, scene, camera):
+def test_an_image_that_cannot_be_made_is_left_out_and_reported(served, scene, camera):
     camera.configure(trigger="software")
     camera.start()
     scene.frame = None
@@ -236,7 +236,7 @@ def test_an_image_that_cannot_be_made_is_left_out_and_told(served, scene, camera
     assert "the image is (2, 2)" in str(served.failure)
 
 
-def test_a_camera_that_goes_away_is_told_and_can_come_back(served):
+def test_a_camera_that_goes_away_is_reported_and_can_come_back(served):
     with open_camera(served.address) as camera:
         camera.configure(frame_rate_hz=10)
         camera.start()

@@ -43,7 +43,7 @@ def write(path: Path, sensor: Sensor, images: list[tuple[np.ndarray, bool]]) -> 
             writer.append(Frame(image, float(k), laser_on, 1.0, float(k)))
 
 
-def test_an_image_tells_its_stripe_points_and_faults(thesis, tmp_path):
+def test_an_image_shows_its_stripe_points_and_faults(thesis, tmp_path):
     dark = stripe_image(thesis, height_dn=0.0)
     images = [(stripe_image(thesis, height_dn=h), True) for h in (150.0, 12.0, 900.0)] + [(dark, True), (dark, False)]
     write(tmp_path / "live.h5", thesis, images)

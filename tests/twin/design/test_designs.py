@@ -177,7 +177,7 @@ def test_a_design_as_built_is_judged_as_in_the_sweep(study):
         assert swept.figures[name] == pytest.approx(alone.figures[name], rel=1e-12, nan_ok=True)
 
 
-def test_designs_that_fail_are_told_with_their_reason(study):
+def test_designs_that_fail_are_reported_with_their_reason(study):
     good = Design(0, {BASELINE: 300.0, "camera.window.glass": "N-BK7", "camera": "large"})
     absurd = Design(1, good.values | {BASELINE: -5.0})
     close = Design(2, good.values | {BASELINE: 60.0})

@@ -180,7 +180,7 @@ def told(objects: Objects, si: mi.SurfaceInteraction3f) -> np.ndarray:
     return np.stack([f(si).numpy() for f in (objects.mirror_share, objects.polarisation, objects.roughness_um)])
 
 
-def test_every_place_tells_the_facts_of_its_own_object_whatever_scenes_there_are():
+def test_every_place_has_the_facts_of_its_own_object_whatever_scenes_there_are():
     finishes = [{"reflectance": 0.1, "mirror": 0.1 * i, "roughness_um": 1.0 + i} for i in range(6)]
     first, second = built(row_of(*finishes)), built(row_of({"finish": "metal"}, *finishes[::-1]))
     start, towards = from_above(8)

@@ -80,7 +80,7 @@ def test_charge_is_conserved_or_drained_never_made(seed, sources, share):
 
 
 @pytest.mark.parametrize(("share", "neighbours"), [(0.0, 0), (1.0, 200)])
-def test_a_detector_blooms_only_when_told(share, neighbours):
+def test_a_detector_blooms_only_when_described_so(share, neighbours):
     # Twenty rows of three full wells are 40 too many: 20 rows above and 20 below them fill up in each of 5 columns.
     chip = Detector(bits=8, quantum_efficiency=0.5, full_well_e=FULL, read_noise_e=0.0, blooming=share)
     assert Detector(bits=8, quantum_efficiency=0.5, full_well_e=FULL, read_noise_e=0.0).blooming == 0

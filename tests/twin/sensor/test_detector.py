@@ -136,7 +136,7 @@ def test_black_level_keeps_the_dark_noise_from_being_cut_off():
     assert lifted.std() == pytest.approx(spread, rel=0.02)
 
 
-def test_dark_current_doubles_every_eight_degrees_unless_told_otherwise():
+def test_dark_current_doubles_every_eight_degrees_unless_described_otherwise():
     # One electron per grey value, 100 electrons in a second at the reference.
     plain = {"full_well_e": 4095.0, "dark_current_e_per_s": 100.0, "black_level_dn": 0.0}
     at = partial(flat, 0.0, exposure_ms=1000.0, seed=None)

@@ -122,7 +122,7 @@ def test_light_explains_why_no_target_is_found(small, gain, says):
     assert why_not_found(image, str(error.value), full_dn=FULL).startswith(says)
 
 
-def test_a_target_that_is_not_there_is_told_by_its_search(small):
+def test_a_target_that_is_not_there_is_reported_by_its_search(small):
     image = np.full((512, 640), 90, np.uint8)
     assert why_not_found(image, "found no circles", full_dn=FULL) == "found no circles"
 
@@ -135,7 +135,7 @@ def test_a_partial_target_is_refused(small):
     assert any(reason.startswith("partial") for reason in quality.reasons), quality
 
 
-def test_motion_and_sameness_are_told_in_pixels(small):
+def test_motion_and_sameness_are_reported_in_pixels(small):
     first = PLATE.detect(drawn_lamp(small, PLATE, target_pose()))
     again = PLATE.detect(drawn_lamp(small, PLATE, target_pose(), seed=1))
     # f of about 1220 px at 378 mm: 1 mm is 3.2 px.
@@ -218,7 +218,7 @@ def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int
     return state
 
 
-def test_following_the_wishes_leads_to_a_good_camera_soon(setting, thesis_as_built):
+def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_built):
     wanted = Wanted(focal_std_px=0.5, centre_std_px=0.4, coverage=0.85, fewest_images=5)
     state = led(setting, wanted, np.random.default_rng(3), most=14)
     assert state.enough and missing(state) == []
@@ -233,7 +233,7 @@ def test_following_the_wishes_leads_to_a_good_camera_soon(setting, thesis_as_bui
     assert (tilts.max(axis=0) > 12).all() and (tilts.min(axis=0) < -12).all()
 
 
-def test_wished_poses_beat_as_many_random_ones(setting):
+def test_advised_poses_beat_as_many_random_ones(setting):
     wanted = Wanted(focal_std_px=1e-6, centre_std_px=1e-6)
     count = 6
     wished = led(setting, wanted, np.random.default_rng(3), most=count)
@@ -268,7 +268,7 @@ def test_an_image_seen_again_gains_little(setting):
     assert gain_of(state, again, state.poses[-1]) < 0.4 * wish.gain
 
 
-def test_wishes_are_said_in_plain_words(setting):
+def test_pose_advice_is_in_plain_words(setting):
     state = state_of(recorded(setting, [target_pose(middle_mm=(-60, -40, 330.0))], np.random.default_rng(0)), setting)
     wish = best_pose(state)
     far = replace(wish, distance_mm=450.0, place=(0.8, 0.8))

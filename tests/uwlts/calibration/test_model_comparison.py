@@ -145,7 +145,7 @@ def test_a_target_held_by_hand_is_predicted_from_its_own_points(thesis):
     assert np.sqrt(np.mean(stripes**2)) == pytest.approx(0.1, rel=0.25)
 
 
-def test_what_a_model_adds_is_told_from_noise_and_strays_do_not_count():
+def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count():
     """A miss common to all points of an image adds its square to the mean square, whatever the noise."""
     rng = np.random.default_rng(0)
     noise = [rng.normal(0, 0.1, 1000) for _ in range(12)]

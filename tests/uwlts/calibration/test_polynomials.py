@@ -215,7 +215,7 @@ def test_noise_is_averaged_over_the_lines(sensor):
     assert noisy.warnings == []
 
 
-def test_kinked_laser_line_is_told(sensor, evidence):
+def test_kinked_laser_line_is_reported(sensor, evidence):
     """A laser line with ripples of 20 lines is no polynomial over the lines."""
     rippled = [s + np.column_stack([np.zeros(len(s)), 0.5 * np.sin(s[:, 0] / 3)]) for s in evidence.stripes]
     found = fit_polynomials(replace(evidence, stripes=rippled), header_of(sensor), degree=6)
@@ -281,7 +281,7 @@ def test_offset_of_the_position_changes_nothing(evidence):
     assert np.abs(there.coefficients - here.coefficients).max() < 1e-9
 
 
-def test_strays_are_left_out(sensor, evidence, result):
+def test_outliers_are_left_out(sensor, evidence, result):
     rng = np.random.default_rng(5)
     stripes, count = [], 0
     for stripe in evidence.stripes:
@@ -379,7 +379,7 @@ def test_file_gives_back_the_same(file, result):
     assert "Z(position): residual 0.000" in text
 
 
-def test_the_other_kind_is_told_by_its_format(tmp_path, sensor):
+def test_the_other_kind_is_recognised_by_its_format(tmp_path, sensor):
     rays = nominal_calibration(sensor)
     write_calibration(tmp_path / "rays.json", rays)
     assert load_calibration(tmp_path / "rays.json") == rays

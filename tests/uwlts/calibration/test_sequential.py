@@ -142,7 +142,7 @@ def test_circle_offsets_are_taken_out(result, files):
     assert "window" not in plain.calibration.residuals
 
 
-def test_images_left_out_are_told(result):
+def test_images_left_out_are_reported(result):
     told = "\n".join(result.warnings)
     assert "frame 10: left out" in told
     assert "frame 11: stripe left out, no target was found at 500 mm" in told

@@ -72,7 +72,7 @@ def test_the_normals_scatter_is_the_reported_one():
     assert 0.6 * np.mean(reported) < rms < 2.0 * np.mean(reported)
 
 
-def test_strays_are_left_out_and_counted():
+def test_outliers_are_left_out_and_counted():
     rng = np.random.default_rng(2)
     points = stripe_points(noise_px=0.15, rng=rng).points_mm
     clean = fit_sheet(points, nominal_normal=LASER.normal)

@@ -88,7 +88,7 @@ def test_nine_noisy_steps_scatter_as_reported():
     assert mean_reported == pytest.approx(np.mean(scatter), rel=0.24)
 
 
-def test_a_wrong_height_shifts_the_distance_as_told():
+def test_a_wrong_height_shifts_the_distance_as_stated():
     solution = solve_window(AIR, PLATE, clean_steps(PLATE))
     wrong = solve_window(AIR, PLATE, [with_height(step, STEP_MM + 0.02) for step in clean_steps(PLATE)])
     # The thesis's height uncertainty of 0.02 mm: nearly 1 mm of window distance, all but linear.
@@ -113,7 +113,7 @@ def test_media_may_differ_from_image_to_image():
 
 
 @pytest.mark.parametrize("window", [PLATE, INTERFACE])
-def test_air_tells_nothing_of_the_distance(window):
+def test_air_shows_nothing_of_the_distance(window):
     with pytest.raises(CalibrationError, match="hardly depends"):
         solve_window(AIR, window, steps(window, nine_steps()[3:6], index=1.0))
 

@@ -109,7 +109,7 @@ def test_the_requirements_are_the_projects_own():
     assert "dask" in {Requirement(line).name for line in extras}
 
 
-def test_an_installed_package_tells_its_requirements_without_a_checkout(tmp_path):
+def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path):
     for source in [
         ROOT / "uwlts" / "__init__.py",
         *(ROOT / "uwlts" / "doctor").glob("*.py"),
@@ -361,7 +361,7 @@ def test_settings_that_contradict_the_documentation_are_named():
     assert mechanics.found.endswith(": $100 is 250") and mechanics.advice.endswith("$100=80")
 
 
-def test_a_stage_without_a_switch_is_told_what_that_means():
+def test_a_stage_without_a_switch_is_explained():
     with unmoved(settings={20: 0, 22: 0}) as controller:
         _, settings, state = devices.try_stage(controller.port)
     assert "without a limit switch" in settings.advice

@@ -64,7 +64,7 @@ def test_darkness_has_no_exposure(thesis):
     assert settled_exposure(faint, sensor=thesis, light="laser") == thesis.exposure.longest_ms
 
 
-def test_saturation_on_many_lines_is_told_from_a_reflection(thesis):
+def test_saturation_on_many_lines_is_distinguished_from_a_reflection(thesis):
     light = stripe(thesis, 150.0)
     glint, much = light.copy(), light.copy()
     glint[498:503, 400:412] = 1000.0
@@ -73,7 +73,7 @@ def test_saturation_on_many_lines_is_told_from_a_reflection(thesis):
     assert brightness(Exposed(much)(1.0), thesis, "laser").overexposed
 
 
-def test_the_laser_is_told_from_daylight(thesis):
+def test_the_laser_is_distinguished_from_daylight(thesis):
     rows = np.arange(1024)[:, None]
     # A bright bar that daylight shows, as narrow as a stripe, and a step.
     bar = 120.0 * np.exp(-0.5 * ((rows - 700) / 2.0) ** 2) * np.ones((1, 1280)) + 60.0 * (rows > 300)

@@ -297,7 +297,7 @@ def test_a_controller_that_cannot_do_it_is_refused(options, message):
         assert wait_for(lambda: not controller.state().port_open)
 
 
-def test_a_silent_port_and_a_foreign_device_are_told_apart():
+def test_a_silent_port_and_a_foreign_device_are_distinguished():
     master, slave = pty.openpty()
     tty.setraw(slave)
     try:

@@ -35,7 +35,7 @@ def test_the_slip_is_found_to_its_standard_error(slip_mm):
     assert all(relief.is_significant(*each) == (abs(slip_mm) > 0.05) for each in found)
 
 
-def test_where_the_picture_stays_the_same_nothing_is_told():
+def test_where_the_picture_stays_the_same_nothing_is_reported():
     rng = np.random.default_rng(2)
     assert watched(np.zeros(LINES), rng).relief is None
     assert watched(np.full(LINES, 0.1), rng).relief is None

@@ -296,7 +296,7 @@ def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, th
     np.testing.assert_allclose(found.T @ found, expected, rtol=1e-6, atol=1e-15)
 
 
-def test_a_calibration_by_turns_tells_none(calibration, thesis):
+def test_a_sequential_calibration_has_none(calibration, thesis):
     without = calibration.model_copy(update={"joint": None})
     with pytest.raises(CalibrationError, match="calibrate jointly"):
         stored_estimate(without, thesis, MEDIUM)

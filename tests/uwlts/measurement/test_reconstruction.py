@@ -69,10 +69,10 @@ CALIBRATION = nominal_calibration(small_sensor())
 
 
 def test_stripes_are_those_of_the_laser_images(path):
-    told = []
+    reported = []
     with Capture(path) as capture:
-        stripes = find_stripes(capture, progress=lambda done, total: told.append((done, total)))
-    assert told == [(2, 5), (3, 5), (5, 5)]
+        stripes = find_stripes(capture, progress=lambda done, total: reported.append((done, total)))
+    assert reported == [(2, 5), (3, 5), (5, 5)]
     assert sorted(set(stripes.frame.tolist())) == [1, 2, 4]
     assert len(stripes.frame) == len(stripes.line) == len(stripes.centre_px) == len(stripes.amplitude)
     assert len(stripes.line) > 3 * (WIDTH - 20)

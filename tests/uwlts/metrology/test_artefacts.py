@@ -59,10 +59,10 @@ def dumbbell(rng, *, count: int = 6000, seen: int = 2, half_angle_deg: float = 7
 
 
 @pytest.mark.parametrize("wall_z", [340.0, 325.5, 305.0, 300.0])
-def test_two_spheres_before_a_wall_with_stray_points(wall_z):
+def test_two_spheres_before_a_wall_with_outliers(wall_z):
     rng = np.random.default_rng(1)
-    spheres, strays = dumbbell(rng), rng.uniform([-60, -90, 250], [80, 130, 340], (60, 3))
-    points = np.vstack([spheres, wall(rng, 60000, z=wall_z), strays])
+    spheres, outliers = dumbbell(rng), rng.uniform([-60, -90, 250], [80, 130, 340], (60, 3))
+    points = np.vstack([spheres, wall(rng, 60000, z=wall_z), outliers])
     shuffled = rng.permutation(len(points))
     result = evaluate_cloud(cloud_of(points[shuffled]), DUMBBELL)
     for number, sphere in enumerate(result.spheres):
@@ -184,7 +184,7 @@ def test_a_plane_has_the_range_and_scatter_that_were_drawn(turn, seed):
     assert np.isnan(result.deviation_mm[:9]).all()
 
 
-def test_more_than_a_few_strays_are_told():
+def test_more_than_a_few_outliers_are_reported():
     points, _ = flat(np.random.default_rng(0), 3000)
     points[:30, 2] -= 5
     assert not evaluate_cloud(cloud_of(points), PlaneStandard()).within_vdi_outliers
@@ -238,9 +238,9 @@ SHAPES = {
 
 
 def step_profile(
-    rng, shape: str, *, tilt_deg: float = 0.0, sigma: float = 0.05, height: float = HEIGHT, strays: int = 8
+    rng, shape: str, *, tilt_deg: float = 0.0, sigma: float = 0.05, height: float = HEIGHT, outliers: int = 8
 ):
-    """Profile (Y, Z) with three mixed points at each edge and strays, and the true treads (0 for these)."""
+    """Profile (Y, Z) with three mixed points at each edge and outliers, and the true treads (0 for these)."""
     y = np.linspace(-88, 88, 900)
     up = SHAPES[shape](y)
     z, tread = np.where(up, -height, 0.0), np.where(up, StepFace.UPPER, StepFace.LOWER)
@@ -250,8 +250,8 @@ def step_profile(
     points = np.column_stack([y, z + rng.normal(0, sigma, len(y))])
     angle = np.radians(tilt_deg)
     points = points @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]) + [3, 310]
-    points = np.vstack([points, rng.uniform([-88, 240], [88, 360], (strays, 2))])
-    return points, np.concatenate([tread, np.zeros(strays, dtype=int)])
+    points = np.vstack([points, rng.uniform([-88, 240], [88, 360], (outliers, 2))])
+    return points, np.concatenate([tread, np.zeros(outliers, dtype=int)])
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -262,14 +262,14 @@ def test_profiles_are_labelled_and_measured(shape, tilt_deg):
         points, tread = step_profile(np.random.default_rng(seed), shape, tilt_deg=tilt_deg)
         labels = label_step_faces(points, height_mm=24.0)
         named = labels != StepFace.NEITHER
-        # A stray may fall on a tread by chance (0.5 mm of 120); mixed points and the other tread never pass.
+        # An outlier may fall on a tread by chance (0.5 mm of 120); mixed points and the other tread never pass.
         assert np.count_nonzero(labels[named] != tread[named]) <= 1
         assert not np.any(named[:900] & (tread[:900] == StepFace.NEITHER))
         kept += np.count_nonzero(named)
         for reference in ("lower", "upper"):
             height = step_height(points, labels, reference=reference)
             scaled.append((height.height_mm - HEIGHT) / height.std_mm)
-    # Edges and strays blank 1 mm to each side: at most 12 x 2 of 176 mm.
+    # Edges and outliers blank 1 mm to each side: at most 12 x 2 of 176 mm.
     assert kept > 6 * 900 * (1 - 24 / 176 - 0.02)
     assert np.abs(scaled).max() < 4.5
     assert np.std(scaled) > 0.3
@@ -309,7 +309,7 @@ def test_labels_serve_slightly_changed_points():
 
 
 def test_a_step_as_low_as_ten_times_the_noise_is_found():
-    points, _ = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, strays=0)
+    points, _ = step_profile(np.random.default_rng(2), "base, block, base", sigma=0.1, height=1.0, outliers=0)
     labels = label_step_faces(points, height_mm=1.0)
     assert np.count_nonzero(labels) > 600
     height = step_height(points, labels)
@@ -337,7 +337,7 @@ def step_scan(turn_deg: float) -> PointCloud:
     points, frames = [], []
     for number in range(40):
         profile, _ = step_profile(
-            rng, "base, block, base", tilt_deg=5, height=HEIGHT / cosine, sigma=0.05 / cosine, strays=2
+            rng, "base, block, base", tilt_deg=5, height=HEIGHT / cosine, sigma=0.05 / cosine, outliers=2
         )
         # Turning about Y shears the profiles along Z.
         points.append(
@@ -401,7 +401,7 @@ def test_a_scan_without_a_step_is_refused():
         ({"kind": "pipe", "diameter_mm": 300.0}, Pipe),
     ],
 )
-def test_descriptions_are_told_apart_by_kind(table, kind):
+def test_descriptions_are_distinguished_by_kind(table, kind):
     adapter = TypeAdapter(Artefact)
     artefact = adapter.validate_python(table)
     assert type(artefact) is kind

@@ -288,7 +288,7 @@ def test_wrong_calls_are_refused(call):
         call()
 
 
-# --- stray points
+# --- outliers
 
 
 @pytest.mark.parametrize(
@@ -299,15 +299,15 @@ def test_wrong_calls_are_refused(call):
         (partial(fit_cylinder, axis_start=[1, 0, 0]), partial(patch, radius=150, arc=1.2, length=40)),
     ],
 )
-def test_planted_strays_and_only_they_are_rejected(fit, draw):
+def test_planted_outliers_and_only_they_are_rejected(fit, draw):
     rng = np.random.default_rng(8)
     points = draw(rng, 4000) + rng.normal(0, SIGMA, (4000, 3))
-    strays = rng.choice(4000, 40, replace=False)
-    points[strays, 2] += rng.uniform(2, 15, 40)  # at least 20 standard deviations up
+    outliers = rng.choice(4000, 40, replace=False)
+    points[outliers, 2] += rng.uniform(2, 15, 40)  # at least 20 standard deviations up
     robust = fit_robustly(fit, points)
-    clean = fit(np.delete(points, strays, axis=0))
+    clean = fit(np.delete(points, outliers, axis=0))
     # Of 3960 normal residuals 0.002 lie beyond 5 standard deviations.
-    np.testing.assert_array_equal(np.flatnonzero(~robust.inliers), np.sort(strays))
+    np.testing.assert_array_equal(np.flatnonzero(~robust.inliers), np.sort(outliers))
     assert (robust.rejected, robust.rejected_share) == (40, 0.01)
     np.testing.assert_allclose(robust.fit.residuals_mm, clean.residuals_mm, atol=1e-8)
     np.testing.assert_array_equal(robust.fit.residuals_mm, robust.distances_mm[robust.inliers])

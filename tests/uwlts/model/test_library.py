@@ -91,7 +91,7 @@ def test_file_may_be_called_like_its_shipped_base(tmp_path: Path, monkeypatch):
 
 
 @pytest.mark.parametrize("ring", [1, 2, 3])
-def test_cycles_are_told_with_their_way(tmp_path: Path, ring: int):
+def test_cycles_are_reported_with_their_path(tmp_path: Path, ring: int):
     for number in range(ring):
         written(tmp_path / f"ring{number}.toml", f'base = "ring{(number + 1) % ring}"\n')
     # A file that names itself looks for a shipped description of this name.
@@ -138,7 +138,7 @@ def test_wrong_keys_are_named_with_what_was_found(tmp_path: Path, text: str, wor
     refused(written(tmp_path / "a.toml", f'base = "thesis"\n{text}'), "a.toml", *words)
 
 
-def test_all_wrong_keys_are_told_at_once(tmp_path: Path):
+def test_all_wrong_keys_are_reported_at_once(tmp_path: Path):
     path = written(tmp_path / "a.toml", "name = 3\nspeed = 1\n")
     message = refused(path, "is not a valid sensor:", "camera: missing")
     assert len(message.splitlines()) > 5
@@ -162,7 +162,7 @@ def test_what_is_no_toml(tmp_path: Path, content: bytes):
     refused(path, "a.toml is not valid TOML")
 
 
-def test_model_name_is_told_in_words():
+def test_model_name_is_given_in_words():
     class ReferenceValues(Medium):
         pass
 

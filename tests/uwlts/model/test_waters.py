@@ -201,7 +201,7 @@ def test_given_coefficients_win():
     assert sea(water="harbour", scattering_per_m=0.0).scatterers(635.0) == ()
 
 
-def test_a_custom_medium_scatters_only_if_told_to():
+def test_a_custom_medium_scatters_only_if_described_so():
     assert Medium(kind="custom", index=1.4).scatterers(635.0) == ()
     assert Medium(kind="air").scatterers(635.0) == ()
     named = Medium(kind="custom", index=1.34, water="coastal")

@@ -160,7 +160,7 @@ def threads(job, send):
     return os.environ.get("OPENBLAS_NUM_THREADS"), os.environ.get("OMP_NUM_THREADS")
 
 
-def test_workers_do_linear_algebra_in_one_thread_unless_told_otherwise(monkeypatch):
+def test_workers_do_linear_algebra_in_one_thread_unless_set_otherwise(monkeypatch):
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     assert work_through(threads, [0, 1], workers=2) == [("1", "3")] * 2

@@ -88,7 +88,7 @@ def test_both_files_hold_the_systematic_covariance_for_other_programs(tmp_path):
         np.testing.assert_array_equal(file["systematic_mm2"], np.stack([vertices[pair] for pair in pairs], axis=1))
 
 
-def test_captures_and_clouds_in_hdf5_are_told_apart(tmp_path):
+def test_captures_and_clouds_in_hdf5_are_distinguished(tmp_path):
     capture = drawn_stripes.write(tmp_path / "capture.h5", [])
     write_cloud(tmp_path / "cloud.h5", some_cloud())
     assert not is_cloud(capture)

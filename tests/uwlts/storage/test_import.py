@@ -76,7 +76,7 @@ def test_every_format_comes_in(tmp_path: Path, suffix: str):
         assert error.max() <= (12 if suffix in (".jpg", ".jpeg") else 0)
 
 
-def test_everything_told_is_in_the_capture(tmp_path: Path):
+def test_everything_described_is_in_the_capture(tmp_path: Path):
     target = {"kind": "chessboard", "columns": 9, "rows": 6, "square_mm": 15.0}
     artefact = {"kind": "step", "height_mm": 23.17}
     told = without("laser", laser="l*", lamp="w*", exposure_ms=4.0, lamp_exposure_ms=9.0, target=target, name="bench")
@@ -196,7 +196,7 @@ def test_free_poses_count_the_images(tmp_path: Path):
 
 
 @pytest.mark.parametrize("separator", [",", ";"])
-def test_a_table_tells_each_image(tmp_path: Path, separator: str):
+def test_a_table_describes_each_image(tmp_path: Path, separator: str):
     pose = np.eye(4)
     pose[:3, 3] = 1.5, -2.25, 1 / 3
     cells = separator.join(repr(value) for value in pose.ravel().tolist())
@@ -218,7 +218,7 @@ def test_a_table_tells_each_image(tmp_path: Path, separator: str):
         assert np.array_equal(capture.pose[0], pose) and np.isnan(capture.pose[1:]).all()
 
 
-def test_patterns_say_which_image_is_what_where_the_table_tells_positions_only(tmp_path: Path):
+def test_patterns_say_which_image_is_what_where_the_table_has_positions_only(tmp_path: Path):
     told = without("stage", "laser", laser="l*", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
     folder = three(tmp_path, told)
     (folder / "each.csv").write_text("file,stage_mm\nl2.png,4\nl1.png,3\n")
@@ -324,7 +324,7 @@ def test_the_wrong_channel_is_black(tmp_path: Path):
     refused(folder, tmp_path, ImageError, "black.*the channel that of its colour")
 
 
-def test_one_black_image_is_told(tmp_path: Path):
+def test_one_black_image_is_reported(tmp_path: Path):
     imported = import_images(three(tmp_path, l2=np.zeros((HEIGHT, WIDTH), np.uint8)), tmp_path / "a.h5")
     assert imported.warnings[0] == "1 of 3 laser images are black, such as l2.png"
 
@@ -340,7 +340,7 @@ def test_white_with_ten_bits(tmp_path: Path):
     refused(folder, tmp_path, ImageError, "is white: 100 % .*1023 DN")
 
 
-def test_without_stripe_is_told_and_imported(tmp_path: Path):
+def test_without_stripe_is_reported_and_imported(tmp_path: Path):
     folder = folder_of(tmp_path, {f"l{n}.png": stripe_image(height=0, dark=40, seed=n) for n in (1, 2)})
     warnings = import_images(folder, tmp_path / "a.h5").warnings
     assert len(warnings) == 1 and "no stripe in any of the 2 laser images" in warnings[0]
@@ -348,7 +348,7 @@ def test_without_stripe_is_told_and_imported(tmp_path: Path):
         assert len(capture) == 2
 
 
-def test_a_stripe_across_is_told(tmp_path: Path):
+def test_a_stripe_across_is_reported(tmp_path: Path):
     square = {"width_px": 80, "height_px": 80}
     sensor = SENSOR | {"camera": SENSOR["camera"] | square}
     image = stripe_image()[:, :80].T

@@ -228,7 +228,7 @@ def test_circles_cut_by_a_stripe_are_left_out(bright):
     assert np.abs(errors).max() < 0.15
 
 
-def test_missing_circles_and_stray_blobs_do_not_confuse_the_numbering():
+def test_missing_circles_and_false_blobs_do_not_confuse_the_numbering():
     random = np.random.default_rng(5)
     missing = [tuple(place) for place in random.integers(-5, 7, (35, 2)).tolist() if tuple(place) not in MARKS]
     camera = Camera((15, -25, 40), (0, 0, 320), k=(-0.2, 0.0))

@@ -1,4 +1,4 @@
-"""Drawn scans of spheres measured as the thesis's campaigns are: stripes sorted by sphere, figures, failures told."""
+"""Drawn scans of spheres measured as the thesis's campaigns are: stripes by sphere, figures, failures reported."""
 
 import math
 from dataclasses import replace

@@ -298,9 +298,9 @@ def test_free_forms_and_experiments():
 
 
 def test_sentences_give_the_measured_numbers():
-    told = " ".join(differences(all_rows([campaign()], PUBLISHED)))
-    assert "The polynomials in water err by 0.115 mm" in told
-    assert "single viewpoint" not in told
+    reported = " ".join(differences(all_rows([campaign()], PUBLISHED)))
+    assert "The polynomials in water err by 0.115 mm" in reported
+    assert "single viewpoint" not in reported
 
 
 class Page(HTMLParser):
@@ -480,7 +480,7 @@ def test_results_are_read_again(tmp_path):
     assert list(json.loads(path.read_text()))[:3] == ["format", "version", "measurements"]
 
 
-def test_a_campaigns_recordings_are_told_by_their_names(tmp_path):
+def test_a_campaigns_recordings_are_found_by_their_names(tmp_path):
     for number in (10, 2, 0):
         (tmp_path / f"campaign-{number}").mkdir()
     (tmp_path / "campaign-9").write_text("no folder")

@@ -185,7 +185,7 @@ def draw(knowledge, evidence=None, start=None):
 
 def test_exact_views_without_uncertainty_do_not_scatter():
     evidence, start = clean()
-    told = []
+    reported = []
     scans = [spheres(), spheres(depth_mm=60.0)]
     results = propagate(
         evidence,
@@ -195,9 +195,9 @@ def test_exact_views_without_uncertainty_do_not_scatter():
         options=PLAIN,
         trials=20,
         workers=1,
-        progress=lambda done, total: told.append((done, total)),
+        progress=lambda done, total: reported.append((done, total)),
     )
-    assert told == [(n, 20) for n in range(1, 21)]
+    assert reported == [(n, 20) for n in range(1, 21)]
     assert [result.placement for result in results] == ["15", "60"]
     for result in results:
         # Views are rounded at 1e-13 px, a pixel is 0.3 mm, and height errors count a hundredfold.
@@ -342,7 +342,7 @@ def test_the_shortest_interval_of_a_known_sample():
     # Squares lie densest at 0: the first 95 of 100.
     squares = np.random.default_rng(3).permutation(np.arange(100.0)) ** 2
     assert propagated(squares).interval_mm() == (0.0, 94.0**2)
-    # Twenty: 19 of them; the stray is left out, whichever side it is on.
+    # Twenty: 19 of them; the outlier is left out, whichever side it is on.
     even = np.append(np.arange(19.0), 100.0)
     assert propagated(even).interval_mm() == (0.0, 18.0)
     assert propagated(-even).interval_mm() == (-18.0, 0.0)
@@ -431,7 +431,7 @@ def test_a_medium_whose_index_does_not_follow_the_temperature_has_no_share():
     assert spacing_budget(clean()[1].calibration, scans, fixed, deviation_mm=0.1)["index"] == 0.0
 
 
-def test_a_pixel_is_worth_what_a_point_moves_by():
+def test_a_pixel_is_as_many_mm_as_a_point_moves():
     window, frame = SENSOR.camera.window, camera_from_object(SENSOR)
     faces = plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
     indices = [1.0, window.index(SENSOR.laser.wavelength_nm), INDEX]

@@ -122,7 +122,7 @@ def test_images_that_determine_no_distance_have_none(tmp_path, scans):
     assert found["near 1"].distance_mm == pytest.approx(DISTANCE_MM, abs=0.3)
 
 
-def test_a_missing_place_is_told(tmp_path, scans):
+def test_a_missing_place_is_reported(tmp_path, scans):
     folder = campaign(tmp_path, [(0.0, 0.0)])
     (tmp_path / "step-far-water.h5").unlink()
     with pytest.raises(CaptureError, match=r"no step-far-water\.h5"):

@@ -176,6 +176,6 @@ def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
         ("sheet_bow", np.radians(-4.0), "bow of the sheet found -4.00, described as 0.00 +- 0.5 °"),
     ],
 )
-def test_angles_are_told_in_degrees(name, value, words):
+def test_angles_are_reported_in_degrees(name, value, words):
     std = np.tan(np.radians(0.5)) if "slope" in name else np.radians(0.5)
     assert format_deviation(parameter_of(name), value, 0.0, std, sigmas=6.0).startswith(words)

@@ -255,7 +255,7 @@ def test_steps_add_the_window_to_a_target_in_air(thesis):
     assert abs(result.estimate.values[place] - 23.17) < 4.5 * result.estimate.std()[height]
 
 
-def test_strays_do_not_count(in_water, thesis):
+def test_outliers_do_not_count(in_water, thesis):
     clean = solve_jointly(gathered(thesis, [in_water]), options=OPTIONS)
     rng = np.random.default_rng(1)
     images = []

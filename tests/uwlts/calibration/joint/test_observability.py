@@ -71,7 +71,7 @@ def of_calibration(calibration):
     return known, over, weaknesses(over, known.parameters.keys, known.covariance)
 
 
-def test_two_that_cannot_be_told_apart_are_named_together():
+def test_two_that_cannot_be_distinguished_are_named_together():
     """Each alone costs 10 µm, they trade places with a correlation of 0.99, and the third is known well."""
     names = keys("window_distance", "index of water", "cx")
     covariance = np.array([[1.0, 0.99, 0.0], [0.99, 1.0, 0.0], [0.0, 0.0, 0.01]])

@@ -98,7 +98,7 @@ def length_error(calibration):
     return abs(np.linalg.norm(found[1] - found[0]) - np.linalg.norm(lit[1] - lit[0]))
 
 
-def test_one_step_tells_the_index_of_colder_water(earlier, thesis):
+def test_one_step_gives_the_index_of_colder_water(earlier, thesis):
     """Water of 18 degC said to have 25: an index wrong by 6.4e-4. An image of 23 mm known to 1 um tells it to 4e-4."""
     result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
     change = result.changes[0]
@@ -172,7 +172,7 @@ def test_a_covariance_that_is_none_is_refused(covariance):
         EarlierEstimate(np.zeros(2), covariance)
 
 
-def test_what_tells_nothing_leaves_everything_as_it_was(earlier, thesis):
+def test_evidence_without_information_leaves_everything_as_it_was(earlier, thesis):
     """Two pixels are a line, and a third a height that nobody knows."""
     known = found_estimate(earlier, WARM)
     frame = camera_from_object(BUILT)

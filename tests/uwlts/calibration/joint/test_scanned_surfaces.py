@@ -207,7 +207,7 @@ def test_a_known_spacing_is_a_length_in_water():
 
 
 @pytest.mark.parametrize("kind", ["pipe along", "pipe across"])
-def test_a_pipe_of_known_diameter_tells_the_water(kind):
+def test_a_pipe_of_known_diameter_gives_the_water(kind):
     told = {}
     for known in (True, False):
         pipe = KINDS[kind][1].model_copy(update={"diameter_uncertainty_mm": 0.01})
@@ -222,7 +222,7 @@ def test_a_pipe_of_known_diameter_tells_the_water(kind):
     assert (better < 0.4 and towards_z > 0.9) if kind == "pipe along" else (better < 0.9 and towards_z < 0.7)
 
 
-def test_a_plane_tells_the_sheet_but_not_the_stage():
+def test_a_plane_gives_the_sheet_but_not_the_stage():
     """Another direction of the stage shears what is measured, and a sheared plane is a plane: the priors stay.
 
     A sheet that is turned distorts in perspective, which the leaning plane shows, as it crosses all depths.
