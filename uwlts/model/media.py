@@ -84,9 +84,8 @@ def find_glass(name: str) -> Glass:
 def glass_index(name: str, *, wavelength_nm: float) -> float:
     """Refractive index of a named glass relative to air; raises RangeError outside the formula's range."""
     glass = find_glass(name)
-    check_range(
-        "wavelength_nm", wavelength_nm, 1e3 * glass.lowest_um, 1e3 * glass.highest_um, f"{name} ({glass.source})"
-    )
+    lowest, highest, source = 1e3 * glass.lowest_um, 1e3 * glass.highest_um, f"{name} ({glass.source})"
+    check_range("wavelength_nm", wavelength_nm, lowest, highest, source)
     return glass.index(1e-3 * wavelength_nm)
 
 

@@ -107,7 +107,7 @@ class MediumIndex:
 
     @property
     def quantity(self) -> Quantity:
-        """How the parameter is shown."""
+        """The parameter as it is shown."""
         return Quantity(self.text)
 
 

@@ -184,9 +184,8 @@ def _second_remainder(d: np.ndarray, v: float) -> np.ndarray:
     return np.where(near, series, (v * far - (1 - np.where(near, 0.5, d) ** v)) / far**2)
 
 
-KINDS: dict[str, type[PhaseFunction]] = {
-    kind.name: kind for kind in (Molecular, HenyeyGreenstein, PetzoldAverage, FournierForand)
-}
+_ALL: tuple[type[PhaseFunction], ...] = (Molecular, HenyeyGreenstein, PetzoldAverage, FournierForand)
+KINDS = {kind.name: kind for kind in _ALL}
 """All phase functions by the names that descriptions give them."""
 
 
@@ -206,9 +205,8 @@ class DescribedPhase(BaseModel):
 
     def phase_function(self) -> PhaseFunction:
         """The phase function; ValueError where the kind or a parameter is unknown or out of range."""
-        kind = phase_function_kind(self.kind)
         try:
-            return kind(**(self.model_extra or {}))
+            return phase_function_kind(self.kind)(**(self.model_extra or {}))
         except TypeError as error:
             raise ValueError(f"the phase function '{self.kind}' does not have these parameters: {error}") from error
 

@@ -15,19 +15,13 @@ Rows = tuple[tuple[float, ...], ...]
 class PolynomialCalibration(Description):
     """A sensor calibrated by polynomials (thesis, section 4.7): stripe position to Z, and Z to Y, for each line.
 
-    It holds in the medium and with the window it was made with, and only where its evidence reached.
-
-    Attributes
-    ----------
-    medium_name, medium : of the captures it was made from
-    window_mounted : whether the camera's window stood in the light's way
-    degree : of both polynomials of a line
-    first_line : number of the profile line of the first row
-    position_range_px, depth_range_mm : ranges of the stripe position and of Z in the OCS on which the arguments of the
-        Legendre polynomials run from -1 to 1, for all lines
-    domains_px : for each line the range of stripe positions that was calibrated, None for a line without any
-    depth_coefficients, along_coefficients : Legendre coefficients in mm of Z(position) and of Y(Z), a row for each line
-    residuals, provenance : named figures, and what the calibration was made from
+    It holds in the medium and with the window it was made with, and only where its evidence reached. Both polynomials
+    of a line are of ``degree``; the first row is the line ``first_line``. On ``position_range_px`` and
+    ``depth_range_mm``, of the stripe position and of Z in the OCS, the arguments of the Legendre polynomials run from
+    -1 to 1 in all lines.
+    ``domains_px`` has for each line the range of stripe positions that was calibrated, None for a line without any;
+    ``depth_coefficients`` and ``along_coefficients`` have a row of Legendre coefficients in mm for each line, of
+    Z(position) and of Y(Z).
     """
 
     sensor_name: str

@@ -116,8 +116,7 @@ class PointCloud:
         points = self.points_mm
         if points.ndim != 2 or points.shape[1] != 3:
             raise CaptureError(f"the points of a cloud have the shape (N, 3), not {points.shape}")
-        unusable = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
-        if unusable:
+        if unusable := np.count_nonzero(~np.isfinite(points).all(axis=1)):
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
         for name in (*_PER_POINT[1:], "deviation_mm"):
             column = getattr(self, name)
@@ -257,8 +256,7 @@ def _read_ply(path: Path) -> PointCloud:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
     vertices = ply["vertex"].data
     names = vertices.dtype.names or ()
-    missing = [axis for axis in "xyz" if axis not in names]
-    if missing:
+    if missing := [axis for axis in "xyz" if axis not in names]:
         raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
     known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
 
@@ -320,20 +318,18 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 def _read_hdf5(path: Path) -> PointCloud:
     if not path.is_file():
-        raise CaptureError(f"{path} does not exist" if not path.exists() else f"{path} is no file")
+        raise CaptureError(f"{path} {'is no file' if path.exists() else 'does not exist'}")
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
             arrays = {name: np.asarray(dataset[...]) for name, dataset in file.items()}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
-    unusable = [name for name, values in arrays.items() if values.dtype.kind not in "iuf"]
-    if unusable:
+    if unusable := [name for name, values in arrays.items() if values.dtype.kind not in "iuf"]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers")
     names = [part.name for part in fields(PointUncertainty)]
     wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
-    missing = [name for name in wanted if name not in arrays]
-    if missing:
+    if missing := [name for name in wanted if name not in arrays]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
     known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}

@@ -324,8 +324,7 @@ def _check_image(image: np.ndarray, *, name: str) -> None:
         raise ImageError(f"the {name} has shape {image.shape}; expected (height, width): choose one channel")
     if image.size == 0:
         raise ImageError(f"the {name} is empty, its shape is {image.shape}")
-    if image.dtype == np.float32 and not np.isfinite(image).all():
-        count = image.size - np.count_nonzero(np.isfinite(image))
+    if image.dtype == np.float32 and (count := np.count_nonzero(~np.isfinite(image))):
         raise ImageError(f"the {name} has {count} pixels that are not finite; repair or mask them before")
 
 

@@ -117,7 +117,11 @@ def measure_windows(
 
     reach = np.minimum(np.ceil(3.0 * smooth_sigma), np.float32(half - FLANK))
     near = np.rint(middle)
-    before, after = _flanks(smooth, columns, near - _INWARD_F * reach + _FLANK_FROM)
+    # The lower of two low-passed values three pixels apart, so that a hot pixel in the flank does not raise it.
+    first = np.minimum(np.maximum(near - _INWARD_F * reach + _FLANK_FROM, 0.0), size - FLANK)
+    index = first.astype(np.intp) * lines.size + columns
+    ends = (smooth.take(index + pixel * lines.size, mode="clip") for pixel in (1, FLANK - 1))
+    before, after = np.minimum(*ends)
     if several.size:
         extent = size if whole else (reach + (FLANK - 1))[several]
         outside = (row <= edges[0, several]) | (row >= edges[1, several])
@@ -179,17 +183,6 @@ def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level:
     part = (level - low) / np.maximum(rise, 1e-6)
     part = np.minimum(np.maximum(part, 0.0), 1.0)
     return rows.astype(np.float32) + _INWARD_F * part
-
-
-def _flanks(smooth: np.ndarray, columns: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """(2, M) float32: background in two runs of five pixels.
-
-    The lower of two low-passed values three pixels apart, so that a hot pixel in the run does not raise it.
-    """
-    size, width = smooth.shape
-    first = np.minimum(np.maximum(first, 0.0), size - FLANK)
-    index = first.astype(np.intp) * width + columns
-    return np.minimum(smooth.take(index + width, mode="clip"), smooth.take(index + (FLANK - 1) * width, mode="clip"))
 
 
 def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, highest: int) -> list[np.ndarray]:
