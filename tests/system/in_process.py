@@ -16,5 +16,8 @@ def uwlts(*arguments: object) -> subprocess.CompletedProcess[str]:
     words, said, errors = ["uwlts", *map(str, arguments)], StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(errors):
         patch.setattr(sys, "argv", words)
-        code = console.run(cli.app)
+        try:
+            code = console.run(cli.app)
+        except SystemExit as ended:
+            code = ended.code
     return subprocess.CompletedProcess(words, code, said.getvalue(), errors.getvalue())

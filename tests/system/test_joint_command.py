@@ -1,6 +1,8 @@
 """The commands from a target rendered in water alone to spheres measured in water: nothing else is known."""
 
 import json
+import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.system.in_process import uwlts
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import read_calibration
 
@@ -75,3 +78,25 @@ def test_spheres_in_water_have_their_distance_and_size(folder: Path):
     assert abs(figures["SSE"]) < 0.02
     assert abs(figures["diameter error sphere 1"]) < 0.03
     assert abs(figures["diameter error sphere 2"]) < 0.03
+
+
+def test_verify_judges_a_known_object_by_both_uncertainties_and_a_limit(folder: Path):
+    def verify(*options: object) -> subprocess.CompletedProcess[str]:
+        return uwlts("verify", folder / "spheres.h5", "--calibration", folder / "calibration.json", *options)
+
+    plain = verify()
+    assert (plain.returncode, plain.stdout.splitlines()[-1]) == (0, "pass")
+    evaluated = json.loads((folder / "spheres.json").read_text(encoding="utf-8"))
+    # The spacing's line: error and expanded uncertainty are those of `uwlts evaluate`; the certificate has its own.
+    line = next(text for text in plain.stdout.splitlines() if "sphere spacing" in text)
+    error, expanded, normalised = map(float, re.search(r"error (\S+) ± (\S+) mm, E_n (\S+):", line).groups())
+    stated = evaluated["uncertainty"]["SSE"]
+    own, certified = 2 * math.hypot(stated["random_mm"], stated["systematic_mm"]), 0.01
+    assert error == pytest.approx(evaluated["evaluation"]["figures_mm"]["SSE"], abs=1e-4)
+    assert expanded == pytest.approx(math.hypot(own, certified), abs=1e-4)
+    assert normalised == pytest.approx(abs(error) / expanded, abs=0.02)
+    # The stated uncertainty exceeds a limit of 1 um, so nothing can conform to it.
+    tight = verify("--limit", 0.001)
+    assert (tight.returncode, tight.stdout.splitlines()[-1]) == (1, "FAIL")
+    generous = verify("--limit", 1.0)
+    assert (generous.returncode, generous.stdout.splitlines()[-1]) == (0, "pass")
