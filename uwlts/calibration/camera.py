@@ -322,8 +322,11 @@ def _solution(
             residuals[index] = misses[here]
         if poses == "stage":
             tilts.append(_tilt(local[6:], covariance[6:, 6:]))
-    mean = np.mean(directions, axis=0)
-    stage = stage_direction(target_poses, np.array([i.stage_mm for i in images])) if poses == "free" else None
+    if poses == "free":
+        stage = stage_direction(target_poses, np.array([image.stage_mm for image in images]))
+    else:
+        stage = np.mean(directions, axis=0) / np.linalg.norm(np.mean(directions, axis=0))
+    tilt, tilt_std = max(tilts, default=(None, None))
     return CameraSolution(
         model=intrinsics.model(fit.global_values),
         target_poses=target_poses,
@@ -331,9 +334,9 @@ def _solution(
         parameters=intrinsics.names,
         covariance=fit.covariance,
         sigma_px=fit.sigma,
-        stage_direction=stage if poses == "free" else mean / np.linalg.norm(mean),
-        stage_tilt_rad=max(tilts)[0] if tilts else None,
-        stage_tilt_std_rad=max(tilts)[1] if tilts else None,
+        stage_direction=stage,
+        stage_tilt_rad=tilt,
+        stage_tilt_std_rad=tilt_std,
         rounds=fit.rounds,
         stopped=fit.stopped,
     )

@@ -23,28 +23,18 @@ Progress = Callable[[str, int, int], None]
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
 _LOOKED_AT = 15  # images of a capture in which the reason for a missing stripe is sought
-_STRIPE = StripeOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class AirEvidence:
-    """Target points and stripes in the captures in air.
-
-    Attributes
-    ----------
-    images : images in which the target was found, one placement per capture
-    frames : list of (capture, frame); where each of them comes from
-    stripes : list of (N, 2); stripe pixels on the target at the position of each image; empty where there are none
-    warnings : images left out, and why
-    no_stripe : why there is no stripe at all; empty where there is one
-    """
+    """Target points and stripes in the captures in air."""
 
     target: Target
-    images: list[TargetImage]
-    frames: list[tuple[int, int]]
-    stripes: list[np.ndarray]
-    warnings: list[str]
-    no_stripe: str = ""
+    images: list[TargetImage]  # images in which the target was found, one placement per capture
+    frames: list[tuple[int, int]]  # capture and frame that each of them comes from
+    stripes: list[np.ndarray]  # (N, 2) each; stripe pixels on the target at the position of the image; may be empty
+    warnings: list[str]  # images left out, and why
+    no_stripe: str = ""  # why there is no stripe at all; empty where there is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +48,7 @@ class StepEvidence:
 
 
 def air_evidence(
-    captures: Sequence[Capture], *, stripe: StripeOptions = _STRIPE, progress: Progress | None = None
+    captures: Sequence[Capture], *, stripe: StripeOptions = StripeOptions(), progress: Progress | None = None
 ) -> AirEvidence:
     """Find the target in the images with the laser off, and the stripe in those with it on at the same positions.
 
@@ -114,7 +104,7 @@ def step_evidence(
     captures: Sequence[Capture],
     *,
     medium_index: float | None = None,
-    stripe: StripeOptions = _STRIPE,
+    stripe: StripeOptions = StripeOptions(),
     progress: Progress | None = None,
 ) -> tuple[list[StepEvidence], list[str]]:
     """Stripes on the step standard in all images with the laser on, and warnings about images left out.

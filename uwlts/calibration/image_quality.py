@@ -15,7 +15,6 @@ _SLOPE_TIMES_BLUR = 0.4
 _JUDGED_POINTS = 80  # enough for a median of the sharpness
 # Points with fewer neighbours on the target than this are too far apart to compare two images by them.
 _FEWEST_COMMON = 4
-_STRIPE = StripeOptions()
 
 
 class LampFault(str):
@@ -32,28 +31,16 @@ class MotionFault(str):
 
 @dataclass(frozen=True)
 class QualityLimits:
-    """What an image must keep to.
+    """Limits that images must keep."""
 
-    Attributes
-    ----------
-    fewest_points : points of the target in an image, where it has so many
-    smallest_share : share of the target's points; a target larger than the image is seen in part
-    largest_blur_px : Gaussian blur (standard deviation) of the edges, median over the points
-    smallest_contrast : grey levels between bright and dark, median over the points, as a share of the full scale
-    largest_saturated : share of the pixels of the target, or of the stripe's lines, that reach the full scale
-    largest_motion_px : way of the points between two images of one pose, see `way_px`
-    smallest_change_px : way of the points from the nearest pose recorded before
-    fewest_lines : profile lines with the stripe on the target
-    """
-
-    fewest_points: int = 12
-    smallest_share: float = 0.1
-    largest_blur_px: float = 2.5
-    smallest_contrast: float = 0.08
-    largest_saturated: float = 0.02
-    largest_motion_px: float = 0.5
-    smallest_change_px: float = 5.0
-    fewest_lines: int = 20
+    fewest_points: int = 12  # points of the target in an image, where it has so many
+    smallest_share: float = 0.1  # share of the target's points; a target larger than the image is seen in part
+    largest_blur_px: float = 2.5  # Gaussian blur (standard deviation) of the edges, median over the points
+    smallest_contrast: float = 0.08  # grey levels between bright and dark, median over the points; of the full scale
+    largest_saturated: float = 0.02  # share of the target's pixels, or of the stripe's lines, at the full scale
+    largest_motion_px: float = 0.5  # way of the points between two images of one pose, see `way_px`
+    smallest_change_px: float = 5.0  # way of the points from the nearest pose recorded before
+    fewest_lines: int = 20  # profile lines with the stripe on the target
 
 
 @dataclass(frozen=True)
@@ -183,7 +170,7 @@ def judge_stripe(
     *,
     stripe_along: str,
     full_dn: int,
-    options: StripeOptions = _STRIPE,
+    options: StripeOptions = StripeOptions(),
     limits: QualityLimits = QualityLimits(),
 ) -> StripeQuality:
     """Quality of a laser image (H, W), taken at the pose in which the lamp showed the target in ``view``.

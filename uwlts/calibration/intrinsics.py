@@ -1,4 +1,4 @@
-"""Which camera parameters a calibration estimates, and how they make up the camera model."""
+"""Camera parameters that a calibration estimates, and the camera model that they give."""
 
 from dataclasses import dataclass, field
 
@@ -13,20 +13,12 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What is estimated.
+    """Camera parameters that are estimated."""
 
-    Attributes
-    ----------
-    distortion : those of k1, k2, p1, p2, k3 that are estimated; the others are zero
-    square_pixels : whether fx and fy are one focal length f
-    principal_point_px : (cx, cy), optional; given, it is not estimated
-    soft_limit_px : distances well beyond it count linearly ("soft L1") rather than squared
-    """
-
-    distortion: tuple[str, ...] = ("k1", "k2")
-    square_pixels: bool = True
-    principal_point_px: tuple[float, float] | None = None
-    soft_limit_px: float | None = None
+    distortion: tuple[str, ...] = ("k1", "k2")  # those of k1, k2, p1, p2, k3 that are estimated; the others are zero
+    square_pixels: bool = True  # whether fx and fy are one focal length f
+    principal_point_px: tuple[float, float] | None = None  # (cx, cy), optional; given, it is not estimated
+    soft_limit_px: float | None = None  # distances well beyond it count linearly ("soft L1") rather than squared
 
     def __post_init__(self) -> None:
         unknown = set(self.distortion) - set(DISTORTION)
@@ -82,11 +74,9 @@ class Intrinsics:
 
     def from_model(self, model: CameraModel) -> np.ndarray:
         """The estimated parameters (P,) of a camera model."""
-        start = self.from_matrix(model.matrix())
-        for place, name in enumerate(self.names):
-            if name in DISTORTION:
-                start[place] = getattr(model.distortion, name)
-        return start
+        distortion = model.distortion.model_dump()
+        start = zip(self.names, self.from_matrix(model.matrix()), strict=True)
+        return np.array([distortion.get(name, value) for name, value in start])
 
     def model(self, estimated: np.ndarray) -> CameraModel:
         """The camera model."""

@@ -33,22 +33,13 @@ _ROUNDS, _RETURNING_ROUNDS = 20, 10
 
 @dataclass(frozen=True, eq=False)
 class LinePolynomials:
-    """Polynomials of one variable, one for each line from the first to the last one with data.
-
-    Attributes
-    ----------
-    range : (low, high); range of the variable, on which the Legendre polynomials' argument runs from -1 to 1; the same
-        for all lines
-    coefficients : (L, degree + 1); Legendre coefficients of each line
-    residuals : (N,); data less polynomial, outliers included
-    used : (N,) bool; the data that were not left out as outliers
-    """
+    """Polynomials of one variable, one for each line from the first to the last one with data."""
 
     first_line: int
-    range: tuple[float, float]
-    coefficients: np.ndarray
-    residuals: np.ndarray
-    used: np.ndarray
+    range: tuple[float, float]  # of the variable, for all lines; the Legendre polynomials' argument runs from -1 to 1
+    coefficients: np.ndarray  # (L, degree + 1); Legendre coefficients of each line
+    residuals: np.ndarray  # (N,); data less polynomial, outliers included
+    used: np.ndarray  # (N,) bool; the data that were not left out as outliers
 
     def rms(self) -> float:
         """Root mean square residual of the data used."""
@@ -272,7 +263,7 @@ def fit_polynomials(
 
 
 def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
-    """How much more the means of the lines scatter than by chance: by the standard deviation over sqrt(n)."""
+    """Scatter of the lines' means over that expected by chance: the standard deviation over sqrt(n)."""
     _, line, count = np.unique(lines[fit.used], return_inverse=True, return_counts=True)
     means, several, rms = np.bincount(line, fit.residuals[fit.used]) / count, count > 1, fit.rms()
     if not (several.any() and rms > 0):

@@ -29,23 +29,14 @@ _X, _Y = np.eye(3)[:2]
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """Smooth map from one plane to another: a homography and a polynomial for what it leaves.
+    """Smooth map from one plane to another: a homography and a polynomial for what it leaves."""
 
-    Attributes
-    ----------
-    homography : (3, 3)
-    low, high : (2,); box of the points it was fitted to, on which the polynomial's arguments run from -1 to 1
-    degree : total degree of the polynomial
-    coefficients : (terms, 2); Legendre coefficients
-    residuals : (N, 2); of the points it was fitted to
-    """
-
-    homography: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    degree: int
-    coefficients: np.ndarray
-    residuals: np.ndarray
+    homography: np.ndarray  # (3, 3)
+    low: np.ndarray  # (2,); first corner of the box of the points it was fitted to: the polynomial's arguments are -1
+    high: np.ndarray  # (2,); opposite corner, the arguments are 1
+    degree: int  # total degree of the polynomial
+    coefficients: np.ndarray  # (terms, 2); Legendre coefficients
+    residuals: np.ndarray  # (N, 2); of the points it was fitted to
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Images (M, 2) of points (M, 2)."""
@@ -66,7 +57,7 @@ class PlateMap(SmoothMap):
     hull: np.ndarray
 
     def beyond_mm(self, pixels: np.ndarray) -> np.ndarray:
-        """How far (M,) outside the hull of the target's points pixels (M, 2) look, in mm; negative inside."""
+        """Distances (M,) in mm at which pixels (M, 2) look outside the hull of the target's points; negative inside."""
         return np.max(self.coarsely(pixels) @ self.hull[:, :2].T + self.hull[:, 2], axis=1)
 
     def rms_mm(self) -> float:
@@ -138,22 +129,14 @@ _ORIGIN_POINTS = 100  # stripe points about the camera's axis on which the origi
 
 @dataclass(frozen=True, eq=False)
 class PlateStripes:
-    """Stripe points of all images on the plate: N points.
+    """Stripe points of all images on the plate: N points."""
 
-    Attributes
-    ----------
-    pixels : (N, 2)
-    lines, centres_px : (N,); profile line of each point (int), and the stripe's centre on it
-    plate_mm : (N, 2); place on the plate, in the target's frame
-    pose, stage_mm : (N,); number of the image (int), and where the stage stood
-    """
-
-    pixels: np.ndarray
-    lines: np.ndarray
-    centres_px: np.ndarray
-    plate_mm: np.ndarray
-    pose: np.ndarray
-    stage_mm: np.ndarray
+    pixels: np.ndarray  # (N, 2)
+    lines: np.ndarray  # (N,) int; profile line of each point
+    centres_px: np.ndarray  # (N,); stripe's centre on the line
+    plate_mm: np.ndarray  # (N, 2); place on the plate, in the target's frame
+    pose: np.ndarray  # (N,) int; number of the image
+    stage_mm: np.ndarray  # (N,); where the stage stood
 
 
 def common_header(captures: Sequence[Capture]) -> CaptureHeader:

@@ -31,27 +31,27 @@ Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observati
 
 @dataclass(frozen=True, eq=False)
 class SchurFit:
-    """Solution of a grouped least-squares problem.
+    """Solution of a grouped least-squares problem."""
 
-    Attributes
-    ----------
-    global_values : (k,)
-    local : list of (b,)
-    residuals : list of (n, c)
-    covariance : (k, k); of the global parameters, scaled by the residuals' variance
-    local_covariances : list of (b, b)
-    sigma : standard deviation of one coordinate of a residual, with the degrees of freedom counted
-    stopped : why the iteration ended
-    """
-
-    global_values: np.ndarray
-    local: list[np.ndarray]
-    residuals: list[np.ndarray]
-    covariance: np.ndarray
-    local_covariances: list[np.ndarray]
-    sigma: float
+    global_values: np.ndarray  # (k,)
+    local: list[np.ndarray]  # list of (b,)
+    residuals: list[np.ndarray]  # list of (n, c)
+    covariance: np.ndarray  # (k, k); of the global parameters, scaled by the residuals' variance
+    local_covariances: list[np.ndarray]  # list of (b, b)
+    sigma: float  # standard deviation of one coordinate of a residual, with the degrees of freedom counted
     rounds: int
-    stopped: str
+    stopped: str  # why the iteration ended
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """A group's residuals (n, c), and its blocks of the normal equations with columns scaled to length one."""
+
+    residuals: np.ndarray
+    border: np.ndarray
+    block: np.ndarray
+    gradient: np.ndarray
+    scale: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +59,14 @@ class _Normal:
     """Normal equations in blocks, with columns scaled to length one, and the cost they belong to."""
 
     cost: float
-    residuals: list[np.ndarray]
-    global_block: np.ndarray
-    border: list[np.ndarray]
-    local_blocks: list[np.ndarray]
-    global_gradient: np.ndarray
-    local_gradients: list[np.ndarray]
-    global_scale: np.ndarray
-    local_scales: list[np.ndarray]
+    block: np.ndarray
+    gradient: np.ndarray
+    scale: np.ndarray
+    groups: list[_Group]
+
+    def count(self) -> int:
+        """Number of coordinates of all residuals."""
+        return sum(group.residuals.size for group in self.groups)
 
 
 def schur_least_squares(
@@ -104,23 +104,19 @@ def schur_least_squares(
         global_step, local_steps = _step(normal, damping)
         tried_global = global_values + global_step
         tried_local = [value + step for value, step in zip(local, local_steps, strict=True)]
-        size = max(
-            float(np.max(np.abs(step * scale))) if len(step) else 0.0
-            for step, scale in zip(
-                (global_step, *local_steps), (normal.global_scale, *normal.local_scales), strict=True
-            )
-        )
+        scales = (normal.scale, *(group.scale for group in normal.groups))
+        steps = zip((global_step, *local_steps), scales, strict=True)
+        size = max(float(np.max(np.abs(step * scale), initial=0.0)) for step, scale in steps)
         # Scaled steps are in the unit of the residuals, summed over all of them.
-        small = size <= _SMALLEST_STEP * np.sqrt(sum(r.size for r in normal.residuals))
+        small = size <= _SMALLEST_STEP * np.sqrt(normal.count())
         tried = _assembled(model, tried_global, tried_local, soft_limit)
         if tried is not None and tried.cost <= normal.cost:
             gain = normal.cost - tried.cost
-            finished = small or gain <= smallest_gain * normal.cost
+            settled = small or gain <= smallest_gain * normal.cost
             global_values, local, normal, damping = tried_global, tried_local, tried, max(damping / 10, 1e-12)
-            if finished:
-                return _solution(
-                    global_values, local, normal, rounds, "step below rounding" if small else "cost settled"
-                )
+            if settled:
+                why = "step below rounding" if small else "cost settled"
+                return _solution(global_values, local, normal, rounds, why)
         elif small or damping > 1e8 or (tried is not None and tried.cost - normal.cost <= smallest_gain * normal.cost):
             return _solution(global_values, local, normal, rounds, "no step lowers the cost further")
         else:
@@ -136,12 +132,12 @@ def schur_least_squares(
 def _assembled(
     model: Model, global_values: np.ndarray, local: list[np.ndarray], soft_limit: float | None
 ) -> _Normal | None:
-    count, cost, residuals, products = len(global_values), 0.0, [], []
-    for group, values in enumerate(local):
-        found = model(group, global_values, values)
-        if found is None:
+    count, cost, found = len(global_values), 0.0, []
+    for number, values in enumerate(local):
+        parts = model(number, global_values, values)
+        if parts is None:
             return None
-        parts = [found] if isinstance(found, Observation) else found
+        parts = [parts] if isinstance(parts, Observation) else parts
         product = np.zeros((count + len(values) + 1,) * 2)
         for part in parts:
             if not np.isfinite(part.residuals).all():
@@ -157,21 +153,17 @@ def _assembled(
             places = np.arange(len(values)) if part.local_columns is None else part.local_columns
             at = np.r_[0:count, count + places, count + len(values)]
             product[np.ix_(at, at)] += columns.T @ columns
-        residuals.append(np.vstack([part.residuals for part in parts]))
-        products.append(product)
-    global_scale = _lengths(sum((np.diag(product)[:count] for product in products), np.zeros(count)))
-    matrix, gradient = np.zeros((count, count)), np.zeros(count)
-    border, blocks, gradients, scales = [], [], [], []
-    for product in products:
+        found.append((np.vstack([part.residuals for part in parts]), product))
+    global_scale = _lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
+    block, gradient, groups = np.zeros((count, count)), np.zeros(count), []
+    for residuals, product in found:
         scale = _lengths(np.diag(product)[count:-1])
         scaled = product / np.outer(both := np.r_[global_scale, scale, 1.0], both)
-        matrix += scaled[:count, :count]
+        block += scaled[:count, :count]
         gradient += scaled[:count, -1]
-        border.append(scaled[:count, count:-1])
-        blocks.append(scaled[count:-1, count:-1])
-        gradients.append(scaled[count:-1, -1])
-        scales.append(scale)
-    return _Normal(cost, residuals, matrix, border, blocks, gradient, gradients, global_scale, scales)
+        own = (scaled[:count, count:-1], scaled[count:-1, count:-1], scaled[count:-1, -1])
+        groups.append(_Group(residuals, *own, scale))
+    return _Normal(cost, block, gradient, global_scale, groups)
 
 
 def _lengths(squares: np.ndarray) -> np.ndarray:
@@ -180,20 +172,18 @@ def _lengths(squares: np.ndarray) -> np.ndarray:
 
 def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
     """Damped step that lowers the cost; every block is positive definite for positive damping."""
-    reduced = normal.global_block + damping * np.eye(len(normal.global_block))
-    right = -normal.global_gradient
-    inverses = [np.linalg.inv(block + damping * np.eye(len(block))) for block in normal.local_blocks]
-    for border, inverse, gradient in zip(normal.border, inverses, normal.local_gradients, strict=True):
-        reduced = reduced - border @ inverse @ border.T
-        right = right + border @ inverse @ gradient
+    reduced = normal.block + damping * np.eye(len(normal.block))
+    right = -normal.gradient
+    inverses = [np.linalg.inv(group.block + damping * np.eye(len(group.block))) for group in normal.groups]
+    for group, inverse in zip(normal.groups, inverses, strict=True):
+        reduced = reduced - group.border @ inverse @ group.border.T
+        right = right + group.border @ inverse @ group.gradient
     step = np.linalg.lstsq(reduced, right, rcond=1e-15)[0]
     local = [
-        -inverse @ (gradient + border.T @ step) / scale
-        for border, inverse, gradient, scale in zip(
-            normal.border, inverses, normal.local_gradients, normal.local_scales, strict=True
-        )
+        -inverse @ (group.gradient + group.border.T @ step) / group.scale
+        for group, inverse in zip(normal.groups, inverses, strict=True)
     ]
-    return step / normal.global_scale, local
+    return step / normal.scale, local
 
 
 def _solution(
@@ -203,28 +193,25 @@ def _solution(
         "the target images do not determine the camera: tilt the target differently between images, cover more of the "
         "image, or fix some parameters (square pixels, principal point, fewer distortion coefficients)"
     )
-    reduced = normal.global_block.copy()
-    inverses = []
-    for border, block in zip(normal.border, normal.local_blocks, strict=True):
-        if len(block) and np.linalg.eigvalsh(block)[0] < _SINGULAR:
+    reduced, inverses = normal.block.copy(), []
+    for group in normal.groups:
+        if len(group.block) and np.linalg.eigvalsh(group.block)[0] < _SINGULAR:
             raise undetermined
-        inverses.append(np.linalg.inv(block))
-        reduced -= border @ inverses[-1] @ border.T
+        inverses.append(np.linalg.inv(group.block))
+        reduced -= group.border @ inverses[-1] @ group.border.T
     if np.linalg.eigvalsh(reduced)[0] < _SINGULAR:
         raise undetermined
-    count = sum(r.size for r in normal.residuals)
-    freedom = count - len(global_values) - sum(map(len, local))
-    sigma = float(np.sqrt(normal.cost / freedom))
-    covariance = np.linalg.inv(reduced)
-    local_covariances = []
-    for border, inverse, scale in zip(normal.border, inverses, normal.local_scales, strict=True):
-        spread = inverse @ border.T
-        local_covariances.append(sigma**2 * (inverse + spread @ covariance @ spread.T) / np.outer(scale, scale))
+    sigma = float(np.sqrt(normal.cost / (normal.count() - len(global_values) - sum(map(len, local)))))
+    covariance, local_covariances = np.linalg.inv(reduced), []
+    for group, inverse in zip(normal.groups, inverses, strict=True):
+        spread = inverse @ group.border.T
+        own = inverse + spread @ covariance @ spread.T
+        local_covariances.append(sigma**2 * own / np.outer(group.scale, group.scale))
     return SchurFit(
         global_values=global_values,
         local=local,
-        residuals=normal.residuals,
-        covariance=sigma**2 * covariance / np.outer(normal.global_scale, normal.global_scale),
+        residuals=[group.residuals for group in normal.groups],
+        covariance=sigma**2 * covariance / np.outer(normal.scale, normal.scale),
         local_covariances=local_covariances,
         sigma=sigma,
         rounds=rounds,

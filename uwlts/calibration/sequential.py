@@ -31,7 +31,7 @@ def _camera_figures(solution: CameraSolution) -> dict[str, JsonValue]:
         "rms_px": solution.rms_px(),
         "sigma_px": solution.sigma_px,
         "image_rms_px": solution.image_rms_px().tolist(),
-        "std": solution.std(),
+        "std": {**solution.std()},
         "parameters": list(solution.parameters),
         "covariance": solution.covariance.tolist(),
         "stage_direction": None if direction is None else direction.tolist(),
@@ -345,7 +345,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
 
 
 def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, JsonValue]:
-    """What a calibration was made from, by what and when, for its provenance."""
+    """Captures, software and date of a calibration, for its provenance."""
     return {
         "source": "calibration from captures",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -34,26 +34,16 @@ class StripePoints:
 
 @dataclass(frozen=True, eq=False)
 class SheetSolution:
-    """A calibrated sheet.
-
-    Attributes
-    ----------
-    residuals_mm : (N,); signed distances of all points from the plane
-    used : (N,) bool; the points that were not left out as outliers
-    rms_mm, max_mm : over the points used
-    rejected_share : share of the points left out
-    normal_std_rad : largest standard deviation of the normal's direction
-    turn_rad : angle between the normal and the nominal one
-    """
+    """A calibrated sheet."""
 
     model: SheetModel
-    residuals_mm: np.ndarray
-    used: np.ndarray
-    rms_mm: float
-    max_mm: float
-    rejected_share: float
-    normal_std_rad: float
-    turn_rad: float
+    residuals_mm: np.ndarray  # (N,); signed distances of all points from the plane
+    used: np.ndarray  # (N,) bool; the points that were not left out as outliers
+    rms_mm: float  # over the points used
+    max_mm: float  # over the points used
+    rejected_share: float  # share of the points left out
+    normal_std_rad: float  # largest standard deviation of the normal's direction
+    turn_rad: float  # angle between the normal and the nominal one
 
 
 def points_on_target(
@@ -64,15 +54,11 @@ def points_on_target(
     extent_mm: np.ndarray,
     margin_mm: float = 0.0,
 ) -> StripePoints:
-    """Where the camera rays of stripe pixels meet the target's plane (thesis, section 4.8).
+    """Points where the camera rays of stripe pixels meet the target's plane (thesis, section 4.8).
 
-    Parameters
-    ----------
-    stripes : sequence of (N, 2); stripe pixels (u, v) of each image
-    target_poses : (F, 4, 4); ``T_camera_target`` of each image
-    extent_mm : (V, 2); points of the target's plane (x, y) whose convex hull is known to be the target: a stripe
-        outside lies elsewhere
-    margin_mm : widens the hull by so much
+    ``stripes`` (N, 2) are the pixels (u, v) of each image, ``target_poses`` (F, 4, 4) its ``T_camera_target``. The
+    target is known to fill the convex hull of ``extent_mm`` (V, 2), points (x, y) of its plane, widened by
+    ``margin_mm``: a stripe outside lies elsewhere.
 
     Raises
     ------
@@ -108,13 +94,10 @@ def points_on_target(
 def fit_sheet(
     points_mm: np.ndarray, *, nominal_normal: np.ndarray, largest_rejected: float = _LARGEST_REJECTED
 ) -> SheetSolution:
-    """Plane by orthogonal distances, without points farther than five robust standard deviations.
+    """Plane through points (N, 3) by orthogonal distances, without those beyond five robust standard deviations.
 
-    Parameters
-    ----------
-    points_mm : (N, 3); camera frame
-    nominal_normal : (3,); unit vector; the normal is turned to its side
-    largest_rejected : share of the points that may lie elsewhere
+    The normal is turned to the side of ``nominal_normal`` (3,), a unit vector, all in the camera frame;
+    ``largest_rejected`` is the share of the points that may lie elsewhere.
 
     Raises CalibrationError: the points do not determine a plane, do not lie on one, or its normal is far from the
     nominal one.
@@ -138,16 +121,17 @@ def fit_sheet(
         )
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
     to_turned = float(np.arccos(min(abs(plane.normal @ (_HALF_TURN * nominal_normal)), 1.0)))
+    advice = None
     if turn > _TURNED_IMAGES and to_turned < turn / 3:
-        raise CalibrationError(
-            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description, as it is "
-            f"where the images are turned by 180 deg or mirrored, or the laser stands on the camera's other side: turn "
-            f"the images, or correct the description"
+        advice = (
+            ", as it is where the images are turned by 180 deg or mirrored, or the laser stands on the camera's other "
+            "side: turn the images, or correct the description"
         )
-    if turn > _LARGEST_TURN:
+    elif turn > _LARGEST_TURN:
+        advice = ": check stripe_along, where the laser stands, and whether the images are turned or mirrored"
+    if advice:
         raise CalibrationError(
-            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description: check "
-            f"stripe_along, where the laser stands, and whether the images are turned or mirrored"
+            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}"
         )
     return SheetSolution(
         model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=float(plane.normal @ plane.point_mm)),

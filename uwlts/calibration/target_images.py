@@ -16,20 +16,12 @@ _COLLINEAR = 1e-3  # extent across over extent along, of points that lie on a li
 
 @dataclass(frozen=True, eq=False)
 class TargetImage:
-    """Target points found in one image.
+    """Target points found in one image."""
 
-    Attributes
-    ----------
-    points_mm : (N, 3); in the target's frame, z = 0
-    pixels : (N, 2); where they appear, (u, v)
-    stage_mm : position of the stage that moves the sensor
-    placement : counts how often the target was put up anew: images of one placement differ by the stage's motion only
-    """
-
-    points_mm: np.ndarray
-    pixels: np.ndarray
-    stage_mm: float = 0.0
-    placement: int = 0
+    points_mm: np.ndarray  # (N, 3); in the target's frame, z = 0
+    pixels: np.ndarray  # (N, 2); where they appear, (u, v)
+    stage_mm: float = 0.0  # position of the stage that moves the sensor
+    placement: int = 0  # counts how often the target was put up anew; in between only the stage moved
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points_mm, dtype=np.float64)
@@ -58,22 +50,13 @@ def z_away(image: TargetImage) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Images that share one pose of the target, but for the known displacement of the stage.
+    """Images that share one pose of the target, but for the known displacement of the stage."""
 
-    Attributes
-    ----------
-    points_mm : (N, 3); in the target's frame
-    shifts_mm : (N,); stage position s - s0 of each point's image, s0 that of the first image
-    pixels : (N, 2)
-    image : (N,); number of each point's image
-    along_z : +1 or -1: the stage moves the sensor roughly along +z or -z of the target
-    """
-
-    points_mm: np.ndarray
-    shifts_mm: np.ndarray
-    pixels: np.ndarray
-    image: np.ndarray
-    along_z: float
+    points_mm: np.ndarray  # (N, 3); in the target's frame
+    shifts_mm: np.ndarray  # (N,); stage position s - s0 of each point's image, s0 that of the first image
+    pixels: np.ndarray  # (N, 2)
+    image: np.ndarray  # (N,); number of each point's image
+    along_z: float  # +1 or -1: the stage moves the sensor roughly along +z or -z of the target
 
     def direction(self, tilt: np.ndarray) -> np.ndarray:
         """Unit direction (3,) of the stage in the target's frame: (a, b, along_z) for a tilt (a, b), z for none."""

@@ -88,13 +88,9 @@ def solve_window(
 ) -> WindowSolution:
     """Window distance that minimises the mean square height error over all step images.
 
-    A coarse scan finds the valley, Gauss-Newton within the bounds its bottom.
-
-    Parameters
-    ----------
-    calibration : camera, sheet and OCS from air; its window is not used
-    window : the window at its nominal distance; everything but the distance stays
-    bounds_mm : (low, high), optional; distances to search; by default 0.2 to 2.5 times the nominal one
+    A coarse scan finds the valley, Gauss-Newton within the bounds its bottom. The calibration's camera, sheet and OCS
+    are used, not its window; of ``window`` everything but the distance stays. ``bounds_mm`` (low, high) are the
+    distances to search, by default 0.2 to 2.5 times the nominal one.
 
     Raises
     ------

@@ -10,10 +10,16 @@ from markupsafe import Markup
 from pydantic import BaseModel, ConfigDict
 
 import uwlts
-from uwlts.calibration.model_comparison.candidates import DIMENSIONS, Candidate, distortion_words
-from uwlts.calibration.model_comparison.comparison import Choice, Comparison, Judged
-from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE
-from uwlts.calibration.model_comparison.scores import POINTS, STRIPES, PolynomialScore, Score
+from uwlts.calibration.model_comparison.comparison import (
+    POINTS,
+    STRIPES,
+    Choice,
+    Comparison,
+    Judged,
+    PolynomialScore,
+    Score,
+)
+from uwlts.calibration.model_comparison.held_out import DIMENSIONS, INSIDE, OUTSIDE, Candidate, distortion_words
 from uwlts.report.numbers import fixed, small_length
 from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
 from uwlts.storage.files import json_text
@@ -82,7 +88,7 @@ def content_of(comparison: Comparison) -> ModelComparisonContent:
         captures=comparison.captures,
         software=f"uwlts {uwlts.__version__}",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
-        held_out={where: len(split.held) for where, split in choice.ways.items()},
+        held_out={where: len(held) for where, held in choice.ways.items()},
         models=[_row(choice, judged) for judged in choice.judged],
         best=choice.best().words(),
         simplest=choice.simplest().words(),

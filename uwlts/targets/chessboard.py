@@ -61,23 +61,20 @@ class ChessboardTarget(Target):
         found, corners = cv2.findChessboardCornersSB(grey, size, flags=_SECTOR_FLAGS)
         if not found:
             found, corners = cv2.findChessboardCorners(grey, size, flags=_QUAD_FLAGS)
-            if not found:
-                raise TargetError(
-                    f"found no chessboard of {size[0]} x {size[1]} inner corners; the whole board must be in view with "
-                    "a bright rim, and columns and rows count inner corners, not squares"
-                )
-        grid = _refined(image, corners.reshape(-1, 2), size).reshape(self.rows, self.columns, 2).astype(np.float64)
+        if not found:
+            raise TargetError(
+                f"found no chessboard of {size[0]} x {size[1]} inner corners; the whole board must be in view with a "
+                "bright rim, and columns and rows count inner corners, not squares"
+            )
+        # Corners are moved to the saddle of the grey levels, in a window that stays within the squares around them.
+        grid = corners.reshape(self.rows, self.columns, 2)
+        sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
+        half = int(np.clip(min(sides) * 0.4, 2, 11))
+        start = grid.astype(np.float32).reshape(-1, 1, 2)
+        moved = cv2.cornerSubPix(image.astype(np.float32), start, (half, half), (-1, -1), _REFINEMENT)
+        grid = moved.reshape(self.rows, self.columns, 2).astype(np.float64)
         pixels = _from_top_left(grey, grid).reshape(-1, 2)
         return TargetView(pixels, self.points_mm, self.indices, corner_quality(image, pixels))
-
-
-def _refined(image: np.ndarray, corners: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Corners moved to the saddle of the grey levels, in a window that stays within the squares around them."""
-    grid = corners.reshape(size[1], size[0], 2)
-    sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    half = int(np.clip(min(sides) * 0.4, 2, 11))
-    grey = image.astype(np.float32)
-    return cv2.cornerSubPix(grey, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), _REFINEMENT)
 
 
 def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -93,6 +90,5 @@ def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
         levels = grey[v, u]
         return grid if levels[even].mean() < levels[~even].mean() else grid[::-1, ::-1]
     # A square board has four turns that look alike, another board two.
-    turns = range(4) if rows == columns else (0, 2)
-    candidates = [np.rot90(grid, turn) for turn in turns]
-    return max(candidates, key=lambda turned: np.diff(turned, axis=1)[..., 0].mean())
+    turned = [np.rot90(grid, turn) for turn in (range(4) if rows == columns else (0, 2))]
+    return max(turned, key=lambda each: np.diff(each, axis=1)[..., 0].mean())

@@ -14,10 +14,7 @@ Place = tuple[int, int]
 # Above the median of all circles, which is below zero where blur lowers the ring of a small circle. A sharp dot has the
 # strength 1, dirt and noise rarely more than 0.1; a dot of two pixels under blur keeps 0.4.
 _MIN_MARK_STRENGTH = 0.3
-
-# Circles outside the described lattice that are taken for outliers: this share of all.
-_MAX_OUTLIERS = 0.02
-
+_MAX_OUTLIERS = 0.02  # share of all circles outside the described lattice that are taken for outliers
 # Quarter turns from the target's axes to those of the numbering. The target is seen from its front: no reflections.
 _QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 
@@ -58,8 +55,7 @@ class CircleTarget(Target):
             raise ValueError(
                 f"marker_diameter_mm is {self.marker_diameter_mm}; expected less than diameter_mm, {self.diameter_mm}"
             )
-        for name, (di, dj) in (("origin", (0, 0)), ("marker_x", self.marker_x), ("marker_y", self.marker_y)):
-            i, j = self.origin[0] + di, self.origin[1] + dj
+        for name, (i, j) in zip(("origin", "marker_x", "marker_y"), self.marked(), strict=True):
             if not (0 <= i < self.columns and 0 <= j < self.rows):
                 raise ValueError(
                     f"{name} is at ({i}, {j}); expected a place of the {self.columns} x {self.rows} lattice"
@@ -89,8 +85,7 @@ class CircleTarget(Target):
 
     def marked(self) -> list[Place]:
         """Places of the three dotted circles: origin, in +X, in +Y."""
-        steps = ((0, 0), self.marker_x, self.marker_y)
-        return [(self.origin[0] + i, self.origin[1] + j) for i, j in steps]
+        return [(self.origin[0] + i, self.origin[1] + j) for i, j in ((0, 0), self.marker_x, self.marker_y)]
 
     def findable(self, in_view: np.ndarray) -> bool:
         return super().findable(in_view) and all(in_view[j * self.columns + i] for i, j in self.marked())
@@ -103,31 +98,25 @@ class CircleTarget(Target):
 
     def detect(self, image: np.ndarray) -> TargetView:
         # Imported late: a description alone does not need the detector.
-        from uwlts.targets.detection import find_circles, label_lattice, mark_strength
+        from uwlts.targets.detection import detect_lattice, mark_strength
 
-        circles = find_circles(image)
-        if len(circles) == 0:
-            raise TargetError("found no circles; check that the target is in view, in focus and well exposed")
-        numbers, labelled = label_lattice(circles.centres, circles.shapes)
-        found = len(circles)
-        circles, numbers = circles[labelled], numbers[labelled]
-        if len(circles) < 4:
-            raise TargetError(
-                f"found {found} circles but they form no lattice; check that the target is in view and sharp"
-            )
+        lattice = detect_lattice(image)
+        circles, numbers = lattice.circles, lattice.indices
         strength = mark_strength(image, circles, mark_over_circle=self.marker_diameter_mm / self.diameter_mm)
-        origin, turn = _orientation(numbers, strength - np.median(strength), self, found)
+        origin, turn = _orientation(numbers, strength - np.median(strength), self, lattice.found)
         indices = (numbers - origin) @ turn + np.array(self.origin)
-        inside = ((indices >= 0) & (indices < (self.columns, self.rows))).all(1)
-        if np.count_nonzero(~inside) > _MAX_OUTLIERS * len(indices):
+        places = (self.columns, self.rows)
+        inside = ((indices >= 0) & (indices < places)).all(1)
+        outside = np.count_nonzero(~inside)
+        if outside > _MAX_OUTLIERS * len(indices):
             low, high = indices.min(0), indices.max(0)
             exchanged = (indices - np.array(self.origin))[:, ::-1] + np.array(self.origin)
-            fits = ((exchanged >= 0) & (exchanged < (self.columns, self.rows))).all()
-            mirrored = "they fit with columns and rows exchanged, as in a mirrored image"
-            advice = mirrored if fits else "check columns, rows and origin"
+            advice = "check columns, rows and origin"
+            if ((exchanged >= 0) & (exchanged < places)).all():
+                advice = "they fit with columns and rows exchanged, as in a mirrored image"
             raise TargetError(
-                f"found circles from place ({low[0]}, {low[1]}) to ({high[0]}, {high[1]}), {np.count_nonzero(~inside)} "
-                f"of {len(indices)} outside the described {self.columns} x {self.rows}; {advice}"
+                f"found circles from place ({low[0]}, {low[1]}) to ({high[0]}, {high[1]}), {outside} of {len(indices)} "
+                f"outside the described {self.columns} x {self.rows}; {advice}"
             )
         circles, indices = circles[inside], indices[inside]
         order = np.lexsort((indices[:, 0], indices[:, 1]))
@@ -154,16 +143,17 @@ def _orientation(
     numbers: np.ndarray, strength: np.ndarray, target: CircleTarget, found: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Number (2,) of the origin circle and the quarter turn (2, 2) from target steps to number steps."""
-    marked = {tuple(number): value for number, value in zip(numbers.tolist(), strength, strict=True)}
-    marked = {number: value for number, value in marked.items() if value > _MIN_MARK_STRENGTH}
+    marked = {
+        tuple(n): value for n, value in zip(numbers.tolist(), strength, strict=True) if value > _MIN_MARK_STRENGTH
+    }
     fits = []
     for number in marked:
         for turn in _QUARTER_TURNS:
             others = [tuple((np.array(number) + turn @ step).tolist()) for step in (target.marker_x, target.marker_y)]
             if all(other in marked for other in others):
-                fits.append((min(marked[place] for place in (number, *others)), number, turn))
+                fits.append((np.array(number), turn))
     if len(fits) == 1:
-        return np.array(fits[0][1]), fits[0][2]
+        return fits[0]
     seen = f"found {found} circles, {len(numbers)} of them in a lattice"
     if len(marked) < 3:
         raise TargetError(

@@ -8,18 +8,25 @@ import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lens_of, step_profile, through_window
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
-from uwlts.calibration.guidance.coverage import candidates, coverage_of, place_words, tilts_rad
 from uwlts.calibration.guidance.pose_advice import (
+    RecordedPose,
+    Setting,
     State,
     Wanted,
     best_pose,
+    candidates,
+    coverage_of,
     format_pose_advice,
     gain_of,
+    judge_residual,
     missing,
     missing_sheet,
+    nominal_camera,
+    place_words,
+    pose_of,
     state_of,
+    tilts_rad,
 )
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual, nominal_camera, pose_of
 from uwlts.calibration.guidance.step import apart_mm, is_new, judge_step, next_depth_mm
 from uwlts.calibration.image_quality import (
     QualityLimits,

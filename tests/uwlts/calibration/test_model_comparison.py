@@ -11,10 +11,17 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.evidence import STRIPE, TARGET
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
 from uwlts.calibration.joint.stored_estimate import found_estimate
-from uwlts.calibration.model_comparison.candidates import Candidate, recast
-from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose
-from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE, Misses, Prediction, Split, predict, splits
-from uwlts.calibration.model_comparison.scores import tally
+from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, tally
+from uwlts.calibration.model_comparison.held_out import (
+    INSIDE,
+    OUTSIDE,
+    Candidate,
+    Misses,
+    Prediction,
+    predict,
+    recast,
+    splits,
+)
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError
 from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
@@ -58,7 +65,9 @@ def tilted_choice(thesis):
     problem = problem_of(thesis, sensor_with(window_tilt_deg=0.2, laser_tilt_deg=0.0), bow=0.0, seed=0)
     ways = splits(problem)
     models = (Candidate(), Candidate(window_tilt=False), Candidate(bow=False))
-    return choice_of({model: {way.where: predict(problem, model, way) for way in ways} for model in models}, ways)
+    return choice_of(
+        {model: {where: predict(problem, model, held) for where, held in ways.items()} for model in models}, ways
+    )
 
 
 def test_where_nothing_is_tilted_or_bowed_the_simplest_model_is_chosen(plain_choice):
@@ -100,8 +109,8 @@ def test_images_held_out_are_predicted_to_their_noise(plain_choice):
 
 def test_misses_on_the_object_are_those_in_the_image_times_its_distance(plain):
     """In air without a window a pixel at an angle a to the axis spans z / f, or that times cos a: up to 20 deg, 6 %."""
-    split = Split(INSIDE, frozenset({(0, 4)}))
-    (misses,) = [m for m in predict(plain, Candidate(), split).misses if m.kind == TARGET]
+    held = frozenset({(0, 4)})
+    (misses,) = [m for m in predict(plain, Candidate(), held).misses if m.kind == TARGET]
     piece, local = plain.evidence[0], plain.local[0]
     pose = piece.pose(plain.parameters, plain.global_values, local, 4)
     here = piece.placement.image == 4
@@ -112,15 +121,16 @@ def test_misses_on_the_object_are_those_in_the_image_times_its_distance(plain):
 
 
 def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
-    inside, outside = splits(plain)
-    assert (inside.where, outside.where) == (INSIDE, OUTSIDE)
+    ways = splits(plain)
+    assert list(ways) == [INSIDE, OUTSIDE]
+    inside, outside = ways.values()
     for number, positions in enumerate((AIR, IN_WATER)):
         lit = np.unique(plain.evidence[number].stripe_image)
         assert len(lit) > 0.8 * len(positions)
         ends = {(number, int(lit[0])), (number, int(lit[-1]))}
-        assert ends <= outside.held
-        assert not ends & inside.held
-    assert len(inside.held) >= 4
+        assert ends <= outside
+        assert not ends & inside
+    assert len(inside) >= 4
 
 
 def test_too_few_images_are_refused(thesis):
@@ -138,7 +148,7 @@ def test_a_target_held_by_hand_is_predicted_from_its_own_points(thesis):
     )
     problem = joint_problem(gathered(thesis, [series]), options=replace(OPTIONS, poses="free"))
     held = frozenset({(2, 2), (5, 5)})
-    misses = predict(problem, Candidate(), Split(INSIDE, held)).misses
+    misses = predict(problem, Candidate(), held).misses
     assert {(m.image, m.kind) for m in misses} == {(image, kind) for image in held for kind in (TARGET, STRIPE)}
     stripes = np.concatenate([m.px for m in misses if m.kind == STRIPE])
     # 200 lines with 0.1 px each: 10 % is twice the standard error of their mean square; the model adds some hundredths.

@@ -1,28 +1,232 @@
-"""Advice during a camera calibration: what is still missing, and the pose of the target that would help most."""
+"""Guidance of a camera calibration: what recorded poses determine, what is missing, and the pose that helps most."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
+import cv2
 import numpy as np
 
-from uwlts.calibration.camera import CameraSolution
-from uwlts.calibration.guidance.coverage import (
-    Candidate,
-    Coverage,
-    candidates,
-    coverage_of,
-    information_of,
-    place_words,
-    tilts_rad,
-)
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, nominal_camera, pose_of, solve_recorded
+from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
+from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
 from uwlts.calibration.sheet import fit_sheet, points_on_target
+from uwlts.calibration.target_images import Placement, TargetImage, observe, pose_values
 from uwlts.model.calibration import CameraModel
-from uwlts.model.errors import CalibrationError
+from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
-from uwlts.optics.camera import project
-from uwlts.targets import TargetView
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.optics.camera import directions, project
+from uwlts.targets import Target, TargetView
+
+# A residual this many times that of the others, and this much beyond what noise alone may do, contradicts them.
+_CONTRADICTION, _ALLOWANCE_PX = 3.0, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPose:
+    """A pose of the target as recorded: what the lamp showed, the stripe (N, 2) on the target, the stage's position."""
+
+    view: TargetView
+    stripe: np.ndarray
+    stage_mm: float
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Sensor, target, the medium it stands in, and how the recorded poses belong together."""
+
+    sensor: Sensor
+    target: Target
+    medium: Medium
+    poses: Poses
+    approaching: bool = True
+    camera: CameraOptions = CameraOptions()
+
+    def intrinsics(self) -> Intrinsics:
+        """The camera parameters that are estimated."""
+        camera = self.sensor.camera
+        return Intrinsics(self.camera, width_px=camera.width_px, height_px=camera.height_px)
+
+
+def nominal_camera(setting: Setting) -> CameraModel:
+    """The described camera; through a window into a medium its focal length grows by the medium's index."""
+    camera = setting.sensor.camera
+    index = setting.medium.refractive_index(setting.sensor.laser.wavelength_nm) if camera.window.mounted else 1.0
+    return CameraModel.described(camera, magnified=index)
+
+
+def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
+    """``T_camera_target`` (4, 4) of a view by a known camera.
+
+    Raises CalibrationError: no pose explains the points.
+    """
+    found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
+    if not found or not np.isfinite(translation).all():
+        raise CalibrationError("no pose of the target explains its image: is it the described target?")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return pose
+
+
+def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:
+    """Why the last image of ``after`` contradicts those before it, which ``before`` was solved from; empty if not."""
+    if before is None:
+        return ()
+    rms, usual = after.image_rms_px(), before.rms_px()
+    limit = _CONTRADICTION * usual + _ALLOWANCE_PX
+    # A wrong image pulls the others along, so they are looked at too.
+    worst = max(float(rms[-1]), float(np.sqrt(np.mean(rms[:-1] ** 2))))
+    reason = (
+        f"contradicts the others: with it the residual is {worst:.2f} px, without it {usual:.2f} px, at most "
+        f"{limit:.2f} px is plausible; did the target bend, the stage slip, the lens turn?"
+    )
+    return () if worst <= limit else (reason,)
+
+
+def without_window(sensor: Sensor) -> Sensor:
+    """The sensor with its camera's window taken off."""
+    window = sensor.camera.window.model_copy(update={"mounted": False})
+    return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
+
+
+_LONG_SIDE_CELLS = 8  # fine enough for distortion, coarse enough to be filled by some ten images
+_POINTS_IN_CELL = 3  # one or two may be a corner of the target that touches the cell
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Points of all images in a grid of nearly square cells over the image: ``counts`` (rows, columns) in each."""
+
+    counts: np.ndarray
+    width_px: int
+    height_px: int
+
+    @property
+    def covered(self) -> np.ndarray:
+        """Mask (rows, columns) of the cells that hold points enough: three."""
+        return self.counts >= _POINTS_IN_CELL
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that are covered."""
+        return float(self.covered.mean())
+
+    def with_points(self, pixels: np.ndarray) -> "Coverage":
+        """The coverage with the points (N, 2) of one more image; points outside the image count nowhere."""
+        rows, columns = self.counts.shape
+        # Pixel (0, 0) is the centre of the first pixel, so the image begins half a pixel before it.
+        place = np.floor((pixels + 0.5) / [self.width_px, self.height_px] * [columns, rows]).astype(int)
+        column, row = place[((place >= 0) & (place < [columns, rows])).all(axis=1)].T
+        counts = self.counts.copy()
+        np.add.at(counts, (row, column), 1)
+        return replace(self, counts=counts)
+
+    def emptiest(self) -> str | None:
+        """Ninth of the image with most empty cells, in words; None where none has any."""
+        empty = ~self.covered
+        if not empty.any():
+            return None
+        rows, columns = (np.minimum(3 * np.arange(n) // n, 2) for n in empty.shape)
+        ninths = np.zeros((3, 3))
+        np.add.at(ninths, (rows[:, None], columns[None, :]), empty)
+        row, column = np.unravel_index(int(np.argmax(ninths)), (3, 3))
+        return place_words((column + 0.5) / 3, (row + 0.5) / 3)
+
+
+def coverage_of(views: Sequence[np.ndarray], *, width_px: int, height_px: int) -> Coverage:
+    """Coverage by the points (N, 2) of several images, or of none."""
+    side = max(width_px, height_px) / _LONG_SIDE_CELLS
+    shape = max(2, round(height_px / side)), max(2, round(width_px / side))
+    coverage = Coverage(np.zeros(shape, dtype=np.int64), width_px, height_px)
+    for pixels in views:
+        coverage = coverage.with_points(pixels)
+    return coverage
+
+
+def place_words(x: float, y: float) -> str:
+    """A place in the image, x and y as shares of its width and height, in words."""
+    across = "left" if x < 0.4 else "right" if x > 0.6 else ""
+    if 0.4 <= y <= 0.6:
+        return across or "middle"
+    if across:
+        return f"{'upper' if y < 0.4 else 'lower'} {across}"
+    return "top" if y < 0.4 else "bottom"
+
+
+def tilts_rad(pose: np.ndarray) -> tuple[float, float]:
+    """Tilts of the target at a pose ``T_camera_target`` (4, 4): right side farther, lower side farther."""
+    normal = pose[:3, 2] * np.sign(pose[2, 2] or 1.0)
+    return float(np.arctan2(-normal[0], normal[2])), float(np.arctan2(-normal[1], normal[2]))
+
+
+TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles stay detectable
+_PLACES, _DEPTHS = (0.2, 0.5, 0.8), (0.1, 0.5, 0.9)  # shares of the image and of the working range, inside both
+_MARGIN_PX = 10.0  # of the image, in which circles would be cut
+_SAMPLE = 100  # points of a candidate that stand for all: more repeat what these say
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose ``T_camera_target`` (4, 4) with the pixels (N, 2) and the information (P, P) that its image would give.
+
+    The information is for points that are found to 1 px.
+    """
+
+    pose: np.ndarray
+    pixels: np.ndarray
+    information: np.ndarray
+
+
+def information_of(
+    points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, setting: Setting
+) -> np.ndarray:
+    """Information (P, P) on the camera's parameters in points of one image, each found to 1 px, the pose being unknown.
+
+    The pose's part is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
+    """
+    intrinsics, count = setting.intrinsics(), len(points_mm)
+    placement = Placement(points_mm, np.zeros(count), pixels, np.zeros(count, dtype=int), 1.0)
+    seen = observe(placement, intrinsics, intrinsics.from_model(camera), pose_values(pose))
+    if seen is None:
+        return np.zeros((len(intrinsics.names),) * 2)
+    by_global, basis = seen.by_global, np.linalg.qr(seen.by_local / np.linalg.norm(seen.by_local, axis=0))[0]
+    left = by_global - basis @ (basis.T @ by_global)
+    return left.T @ left
+
+
+def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[Candidate]:
+    """Poses at three distances in the working range, nine places, nine tilts, in which the target could be found.
+
+    Tilts are none and those that make one of eight sides of the image farther. ``spin_rad`` is how the target is turned
+    in the image, from its x axis to the image's.
+    """
+    target, volume, window = setting.target, setting.sensor.volume, setting.sensor.camera.window
+    outer = window.distance_mm + window.thickness_mm
+    nearest, farthest = outer + volume.near_mm, outer + volume.far_mm
+    points, middle = target.points_mm, target.points_mm.mean(axis=0)
+    largest = [camera.width_px - _MARGIN_PX, camera.height_px - _MARGIN_PX]
+    step = max(1, len(points) // _SAMPLE)
+    spin = cv2.Rodrigues(np.array([0.0, 0.0, spin_rad]))[0]
+    sides = np.arange(8) * np.pi / 4
+    tilts = [np.zeros(3), *(TILT_RAD * np.array([np.sin(side), -np.cos(side), 0.0]) for side in sides)]
+    found = []
+    for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
+        distance = nearest + depth * (farthest - nearest)
+        ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(tilt)[0] @ spin
+        pose[:3, 3] = ray / ray[2] * distance - pose[:3, :3] @ middle
+        rotation = cv2.Rodrigues(pose[:3, :3])[0]
+        pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
+        ahead = points @ pose[2, :3] + pose[2, 3] > 0
+        inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
+        if target.findable(inside):
+            sample = np.flatnonzero(inside)[::step]
+            added = information_of(points[sample], pixels[sample], pose, camera, setting)
+            found.append(Candidate(pose, pixels[inside], added * inside.sum() / len(sample)))
+    return found
+
 
 # How well points are usually found, used until residuals are known. Sharp circles do better, in reality too.
 _USUAL_SIGMA_PX, _LEAST_SIGMA_PX = 0.1, 0.02
@@ -40,15 +244,14 @@ _PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
 # A fully uncovered image counts as a factor of 55 in a standard deviation, a side never tilted as one of 1.6.
 _COVERAGE_WEIGHT, _SPREAD_WEIGHT = 4.0, 0.5
 _SIDES = ("right side", "left side", "lower side", "upper side")
-# Decides between poses once everything wanted is reached.
-_BEYOND = 0.05
+_BEYOND = 0.05  # decides between poses once everything wanted is reached
 # What a hand can keep: closer to the advised pose nothing is said.
 _SAME_TILT_RAD, _SAME_PLACE, _SAME_DISTANCE = np.radians(9.0), 0.15, 0.1
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """When a calibration is good enough.
+    """Limits at which a calibration is good enough.
 
     Attributes
     ----------
@@ -71,26 +274,17 @@ class Wanted:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """How far a calibration has come.
-
-    Attributes
-    ----------
-    camera : as far as it is known
-    solution : None as long as the poses do not determine it
-    undetermined : why not
-    poses : (F, 4, 4); ``T_camera_target`` of the recorded poses
-    information : (P, P); what is known of the camera's parameters, of the description alone at first
-    """
+    """State of a calibration by the poses recorded so far."""
 
     setting: Setting
     wanted: Wanted
     recorded: tuple[RecordedPose, ...]
-    camera: CameraModel
-    solution: CameraSolution | None
-    undetermined: str
-    poses: np.ndarray
+    camera: CameraModel  # as far as it is known
+    solution: CameraSolution | None  # None as long as the poses do not determine it
+    undetermined: str  # why the poses do not determine it
+    poses: np.ndarray  # (F, 4, 4); ``T_camera_target`` of the recorded poses
     coverage: Coverage
-    information: np.ndarray
+    information: np.ndarray  # (P, P); on the camera's parameters, of the description alone at first
 
     def std(self) -> dict[LensParameter, float]:
         """Standard deviation of every camera parameter: the solution's, or what is expected without one."""
@@ -139,19 +333,25 @@ class PoseAdvice:
 
 
 def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted = Wanted()) -> State:
-    """How far the recorded poses lead.
+    """State of a calibration by the recorded poses.
 
     Raises CalibrationError: no pose of the target explains one of its images.
     """
-    solution, undetermined = None, "no image yet"
-    camera = nominal_camera(setting)
+    image, camera, solution, undetermined = setting.sensor.camera, nominal_camera(setting), None, "no image yet"
     if recorded:
         try:
-            solution = solve_recorded(recorded, setting)
+            solution = solve_camera(
+                [TargetImage(pose.view.points_mm, pose.view.pixels, pose.stage_mm) for pose in recorded],
+                width_px=image.width_px,
+                height_px=image.height_px,
+                poses=setting.poses,
+                approaching=setting.approaching,
+                options=setting.camera,
+                circle_diameter_mm=setting.target.circle_diameter_mm,
+            )
             camera, undetermined = solution.model, ""
-        except CalibrationError as error:
+        except (CalibrationError, RangeError) as error:
             undetermined = str(error)
-    image = setting.sensor.camera
     size = dict.fromkeys(_FOCAL, camera.fx_px) | {LensParameter.FY: camera.fy_px}
     size |= {LensParameter.CX: camera.width_px, LensParameter.CY: camera.height_px}
     stds = [_PRIOR[key] * size.get(key, 1.0) for key in setting.intrinsics().keys]
@@ -173,7 +373,7 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
 
 
 def lack(state: State) -> float:
-    """How much is missing: 0 once all that is wanted is reached, else logarithms of ratios and weighted shares."""
+    """Measure of the shortfall: 0 once everything wanted is reached, else logarithms of ratios and weighted shares."""
     std, share = state.expected_std(), state.coverage.share
     ratios = np.log([std[key] / limit for key, limit in state.wanted.std_px().items() if key in std])
     beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - share))
@@ -214,7 +414,7 @@ def middle_of(pose: np.ndarray, state: State) -> tuple[tuple[float, float], floa
 
 
 def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None) -> str:
-    """What to do with the target to bring it from its present pose (4, 4), None if unknown, to the advised one."""
+    """Instruction for moving the target from its present pose (4, 4), None if unknown, to the advised one."""
     parts, aim = [], advice.candidate.pose
     place, distance = (None, None) if pose is None else middle_of(pose, state)
     if pose is None or np.arccos(np.clip(pose[:3, 2] @ aim[:3, 2], -1, 1)) > _SAME_TILT_RAD:
@@ -232,7 +432,7 @@ def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None
 
 
 def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
-    """Which side of the target shall be farther, and by how much."""
+    """Instruction for tilting the target: the side that shall be farther, and by how much."""
     across, down = tilts_rad(aim)
     size = np.degrees(np.arccos(np.clip(1 / np.sqrt(1 + np.tan(across) ** 2 + np.tan(down) ** 2), -1, 1)))
     if size < 5:
@@ -240,16 +440,13 @@ def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
     farther = {"lower": down, "upper": -down, "right": across, "left": -across}
     sides = [side for side, tilt in farther.items() if tilt > np.radians(5)]
     what = f"{sides[0]} side" if len(sides) == 1 else f"{' '.join(sides)} corner"
-    now = (
-        ""
-        if pose is None
-        else f" (now it is tilted by {np.degrees(np.arccos(np.clip(abs(pose[2, 2]), 0, 1))):.0f} deg)"
-    )
+    present = 1.0 if pose is None else np.clip(abs(pose[2, 2]), 0, 1)
+    now = "" if pose is None else f" (now it is tilted by {np.degrees(np.arccos(present)):.0f} deg)"
     return f"tilt the target so that its {what} is farther, {size:.0f} deg{now}"
 
 
 def missing(state: State) -> list[str]:
-    """What is still not good enough, in words; empty when all that is wanted is reached."""
+    """Limits that are not reached yet, in words; empty when all that is wanted is reached."""
     said, wanted = [], state.wanted
     if len(state.recorded) < wanted.fewest_images:
         said.append(f"{len(state.recorded)} images, at least {wanted.fewest_images} are wanted")
@@ -273,7 +470,7 @@ def missing(state: State) -> list[str]:
 
 
 def missing_sheet(state: State) -> list[str]:
-    """What the laser sheet still lacks; nothing as long as the camera is not known."""
+    """Reasons why the laser sheet is not determined yet, in words; none as long as the camera is not known."""
     if state.solution is None:
         return []
     target, stripes = state.setting.target, [pose.stripe for pose in state.recorded]

@@ -20,7 +20,6 @@ PLACES = 3
 _APART = 1 / 7  # of the volume's depth
 _FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
 _MOST_SATURATED = 0.05  # share of the lines; outlier tests bear so many wrong centres
-_STRIPE = StripeOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +32,7 @@ class StepQuality:
 
 
 def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor) -> float | None:
-    """Where to put the standard next, mm outside the window; None once it was seen at three depths apart.
+    """Depth for the standard's next image, mm outside the window; None once it was seen at three depths apart.
 
     Of the middles of the measuring volume's thirds the one farthest from where it was seen.
     """
@@ -58,7 +57,7 @@ def is_new(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
 
 
 def least_apart_mm(sensor: Sensor) -> float:
-    """How far apart two depths of the standard shall be."""
+    """Least distance of two depths of the standard, mm."""
     return _APART * (sensor.volume.far_mm - sensor.volume.near_mm)
 
 
@@ -70,7 +69,7 @@ def judge_step(
     *,
     medium_index: float,
     full_dn: int,
-    options: StripeOptions = _STRIPE,
+    options: StripeOptions = StripeOptions(),
 ) -> StepQuality:
     """Quality of a laser image (H, W) of the step standard, by a calibration in air and the nominal window."""
     along = calibration.stripe_along

@@ -2,28 +2,193 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Literal, TypeVar
 
+import numpy as np
+from numpy.polynomial import legendre
+
 from uwlts.calibration.evidence import Progress as Searched
-from uwlts.calibration.joint.evidence import TargetEvidence
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly
+from uwlts.calibration.joint.evidence import STRIPE, TARGET, TargetEvidence
+from uwlts.calibration.joint.gathering import Gathered, Series, gather_jointly
+from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.procedure import JointProblem, joint_problem
-from uwlts.calibration.model_comparison.candidates import Candidate, dimensions_of
-from uwlts.calibration.model_comparison.held_out import INSIDE, Prediction, Split, predict, splits
-from uwlts.calibration.model_comparison.scores import PolynomialScore, Score, Tally, polynomial_score, tally
-from uwlts.calibration.polynomial_evidence import common_header
+from uwlts.calibration.model_comparison.held_out import (
+    INSIDE,
+    Candidate,
+    Image,
+    Prediction,
+    dimensions_of,
+    predict,
+    splits,
+)
+from uwlts.calibration.polynomial import fit_line_polynomials
+from uwlts.calibration.polynomial_evidence import common_header, object_coordinates, stripes_on_plate
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.optics.window import require_index
 from uwlts.runtime.workers import Send, work_through
-from uwlts.storage.capture import Capture, opened_captures
+from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
 from uwlts.stripe import StripeOptions
 
 Level = TypeVar("Level")
 
 Progress = Callable[[int, int], None]
 _Captures = Sequence[Capture | str | Path]
+
+
+POINTS, STRIPES = "points", "stripes"
+"""The target's points; stripes on target and steps."""
+
+_DRAWS = 2000  # standard errors to 2 %
+
+
+@dataclass(frozen=True)
+class Score:
+    """Root mean square miss of a model in the images held out in one way.
+
+    ``px`` are those of the target's points and of the stripes, ``mm`` the same on the object, ``all_mm`` of both
+    together, ``std_mm`` its standard error, by drawing the images anew.
+    """
+
+    px: dict[str, float]
+    mm: dict[str, float]
+    all_mm: float
+    std_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """Sums over the points of each image held out, for C models and I images; outliers do not count.
+
+    ``px`` and ``mm`` are squares (C, I) of misses, of points and of stripes, ``counts`` numbers (I,) of points.
+    """
+
+    px: dict[str, np.ndarray]
+    mm: dict[str, np.ndarray]
+    counts: dict[str, np.ndarray]
+
+    def score(self, model: int) -> Score:
+        """Score of a model."""
+        seen = [kind for kind in self.counts if self.counts[kind].any()]
+        all_mm, std_mm = rms_of_images(self._all(model), self._number())
+        return Score(
+            px={kind: _rms(self.px[kind][model], self.counts[kind]) for kind in seen},
+            mm={kind: _rms(self.mm[kind][model], self.counts[kind]) for kind in seen},
+            all_mm=all_mm,
+            std_mm=std_mm,
+        )
+
+    def beyond(self, model: int, other: int) -> tuple[float, float]:
+        """By how much a model's mean square in mm2 is above another's, image by image, and its standard error."""
+        difference, draws = self._all(model) - self._all(other), _draws(len(self._number()))
+        drawn = draws @ difference / (draws @ self._number())
+        return float(difference.sum() / self._number().sum()), float(drawn.std(ddof=1))
+
+    def as_good(self, model: int, other: int) -> bool:
+        """Whether a model is no worse than another, within the standard error of their difference."""
+        difference, std = self.beyond(model, other)
+        return difference <= std
+
+    def _all(self, model: int) -> np.ndarray:
+        return np.sum([squares[model] for squares in self.mm.values()], axis=0)
+
+    def _number(self) -> np.ndarray:
+        return np.sum(list(self.counts.values()), axis=0)
+
+
+def tally(predictions: Sequence[Prediction]) -> Tally:
+    """The sums of several predictions of the same images."""
+    used, first = _used(predictions), predictions[0].misses
+    images = sorted({miss.image for miss in first})
+    shape = len(predictions), len(images)
+    sums = {what: {kind: np.zeros(shape) for kind in (POINTS, STRIPES)} for what in ("px", "mm")}
+    counts = {kind: np.zeros(len(images)) for kind in (POINTS, STRIPES)}
+    for place, miss in enumerate(first):
+        kind, image = POINTS if miss.kind == TARGET else STRIPES, images.index(miss.image)
+        counts[kind][image] += used[place].sum()
+        for model, prediction in enumerate(predictions):
+            for what, squares in sums.items():
+                squares[kind][model, image] += np.sum(getattr(prediction.misses[place], what)[used[place]] ** 2)
+    return Tally(sums["px"], sums["mm"], counts)
+
+
+def _used(predictions: Sequence[Prediction]) -> list[np.ndarray]:
+    """Masks (n,) of the points that count in each of the misses: not those that all models miss by far."""
+    limits = {
+        kind: min(outlier_limit(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions)
+        for kind in {miss.kind for miss in predictions[0].misses}
+    }
+    each = zip(*(p.misses for p in predictions), strict=True)
+    return [np.min([miss.px for miss in same], axis=0) <= limits[same[0].kind] for same in each]
+
+
+def rms_of_images(squares: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
+    """Root of the mean square over all images, from sums of squares (I,) and counts (I,), and its standard error."""
+    draws = _draws(len(counts))
+    return _rms(squares, counts), float(np.sqrt(draws @ squares / (draws @ counts)).std(ddof=1))
+
+
+def _draws(images: int) -> np.ndarray:
+    """Numbers (B, I) of times that each image is drawn; the same draws for all."""
+    return np.random.default_rng(0).multinomial(images, np.full(images, 1 / images), size=_DRAWS)
+
+
+def _rms(squares: np.ndarray, counts: np.ndarray) -> float:
+    return float(np.sqrt(squares.sum() / counts.sum()))
+
+
+DEGREE = 6  # of the polynomials (thesis, section 4.7)
+
+
+@dataclass(frozen=True)
+class PolynomialScore:
+    """Root mean square misses in mm of stripes on the target, inside the calibrated volume.
+
+    Polynomials have no camera, so that they are judged on the object only; outside they do not measure. ``all_mm`` and
+    ``std_mm`` are by polynomials, with the standard error, ``model_mm`` and ``model_std_mm`` in the same images by the
+    model they are compared with.
+    """
+
+    medium: str
+    images: int
+    all_mm: float
+    std_mm: float
+    model_mm: float
+    model_std_mm: float
+
+
+def polynomial_score(
+    series: Series, header: CaptureHeader, images: Sequence[Image], model: Prediction
+) -> PolynomialScore | None:
+    """Score of polynomials in the images of a series that are held out; None where there is no such image.
+
+    Raises CalibrationError: the series is not fit for polynomials.
+    """
+    if not images:
+        return None
+    stripes, _, _ = stripes_on_plate(series.found, header, DEGREE)
+    depth_mm, _ = object_coordinates(stripes, header)
+    held = np.isin(stripes.pose, [image for _, image in images])
+    fit = fit_line_polynomials(stripes.lines[~held], stripes.centres_px[~held], depth_mm[~held], degree=DEGREE)
+    low, high = fit.range
+    rows, x = stripes.lines[held] - fit.first_line, stripes.centres_px[held]
+    known = (rows >= 0) & (rows < len(fit.coefficients)) & (x >= low) & (x <= high)
+    argument = (2 * x[known] - low - high) / (high - low)
+    found = legendre.legval(argument, fit.coefficients[rows[known]].T, tensor=False)
+    off, pose = found - depth_mm[held][known], stripes.pose[held][known]
+    by_model = [m.mm for m in model.misses if m.image in images and m.kind == STRIPE]
+    own = _robust_rms([off[pose == image] for image in np.unique(pose)])
+    return PolynomialScore(header.medium_name, len(images), *own, *_robust_rms(by_model))
+
+
+def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Root mean square of the misses in several images, without outliers, and its standard error."""
+    limit = outlier_limit(np.concatenate(misses))
+    kept = [off[np.abs(off) <= limit] for off in misses]
+    squares, counts = np.array([np.sum(off**2) for off in kept]), np.array([len(off) for off in kept])
+    return rms_of_images(squares, counts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,35 +205,30 @@ class Judged:
 class Choice:
     """The models, the usual one first, and what their scores say.
 
-    Attributes
-    ----------
-    ways : `Split` by its name
-    predictions : of the models that have scores, by the way of holding out
-    tallies : for each way of holding out, of those models in their order
+    ``ways`` are the images held out, by the name of the way; ``predictions`` those of the models that have scores, by
+    the way; ``tallies`` belong to each way, of those models in their order.
     """
 
     judged: list[Judged]
-    ways: dict[str, Split]
+    ways: dict[str, frozenset[Image]]
     predictions: dict[Candidate, dict[str, Prediction]]
     tallies: dict[str, Tally]
 
     def best(self) -> Candidate:
         """The model of the smallest mean square miss, both ways of holding out counting alike."""
-        return self.good_among(self._able())[0].candidate
+        return self._good_among()[0].candidate
 
     def as_good(self) -> list[Candidate]:
         """Those that are no worse than the best in either way, but for chance."""
-        return [each.candidate for each in self.good_among(self._able())[1]]
+        return [each.candidate for each in self._good_among()[1]]
 
-    def simplest(self) -> Candidate:
-        """Of these that with the fewest parameters."""
-        return min(self.good_among(self._able())[1], key=self._size).candidate
+    def simplest(self, among: Sequence[Candidate] | None = None) -> Candidate:
+        """Of all models or some, of those as good as the best that with the fewest parameters."""
+        return min(self._good_among(among)[1], key=lambda each: each.parameters or 0).candidate
 
-    def _able(self) -> list[Judged]:
-        return [each for each in self.judged if each.scores]
-
-    def _size(self, judged: Judged) -> int:
-        return len(self.predictions[judged.candidate][INSIDE].parameters.keys)
+    def level(self, name: str, levels: Sequence[Level]) -> Level:
+        """Of the ways in which one thing can be modelled, the simplest that is as good as the best of them."""
+        return getattr(self.simplest([replace(Candidate(), **{name: value}) for value in levels]), name)
 
     def number(self, candidate: Candidate) -> int:
         """Number of a model among those that have scores."""
@@ -84,17 +244,16 @@ class Choice:
         separate = self.predictions[other][INSIDE].separates_from(self.predictions[candidate][INSIDE])
         return not separate or self.tallies[where].as_good(self.number(candidate), self.number(other))
 
-    def good_among(self, judged: Sequence[Judged]) -> tuple[Judged, list[Judged]]:
-        """Of some models the best, and those that are as good in both ways."""
-        best = min(judged, key=lambda each: sum(score.all_mm**2 for score in each.scores.values()))
-        good = [e for e in judged if all(self.no_worse(e.candidate, best.candidate, where) for where in self.ways)]
+    def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[Judged, list[Judged]]:
+        """Of all models or some the best, and those that are as good in both ways."""
+        able = [each for each in self.judged if each.scores and (among is None or each.candidate in among)]
+        best = min(able, key=lambda each: sum(score.all_mm**2 for score in each.scores.values()))
+        good = [e for e in able if all(self.no_worse(e.candidate, best.candidate, where) for where in self.ways)]
         return best, good
 
-    def level(self, name: str, levels: Sequence[Level]) -> Level:
-        """Of the ways in which one thing can be modelled, the simplest that is as good as the best of them."""
-        alternatives = [replace(Candidate(), **{name: value}) for value in levels]
-        _, good = self.good_among([e for e in self.judged if e.scores and e.candidate in alternatives])
-        return getattr(min(good, key=self._size).candidate, name)
+
+Found = dict[Candidate, dict[str, Prediction] | str]
+"""For each model its predictions by the way of holding out, or why there are none."""
 
 
 def choose(
@@ -104,52 +263,34 @@ def choose(
 
     Raises CalibrationError: there are too few images, or the usual model cannot be calibrated without those held out.
     """
-    ways, usual = splits(problem), Candidate()
+    ways, usual, done = splits(problem), Candidate(), count(1)
     dimensions = dimensions_of(problem.parameters)
     singles = [usual, *(replace(usual, **{name: other}) for name, others in dimensions.items() for other in others)]
     total = len(ways) * (len(singles) + 1)
-    found = _predicted(problem, singles, ways, workers=workers, progress=lambda done: progress(done, total))
+
+    def predicted(candidates: Sequence[Candidate]) -> Found:
+        jobs = [(problem, candidate, held) for candidate in candidates for held in ways.values()]
+        results = work_through(_work, jobs, workers=workers, on_message=lambda _: progress(next(done), total))
+        found: Found = {}
+        for place, candidate in enumerate(candidates):
+            own = results[place * len(ways) : (place + 1) * len(ways)]
+            by_way = {where: each for where, each in zip(ways, own, strict=True) if not isinstance(each, str)}
+            found[candidate] = next((each for each in own if isinstance(each, str)), by_way)
+        return found
+
+    found = predicted(singles)
     if isinstance(found[usual], str):
         raise CalibrationError(f"without the images held out there is no calibration: {found[usual]}")
     first = choice_of(found, ways)
     needed = {name: first.level(name, [getattr(usual, name), *others]) for name, others in dimensions.items()}
-    simple, before = replace(usual, **needed), len(ways) * len(singles)
+    simple = replace(usual, **needed)
     if simple not in found:
-        found |= _predicted(
-            problem, [simple], ways, workers=workers, progress=lambda done: progress(before + done, total)
-        )
+        found |= predicted([simple])
     progress(total, total)
     return choice_of(found, ways)
 
 
-def _predicted(
-    problem: JointProblem,
-    candidates: Sequence[Candidate],
-    ways: Sequence[Split],
-    *,
-    workers: int | None,
-    progress: Callable[[int], None],
-) -> dict[Candidate, dict[str, Prediction] | str]:
-    """For each model its predictions by the way of holding out, or why there are none."""
-    done = 0
-
-    def on_message(message: object) -> None:
-        nonlocal done
-        done += 1
-        progress(done)
-
-    jobs = [(problem, candidate, way) for candidate in candidates for way in ways]
-    results = work_through(_work, jobs, workers=workers, on_message=on_message)
-    found: dict[Candidate, dict[str, Prediction] | str] = {}
-    for place, candidate in enumerate(candidates):
-        own = results[place * len(ways) : (place + 1) * len(ways)]
-        reasons = [each for each in own if isinstance(each, str)]
-        predicted = {way.where: each for way, each in zip(ways, own, strict=True) if not isinstance(each, str)}
-        found[candidate] = reasons[0] if reasons else predicted
-    return found
-
-
-def _work(job: tuple[JointProblem, Candidate, Split], send: Send) -> Prediction | str:
+def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> Prediction | str:
     try:
         return predict(*job)
     except CalibrationError as error:
@@ -158,24 +299,24 @@ def _work(job: tuple[JointProblem, Candidate, Split], send: Send) -> Prediction 
         send(None)
 
 
-def choice_of(found: dict[Candidate, dict[str, Prediction] | str], ways: Sequence[Split]) -> Choice:
+def choice_of(found: Found, ways: dict[str, frozenset[Image]]) -> Choice:
     """The choice among models by what each predicts in both ways, or the reason why it does not."""
     predictions = {candidate: result for candidate, result in found.items() if not isinstance(result, str)}
-    tallies = {way.where: tally([each[way.where] for each in predictions.values()]) for way in ways}
-    judged = []
+    tallies = {where: tally([each[where] for each in predictions.values()]) for where in ways}
+    judged, number = [], count()
     for candidate, result in found.items():
         if isinstance(result, str):
             judged.append(Judged(candidate, None, {}, result))
         else:
-            number = list(predictions).index(candidate)
-            scores = {where: each.score(number) for where, each in tallies.items()}
+            place = next(number)
+            scores = {where: each.score(place) for where, each in tallies.items()}
             judged.append(Judged(candidate, len(result[INSIDE].parameters.keys), scores))
-    return Choice(judged, {way.where: way for way in ways}, predictions, tallies)
+    return Choice(judged, ways, predictions, tallies)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What models miss in images held out, of which sensor and which captures.
+    """Misses of models in images held out, with the sensor and the captures.
 
     ``polynomials`` is None without a target in a medium on the stage; ``why_none`` is why they have no score.
     """
@@ -253,7 +394,7 @@ def _polynomials(
         return None, "polynomials need a target in the medium of use that the stage moves"
     part = wet[0]
     alike = [n for n, e in enumerate(problem.evidence) if isinstance(e, TargetEvidence) and e.view == part.view]
-    images = [image for image in choice.ways[INSIDE].held if image[0] in alike]
+    images = [image for image in choice.ways[INSIDE] if image[0] in alike]
     try:
         header = common_header([c for c in targets if c.path.name in part.names and c.header.medium.kind != "air"])
         return polynomial_score(part, header, images, choice.predictions[choice.simplest()][INSIDE]), ""

@@ -1,13 +1,14 @@
-"""Images held out from a calibration, and how well a model calibrated without them predicts them."""
+"""Models of the sensor to choose from, and how well each predicts images held out from its calibration."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import assert_never
+from typing import Literal, assert_never
 
 import cv2
 import numpy as np
 from scipy.stats import chi2
 
+from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.joint.consistency import much_left_out
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.evidence import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
@@ -15,8 +16,98 @@ from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.joint.procedure import JointProblem, centred
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
-from uwlts.calibration.model_comparison.candidates import Candidate, recast
+from uwlts.calibration.target_images import pose_values
+from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import ParameterKey, SheetParameter, WindowParameter
+
+_HELD: dict[str, tuple[ParameterKey, ...]] = {
+    "window_tilt": (WindowParameter.SLOPE_X, WindowParameter.SLOPE_Y),
+    "bow": (SheetParameter.BOW,),
+    "window_turn": (SheetParameter.WINDOW_TURN,),
+}
+_WORDS = {
+    "refractions": "one refraction",
+    "window_tilt": "window not tilted",
+    "bow": "sheet without bow",
+    "window_turn": "laser window not turned",
+}
+_GLASS = (WindowParameter.THICKNESS, WindowParameter.GLASS_INDEX)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model of the sensor; what is not free is held as described.
+
+    ``refractions`` is 1 where the camera's window is one interface, 2 for a pane of glass. Free may be the tilt of the
+    camera's window, the sheet's bow and the turn of the laser's window; distortion coefficients not named are zero.
+    """
+
+    refractions: Literal[1, 2] = 2
+    window_tilt: bool = True
+    bow: bool = True
+    window_turn: bool = True
+    distortion: tuple[str, ...] = ("k1", "k2")
+
+    def words(self) -> str:
+        """The model by what sets it apart from the usual one."""
+        usual = Candidate()
+        parts = [words for name, words in _WORDS.items() if getattr(self, name) != getattr(usual, name)]
+        if self.distortion != usual.distortion:
+            parts.append(distortion_words(self.distortion))
+        return ", ".join(parts) or "usual (glass plate, tilts, bow, k1 k2)"
+
+
+def distortion_words(distortion: tuple[str, ...]) -> str:
+    """Distortion coefficients by name."""
+    return "distortion " + " ".join(distortion) if distortion else "no distortion"
+
+
+DIMENSIONS: dict[str, tuple[object, ...]] = {
+    "refractions": (1,),
+    "window_tilt": (False,),
+    "bow": (False,),
+    "window_turn": (False,),
+    "distortion": ((), ("k1",), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2")),
+}
+"""Departures from the usual model, one at a time."""
+
+
+def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
+    """Those that the evidence has to do with."""
+    return {
+        name: others
+        for name, others in DIMENSIONS.items()
+        if name == "distortion"
+        or (name == "refractions" and parameters.window is not None)
+        or any(held in parameters.keys for held in _HELD.get(name, ()))
+    }
+
+
+def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
+    """The problem with the candidate's parameters, starting where it started.
+
+    The distance of a single interface is only known to lie near the described one, as it stands for a pane of glass.
+    """
+    known = problem.parameters
+    options = replace(known.intrinsics.options, distortion=candidate.distortion)
+    intrinsics = Intrinsics(options, width_px=known.intrinsics.width_px, height_px=known.intrinsics.height_px)
+    held = {key for field, keys in _HELD.items() if not getattr(candidate, field) for key in keys}
+    window, priors = known.window, dict(known.priors)
+    if candidate.refractions == 1 and window is not None:
+        window = WindowModel(refractions=1, distance_mm=window.distance_mm, normal=window.normal)
+        held |= set(_GLASS)
+        priors |= {
+            WindowParameter.DISTANCE: replace(priors[WindowParameter.DISTANCE], std=np.inf),
+            WindowParameter.THICKNESS: replace(priors[WindowParameter.THICKNESS], mean=0.0),
+            WindowParameter.GLASS_INDEX: replace(priors[WindowParameter.GLASS_INDEX], mean=1.0),
+        }
+    priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in priors.items()}
+    parameters = replace(known, intrinsics=intrinsics, window=window, priors=priors)
+    start = dict(zip(known.keys, problem.global_values, strict=True))
+    global_values = np.array([start.get(key, 0.0) for key in parameters.keys])
+    return replace(problem, parameters=parameters, global_values=global_values)
+
 
 INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
@@ -27,18 +118,11 @@ _OUTER = 1 / 6  # of the depth, at either end
 _FEWEST_KEPT, _FEWEST_HELD = 4, 4  # images; fewer give neither a calibration nor a standard error
 
 
-@dataclass(frozen=True)
-class Split:
-    """Images held out: inside the volume of the others, or outside of it, the nearest and the farthest."""
+def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
+    """Images held out, inside the volume of the others and outside of it: the nearest and the farthest.
 
-    where: str
-    held: frozenset[Image]
-
-
-def splits(problem: JointProblem) -> list[Split]:
-    """Both ways of holding out. An image's depth is where its stripe lies in the image, among those seen alike.
-
-    Every fourth image is held out, or those in the outer sixths of where stripes lie. Images without a stripe are not.
+    An image's depth is where its stripe lies in the image, among those seen alike. Every fourth image is held out, or
+    those in the outer sixths of where stripes lie. Images without a stripe are not.
 
     Raises CalibrationError: there are too few images.
     """
@@ -51,13 +135,13 @@ def splits(problem: JointProblem) -> list[Split]:
         outer = (places < places[0] + reach) | (places > places[-1] - reach)
         if np.count_nonzero(~outer) >= _FEWEST_KEPT:
             outside |= {image for image, out in zip(images, outer, strict=True) if out}
-    for held in (inside, outside):
-        if len(held) < _FEWEST_HELD:
-            raise CalibrationError(
-                f"the captures have too few images with a stripe to hold some out: {len(held)} could be, at least "
-                f"{_FEWEST_HELD} are needed; take 16 or more of the target at different depths"
-            )
-    return [Split(INSIDE, frozenset(inside)), Split(OUTSIDE, frozenset(outside))]
+    fewest = min(len(inside), len(outside))
+    if fewest < _FEWEST_HELD:
+        raise CalibrationError(
+            f"the captures have too few images with a stripe to hold some out: {fewest} could be, at least "
+            f"{_FEWEST_HELD} are needed; take 16 or more of the target at different depths"
+        )
+    return {INSIDE: frozenset(inside), OUTSIDE: frozenset(outside)}
 
 
 def _by_depth(problem: JointProblem) -> dict[View, list[tuple[float, Image]]]:
@@ -80,22 +164,21 @@ def _by_depth(problem: JointProblem) -> dict[View, list[tuple[float, Image]]]:
 def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem, list[int]]:
     """The problem without the images held out, and which pieces of its evidence are left."""
     evidence: list[Evidence] = []
-    own, numbers = [], []
+    local, numbers = [], []
     for number, (piece, start) in enumerate(zip(problem.evidence, problem.local, strict=True)):
-        if not isinstance(piece, TargetEvidence):
-            if (number, piece.image) in held:
-                continue
-        else:
+        if isinstance(piece, TargetEvidence):
             kept = [image for image in np.unique(piece.placement.image).tolist() if (number, image) not in held]
             if not kept:
                 continue
             piece = of_images(piece, kept)
             if piece.staged:
                 start = np.concatenate([start[:8], np.zeros(len(piece.images()))])
+        elif (number, piece.image) in held:
+            continue
         evidence.append(piece)
-        own.append(start)
+        local.append(start)
         numbers.append(number)
-    return replace(problem, evidence=evidence, local=own), numbers
+    return replace(problem, evidence=evidence, local=local), numbers
 
 
 def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
@@ -145,7 +228,7 @@ class Prediction:
         return bool(chi2.sf(square, len(more)) < _BY_CHANCE)
 
 
-def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Prediction:
+def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image]) -> Prediction:
     """Calibrate without the images held out, and predict these.
 
     Where the stage moved the target, its place in an image held out follows from the others and the stage's position,
@@ -156,15 +239,15 @@ def predict(problem: JointProblem, candidate: Candidate, split: Split) -> Predic
     out meets nothing.
     """
     whole = recast(problem, candidate)
-    training, numbers = without(whole, split.held)
+    training, numbers = without(whole, held)
     estimate = training.solve()
     if misfits := much_left_out(estimate):
         kind, share = next(iter(misfits.items()))
         raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
     local = dict(zip(numbers, estimate.local, strict=True))
     found = []
-    for number in sorted({number for number, _ in split.held}):
-        piece, images = whole.evidence[number], sorted(image for held, image in split.held if held == number)
+    for number in sorted({number for number, _ in held}):
+        piece, images = whole.evidence[number], sorted(image for at, image in held if at == number)
         match piece:
             case TargetEvidence():
                 posed = _posed(whole, piece, number, images, local.get(number))
@@ -194,8 +277,7 @@ def _posed(
         return [(held, np.concatenate([local[:3], shift, local[6:8], np.zeros(len(held.images()))]), ())]
     found = []
     for image in images:
-        at = piece.pose(problem.parameters, problem.global_values, problem.local[number], image)
-        start = np.concatenate([cv2.Rodrigues(at[:3, :3])[0].ravel(), at[:3, 3]])
+        start = pose_values(piece.pose(problem.parameters, problem.global_values, problem.local[number], image))
         found.append((replace(of_images(piece, [image]), staged=False), start, (TARGET,)))
     return found
 

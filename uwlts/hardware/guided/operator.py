@@ -10,7 +10,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from uwlts.calibration.guidance.coverage import Coverage
+from uwlts.calibration.guidance.pose_advice import Coverage
 from uwlts.hardware.live_view import LivePage, small_picture
 
 _LOOK_S = 0.1

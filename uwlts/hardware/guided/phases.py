@@ -12,16 +12,19 @@ import numpy as np
 
 from uwlts.calibration.guidance.pose_advice import (
     PoseAdvice,
+    RecordedPose,
+    Setting,
     State,
     Wanted,
     best_pose,
     format_pose_advice,
     gain_of,
+    judge_residual,
     missing,
     missing_sheet,
+    pose_of,
     state_of,
 )
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, judge_residual, pose_of
 from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
 from uwlts.calibration.image_quality import (
     LampFault,

@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from uwlts.calibration.camera import Poses
-from uwlts.calibration.guidance.pose_advice import Wanted
-from uwlts.calibration.guidance.solution import RecordedPose, Setting, without_window
+from uwlts.calibration.guidance.pose_advice import RecordedPose, Setting, Wanted, without_window
 from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, plan_table
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import DescriptionError

@@ -14,8 +14,7 @@ from typing import Literal
 import numpy as np
 
 from uwlts.calibration.camera import Poses
-from uwlts.calibration.guidance.pose_advice import State
-from uwlts.calibration.guidance.solution import Setting
+from uwlts.calibration.guidance.pose_advice import Setting, State
 from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially

@@ -10,15 +10,10 @@ from uwlts.model.errors import ImageError
 # Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
 # to three quarters of its side, so factors of four cover 4 px to 380 px with overlap.
 WINDOWS_PX = (32, 128, 512)
-
-# A blob of fewer pixels has no measurable shape (a disc of 4 px diameter covers 12.6).
-MIN_AREA_PX = 10.0
-
+MIN_AREA_PX = 10.0  # a blob of fewer pixels has no measurable shape (a disc of 4 px diameter covers 12.6)
 # Pure noise, which the median filter has more than halved, shows 0.7 of its standard deviation between both levels.
 CONTRAST_OVER_NOISE = 3.0
-
-# Fraction of the image's grey range below which a contrast is taken for dirt or compression noise.
-CONTRAST_OVER_RANGE = 0.04
+CONTRAST_OVER_RANGE = 0.04  # below this fraction of the image's grey range a contrast is dirt or compression noise
 
 
 @dataclass(frozen=True)
@@ -36,19 +31,20 @@ class Blobs:
     shapes: np.ndarray
     bright: bool
 
+    def __len__(self):
+        return len(self.centres)
+
 
 def checked_grey(image):
     """Return `image` unchanged if it is an (H, W) array of uint8 or uint16, else raise `ImageError`."""
     if not isinstance(image, np.ndarray):
         raise ImageError(f"the image is a {type(image).__name__}; expected a NumPy array (H, W) of uint8 or uint16")
-    if image.ndim != 2:
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 16:
+        size = " x ".join(map(str, image.shape[1::-1]))
         raise ImageError(
-            f"the image has shape {image.shape}; expected one grey channel (H, W): convert colour images first"
+            f"the image has {size} pixels, {image.ndim} dimensions and the type {image.dtype}; expected one grey "
+            "channel (H, W) of uint8 or uint16, at least 16 x 16: convert colour images first"
         )
-    if image.dtype not in (np.uint8, np.uint16):
-        raise ImageError(f"the image has type {image.dtype}; expected uint8 or uint16")
-    if min(image.shape) < 16:
-        raise ImageError(f"the image has {image.shape[1]} x {image.shape[0]} pixels; a target needs at least 16 x 16")
     return image
 
 
@@ -158,7 +154,6 @@ def _ellipse_like(mask, *, bright):
 
 def _largest_family(radii):
     """Number of radii in the best-filled interval of a factor of two."""
-    if len(radii) == 0:
-        return 0
     ordered = np.sort(np.log2(radii))
-    return int((np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(len(ordered))).max())
+    within = np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(len(ordered))
+    return int(within.max(initial=0))

@@ -15,18 +15,8 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
     O. Silven, A four-step camera calibration procedure, CVPR 1997, section 3.2); with distortion or refraction the
     ellipse is the one that best fits the projected rim.
 
-    Parameters
-    ----------
-    project : callable
-        Maps points (M, 3) in mm, target frame, to pixels (M, 2).
-    centres_mm : (N, 3) float64, mm, target frame
-    diameter_mm : float
-    axis_u, axis_v : (3,) float64, target frame
-        Orthonormal vectors that span the plane of the circles.
-
-    Returns
-    -------
-    (N, 2) float64, px, (u, v)
+    ``project`` maps points (M, 3) in mm, target frame, to pixels (M, 2); ``centres_mm`` (N, 3) are in the target frame,
+    ``axis_u`` and ``axis_v`` (3,) orthonormal vectors that span the plane of the circles. Returns (N, 2) in px, (u, v).
 
     Raises
     ------
@@ -52,8 +42,7 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
             f"{broken.sum()} of {len(centres)} circles have no finite image, the first at {centres[broken][0]} mm; "
             "leave out circles that the camera cannot see"
         )
-    image_of_centre, rim_image = pixels[:, 0], pixels[:, 1:]
-    return _ellipse_centres(rim_image) - image_of_centre
+    return _ellipse_centres(pixels[:, 1:]) - pixels[:, 0]
 
 
 def _ellipse_centres(points):

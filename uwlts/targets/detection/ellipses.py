@@ -5,21 +5,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.targets.detection.blobs import find_blobs, noise_level
+from uwlts.targets.detection.blobs import Blobs, find_blobs, noise_level
 
 PASSES = 2
-
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast; 1.2 / slope is therefore three s.
 REACH_TIMES_SLOPE = 1.2
-
 MIN_REACH_PX = 2.5
-
 MAX_REACH_PX = 8.0
-
 MIN_RELATIVE_CONTRAST = 0.25
-
-# A centroid further from the ellipse's centre than this has something other than a circle in its band.
-MAX_SHIFT_PX = 0.5
+MAX_SHIFT_PX = 0.5  # a centroid further from the ellipse's centre has something other than a circle in its band
+PROFILES = 48  # around a blob
+SAMPLES = 11  # on each profile
+_ANGLES = np.arange(PROFILES) * (2 * np.pi / PROFILES)
+DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
+"""Unit vectors (PROFILES, 2) that an ellipse's shape matrix maps to points of its rim."""
 
 
 def area_centroids(grey, ellipses):
@@ -34,9 +33,7 @@ def area_centroids(grey, ellipses):
     Returns centres (N, 2) in px and whether (N,) the centroid is next to the centre of the ellipse fitted to the edge;
     where not, the ellipse's centre is given. ``grey`` is float32 (H, W).
     """
-    centres, agree = ellipses.centres.copy(), np.ones(len(ellipses), bool)
-    if len(ellipses) == 0:
-        return centres, agree
+    centres, agree = ellipses.centres, np.ones(len(ellipses), bool)
     wanted, *reaches = _reaches(grey.shape, ellipses)
     for _ in range(PASSES):
         planes = _level_planes(grey, centres, ellipses.shapes, reaches, wanted)
@@ -64,10 +61,7 @@ def _reaches(shape, ellipses):
 
 def _level_planes(grey, centres, shapes, reaches, wanted):
     """Inside and outside level of each blob: (N, 2, 3), value at the centre and slopes along u and v per px."""
-    directions = rim_directions()
-    normals = directions @ np.linalg.inv(shapes)
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    rim = directions @ shapes
+    rim, normals = _rims(shapes)
     planes = np.zeros((len(centres), 2, 3))
     for side, reach in enumerate((-reaches[0], reaches[1])):
         offsets = rim + normals * reach[:, None, None]
@@ -138,31 +132,20 @@ def _row_runs(centres, inner_shapes, outer_shapes):
     return blob[covered], v[covered], (first[covered], last[covered]), (inner[0][covered], inner[1][covered])
 
 
-# Profiles around a blob, and samples on each.
-PROFILES = 48
-
-SAMPLES = 11
-
 # Reaches of an edge profile on either side of the ellipse, tried in turn. Two and a half pixels hold the edge of a lens
 # in focus, six that of one out of focus; inside a small blob half the minor semi-axis is all there is before the
 # opposite edge is felt. The next is tried where this share of the blobs shows no sharp edge.
 REACHES_PX = (2.5, 6.0)
-
 REACH_OVER_MINOR_AXIS = 0.5
-
 MISSED_SHARE = 0.2
 
 # Largest rms distance of the edge from its ellipse: as a share of the reach (0.15 px of 2.5 px) and of the mean radius,
 # against what the noise of a single pixel does to an edge, and against the median of all blobs, which have about the
 # same noise and blur.
 MAX_RESIDUAL_OVER_REACH = 0.06
-
 MAX_RESIDUAL_OVER_RADIUS = 0.01
-
 MAX_RESIDUAL_OVER_NOISE = 1.5
-
 MAX_RESIDUAL_OVER_MEDIAN = 2.5
-
 RESIDUAL_FLOOR_PX = 0.03
 
 # Least slope over contrast of an edge, times the reach; at a reach of 2.5 px it is that under a Gaussian blur of 4 px.
@@ -171,43 +154,27 @@ MIN_SHARPNESS_TIMES_REACH = 0.25
 # Largest departure of one profile's contrast from the smooth course around the blob. Where blur fills a small blob, its
 # inside level differs between the ends and the flanks of the ellipse.
 MAX_CONTRAST_DEPARTURE = 0.2
-
 MAX_CONTRAST_DEPARTURE_IF_SMALL = 0.4
 
 
 @dataclass(frozen=True)
-class Ellipses:
+class Ellipses(Blobs):
     """Ellipses fitted to the edges of blobs.
 
     Attributes
     ----------
-    centres : (N, 2) float64, px, (u, v)
-    shapes : (N, 2, 2) float64, px, symmetric positive; ``centre + shape @ (cos t, sin t)`` is the ellipse
     residual_px : (N,) float64, rms distance of the edge points from the ellipse
     contrast : (N,) float64, grey levels, inside minus outside
     sharpness : (N,) float64, 1/px, slope of the edge over its contrast
-    bright : whether the blobs are brighter than their surroundings
     """
 
-    centres: np.ndarray
-    shapes: np.ndarray
     residual_px: np.ndarray
     contrast: np.ndarray
     sharpness: np.ndarray
-    bright: bool
-
-    def __len__(self):
-        return len(self.centres)
 
     def __getitem__(self, select):
-        return Ellipses(
-            self.centres[select],
-            self.shapes[select],
-            self.residual_px[select],
-            self.contrast[select],
-            self.sharpness[select],
-            self.bright,
-        )
+        own = vars(self).items()
+        return Ellipses(**{name: value if name == "bright" else value[select] for name, value in own})
 
 
 def fit_ellipses(image, blobs):
@@ -226,7 +193,7 @@ def fit_ellipses(image, blobs):
     noise = max(noise_level(grey), 0.5)
     best = _fitted(grey, blobs, REACHES_PX[0], noise)
     for reach in REACHES_PX[1:]:
-        if len(best) >= (1 - MISSED_SHARE) * len(blobs.centres):
+        if len(best) >= (1 - MISSED_SHARE) * len(blobs):
             break
         best = max(best, _fitted(grey, blobs, reach, noise), key=len)
     return best
@@ -234,20 +201,11 @@ def fit_ellipses(image, blobs):
 
 def _fitted(grey, blobs, reach, noise):
     """Ellipses of a float32 image (H, W) with edges sampled over one reach in px."""
-    centres, shapes = blobs.centres, blobs.shapes
-    kept, residual, edge = np.ones(len(centres), bool), np.empty(0), None
+    found = Ellipses(blobs.centres, blobs.shapes, blobs.bright, *np.zeros((3, len(blobs))))
+    found = found[_inside(grey.shape, found, reach)]
     for _ in range(PASSES):
-        kept = kept & _inside(grey.shape, centres, shapes, reach)
-        centres, shapes = centres[kept], shapes[kept]
-        if len(centres) == 0:
-            break
-        edge = _edges(grey, centres, shapes, reach, bright=blobs.bright, noise=noise)
-        centres, shapes, residual, fitted = _moved(centres, shapes, edge)
-        kept = edge.whole & fitted & _inside(grey.shape, centres, shapes, reach)
-    if edge is None or len(centres) == 0:
-        empty = np.empty(0)
-        return Ellipses(np.empty((0, 2)), np.empty((0, 2, 2)), empty, empty, empty, blobs.bright)
-    found = Ellipses(centres, shapes, residual, edge.contrast, edge.sharpness, blobs.bright)[kept]
+        found, whole = _moved(grey, found, reach, noise)
+        found = found[whole & _inside(grey.shape, found, reach)]
     radii = np.sqrt(np.linalg.det(found.shapes))
     from_noise = noise / (found.contrast * np.maximum(found.sharpness, MIN_SHARPNESS_TIMES_REACH / reach))
     limit = np.maximum(MAX_RESIDUAL_OVER_REACH * reach, MAX_RESIDUAL_OVER_RADIUS * radii)
@@ -258,48 +216,52 @@ def _fitted(grey, blobs, reach, noise):
     return found[round_enough]
 
 
-@dataclass(frozen=True)
-class _Edges:
-    directions: np.ndarray
-    normals: np.ndarray
-    distance: np.ndarray
-    contrast: np.ndarray
-    sharpness: np.ndarray
-    whole: np.ndarray
-
-
-def _inside(shape, centres, shapes, reach):
+def _inside(shape, ellipses, reach):
     """Whether the profiles of ellipses stay within the image, (N,) bool."""
-    half_width = np.sqrt((shapes**2).sum(2)) + reach
+    half_width = np.sqrt((ellipses.shapes**2).sum(2)) + reach
     limit = np.array([shape[1], shape[0]]) - 1.001
-    return (centres - half_width >= 0).all(1) & (centres + half_width <= limit).all(1)
+    return (ellipses.centres - half_width >= 0).all(1) & (ellipses.centres + half_width <= limit).all(1)
 
 
-def _edges(grey, centres, shapes, longest, *, bright, noise):
-    directions = rim_directions()
-    rim = centres[:, None] + directions @ shapes
-    normals = directions @ np.linalg.inv(shapes)
-    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    reach = np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(shapes)[:, 0])
-    offsets = np.linspace(-1, 1, SAMPLES)
-    steps = reach[:, None] * offsets
-    profiles = sample(grey, rim[:, :, None] + normals[:, :, None] * steps[:, None, :, None])
-    if not bright:
+def _rims(shapes):
+    """Points of the rims of ellipses about their centres, and the normals there, both (N, PROFILES, 2)."""
+    normals = DIRECTIONS @ np.linalg.inv(shapes)
+    return DIRECTIONS @ shapes, normals / np.linalg.norm(normals, axis=2, keepdims=True)
+
+
+def _moved(grey, ellipses, longest, noise):
+    """Ellipses moved to the edges around them by least squares, and whether (N,) the edges are whole."""
+    rim, normals = _rims(ellipses.shapes)
+    reach = np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(ellipses.shapes)[:, 0])
+    steps = reach[:, None] * np.linspace(-1, 1, SAMPLES)
+    along = normals[:, :, None] * steps[:, None, :, None]
+    profiles = sample(grey, (ellipses.centres[:, None] + rim)[:, :, None] + along)
+    if not ellipses.bright:
         profiles = -profiles
     inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
-    harmonics = np.stack([np.ones(PROFILES), *directions.T], 1)
+    harmonics = np.stack([np.ones(PROFILES), *DIRECTIONS.T], 1)
     smoother = harmonics @ np.linalg.pinv(harmonics)
     inner_level, outer_level = inner @ smoother, outer @ smoother
     contrast = inner_level - outer_level
     departure = np.abs(inner - outer - contrast)
     share = np.where(reach < longest, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
     whole = (contrast > 0).all(1) & (departure <= np.maximum(share[:, None] * contrast, 6 * noise)).all(1)
-    distance, crossed = _crossing(profiles - (inner_level + outer_level)[:, :, None] / 2)
-    middle = SAMPLES // 2
+    crossing, crossed = _crossing(profiles - (inner_level + outer_level)[:, :, None] / 2)
+    distance, middle = crossing * reach[:, None], SAMPLES // 2
     slope = (profiles[:, :, middle - 2] - profiles[:, :, middle + 2]).mean(1) / (8 * reach / (SAMPLES - 1))
     mean_contrast = contrast.mean(1)
     sharpness = slope / np.where(whole, mean_contrast, 1.0)
-    return _Edges(directions, normals, distance * reach[:, None], mean_contrast, sharpness, whole & crossed)
+    # The distances along the normals are linear in small changes of the centre (2) and of the shape (3).
+    (n_u, n_v), (e_u, e_v) = np.moveaxis(normals, 2, 0), DIRECTIONS.T
+    design = np.stack([n_u, n_v, n_u * e_u, n_u * e_v + n_v * e_u, n_v * e_v], 2)
+    normal = design.swapaxes(1, 2) @ design
+    change = np.linalg.solve(normal, design.swapaxes(1, 2) @ distance[:, :, None])
+    residual = distance - (design @ change)[:, :, 0]
+    rms = np.sqrt((residual**2).sum(1) / (PROFILES - 5))
+    centres = ellipses.centres + change[:, :2, 0]
+    shapes = ellipses.shapes + change[:, [2, 3, 3, 4], 0].reshape(-1, 2, 2)
+    moved = Ellipses(centres, shapes, ellipses.bright, rms, mean_contrast, sharpness)
+    return moved, whole & crossed & (np.linalg.eigvalsh(shapes)[:, 0] > 1.0)
 
 
 def _crossing(excess):
@@ -312,27 +274,6 @@ def _crossing(excess):
     crossed = falls.any(2)
     share = np.where(crossed, before / np.where(crossed, before - after, 1.0), 0.5)
     return 2 * (first + share) / (SAMPLES - 1) - 1, crossed.all(1)
-
-
-def _moved(centres, shapes, edge):
-    """Least-squares change of centre and shape for the distances along the normals, and the rms residual."""
-    n, e = edge.normals, edge.directions
-    design = np.stack(
-        [n[..., 0], n[..., 1], n[..., 0] * e[:, 0], n[..., 0] * e[:, 1] + n[..., 1] * e[:, 0], n[..., 1] * e[:, 1]], 2
-    )
-    normal = design.swapaxes(1, 2) @ design
-    change = np.linalg.solve(normal, design.swapaxes(1, 2) @ edge.distance[:, :, None])
-    residual = edge.distance - (design @ change)[:, :, 0]
-    change = change[:, :, 0]
-    shapes = shapes + change[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    rms = np.sqrt((residual**2).sum(1) / (PROFILES - 5))
-    return centres + change[:, :2], shapes, rms, np.linalg.eigvalsh(shapes)[:, 0] > 1.0
-
-
-def rim_directions():
-    """Unit vectors (PROFILES, 2) that an ellipse's shape matrix maps to points of its rim."""
-    angle = np.arange(PROFILES) * (2 * np.pi / PROFILES)
-    return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 def sample(grey, points):
@@ -369,7 +310,7 @@ def mark_strength(image, circles, *, mark_over_circle):
     the dot over that of the circle.
     """
     grey = image.astype(np.float32)
-    rim = rim_directions() @ circles.shapes
+    rim = DIRECTIONS @ circles.shapes
     dot = np.mean(
         [sample(grey, circles.centres[:, None] + share * mark_over_circle * rim) for share in (0.0, 0.25, 0.5)], (0, 2)
     )

@@ -10,14 +10,9 @@ from uwlts.targets.detection.ellipses import Ellipses, find_circles
 
 # Half the side of the square of neighbours: 24 of them determine the six terms of a quadratic with room for gaps.
 NEIGHBOURHOOD = 2
-
-# Fewer neighbours than this neither support nor contradict a place.
-MIN_NEIGHBOURS = 3
-
+MIN_NEIGHBOURS = 3  # fewer neither support nor contradict a place
 MAX_OVER_SPREAD = 8.0
-
-# What a quadratic leaves of perspective and distortion over two steps, as a share of one step.
-MODEL_ERROR = 0.002
+MODEL_ERROR = 0.002  # what a quadratic leaves of perspective and distortion over two steps, as a share of one step
 
 
 def agreeing(points, indices):
@@ -84,41 +79,28 @@ def _excess(points, around, present, terms, valid):
 
 
 NEIGHBOURS = 16
-
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
 # A neighbour is taken where it lies within this share of a step of its predicted place. One step changes by up to a
 # tenth from one circle to the next in strong perspective; half a step would reach the neighbour's neighbour.
 TOLERANCE = 0.25
-
-# Largest ratio of the radii of neighbouring circles.
-MAX_SIZE_RATIO = 1.5
+MAX_SIZE_RATIO = 1.5  # of the radii of neighbouring circles
 
 # Smallest sine of the angle between the steps of a seed, where the ellipse of its circle is a circle. An ellipse 20 %
 # too round turns a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice of sides 1 : 3 has the sine 0.95.
 MIN_SINE = 0.95
 
-# Largest ratio of the area of a seed's cell to the median, half-way between one and two cells.
-MAX_CELL_RATIO = 1.4
-
+MAX_CELL_RATIO = 1.4  # of the area of a seed's cell to the median, half-way between one and two cells
 MIN_LABELLED = 4
-
 MAX_SEEDS = 20
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Circles with their places in a lattice.
+    """Circles with their places in a lattice, and the number ``found`` in the image, with or without a place.
 
-    Attributes
-    ----------
-    circles : Ellipses
-        Those with a place, N of them.
-    indices : (N, 2) int64
-        Steps (i, j) from an arbitrary circle; the turn from i to j is the turn from u to v, otherwise the choice of
-        the axes is arbitrary.
-    found : int
-        Number of circles found in the image, with or without a place.
+    ``indices`` (N, 2) int64 are steps (i, j) from an arbitrary circle; the turn from i to j is the turn from u to v,
+    otherwise the choice of the axes is arbitrary.
     """
 
     circles: Ellipses
@@ -158,24 +140,18 @@ def label_lattice(centres, shapes):
     tree = KDTree(centres)
     radii = np.sqrt(np.linalg.det(shapes))
     bases, sines = _bases(centres, shapes, tree)
-    tried = np.zeros(len(centres), bool)
+    tried, places = np.zeros(len(centres), bool), {}
     for seed in _seeds(centres, radii, bases, sines, tree):
         if tried[seed]:
             continue
-        places = _grown(seed, centres, radii, bases[seed], tree)
-        members = np.fromiter(places.values(), int)
-        tried[members] = True
-        if len(places) > labelled.sum():
-            labelled[:] = False
-            labelled[members] = True
-            indices[members] = np.array(list(places))
-        if labelled.sum() >= np.count_nonzero(~tried):
+        grown = _grown(seed, centres, radii, bases[seed], tree)
+        tried[list(grown.values())] = True
+        places = max(places, grown, key=len)
+        if len(places) >= np.count_nonzero(~tried):
             break
-    members = np.flatnonzero(labelled)
-    members = members[agreeing(centres[members], indices[members])]
-    labelled[:] = False
-    labelled[members] = True
-    indices[~labelled] = 0
+    members, steps = np.fromiter(places.values(), int), np.array(list(places), np.int64).reshape(-1, 2)
+    kept = agreeing(centres[members], steps)
+    indices[members[kept]], labelled[members[kept]] = steps[kept], True
     return indices, labelled
 
 
