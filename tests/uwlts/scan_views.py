@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.uwlts.calibration_views import WATER, built_sensor, inside
 from tests.uwlts.joint_views import Noise, seen
-from uwlts.calibration.joint.initial_scans import ScanStripes
+from uwlts.calibration.joint.gathering import ScanStripes
 from uwlts.calibration.joint.parameters import View
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor

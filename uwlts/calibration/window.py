@@ -64,7 +64,7 @@ def step_profile(
     """Points (N, 2) of a profile, Y and Z of the OCS in mm, seen through a window; NaN where a ray has no point."""
     seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
     object_from_camera = np.linalg.inv(calibration.object_transform())
-    return seen.points_camera_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
+    return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
 
 
 def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:

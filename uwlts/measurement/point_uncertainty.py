@@ -11,7 +11,7 @@ import numpy as np
 from uwlts.calibration.joint.derivatives import COLUMNS
 from uwlts.calibration.joint.evidence import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint, stored_estimate
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
@@ -89,11 +89,7 @@ def point_uncertainty(
     pose = capture.pose[:, :3, :3]
     posed = np.isfinite(capture.pose).all(axis=(1, 2))[:, None, None]
     into_scene = np.where(posed, pose, np.eye(3)) @ calibration.object_transform()[:3, :3].T
-    # Times its transpose this is the covariance.
-    scale = np.sqrt(np.diag(known.covariance))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(known.covariance / np.outer(scale, scale))
-    root = scale[:, None] * vectors[:, values > 0] * np.sqrt(values[values > 0])
+    root = covariance_root(known.covariance)
     stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
@@ -154,7 +150,7 @@ def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureH
     sign = 1.0 if found is None or found[1] else -1.0
     ways = dict(zip(SLOPES, sign * across_of(sign * described), strict=True)) | {StageParameter.SCALE: described}
     calibrated = [key for key in ways if key in keys and (key not in SLOPES or found is not None)]
-    lean = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
+    lean = uncertainty.stage_lean()
     std = dict.fromkeys(SLOPES, lean) | {StageParameter.SCALE: uncertainty.stage_scale}
     within = sum((np.outer(root[keys.index(key)], ways[key]) for key in calibrated), np.zeros((root.shape[1], 3)))
     besides = [std[key] * way for key, way in ways.items() if key not in calibrated]

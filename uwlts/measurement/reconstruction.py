@@ -12,7 +12,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightness
-from uwlts.optics.reconstruction import ObjectPoints, reconstruct_by_polynomials, reconstruct_profile
+from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, opened_capture
@@ -152,7 +152,7 @@ def reconstruct_stripes(
     )
 
 
-def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes, index: float) -> ObjectPoints:
+def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes, index: float) -> MeasuredPoints:
     """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
     stage, direction = capture.stage_mm[stripes.frame], np.array(capture.header.stage_direction)
     line, centre = stripes.line, stripes.centre_px

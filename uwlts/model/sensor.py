@@ -459,6 +459,10 @@ class Uncertainty(Description):
     target_bow_mm: NotNegative = 0.03
     step_height_mm: Positive = 0.01
 
+    def stage_lean(self) -> float:
+        """Standard uncertainty of the direction of the stage as a slope."""
+        return float(np.tan(np.radians(self.stage_alignment_deg)))
+
 
 class Sensor(Description):
     """A complete sensor with the media it is used in. ``more_lasers`` shine further sheets at the same time."""

@@ -66,22 +66,21 @@ def beside_sheet(
     sheet = calibration.sheet
     window = calibration.window if sensor.camera.window.mounted else None
 
-    def points(offset_mm: float, further_px: float = 0.0) -> np.ndarray:
-        moved = calibration.model_copy(
-            update={"sheet": sheet.model_copy(update={"offset_mm": offset_mm}), "window": window}
-        )
-        found = reconstruct_profile(
-            moved, line, centre_px + further_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
-        )
-        return found.points_mm
+    def points(further_mm: float = 0.0, further_px: float = 0.0) -> np.ndarray:
+        shifted = sheet.model_copy(update={"offset_mm": sheet.offset_mm + further_mm})
+        moved = calibration.model_copy(update={"sheet": shifted, "window": window})
+        at_px = centre_px + further_px
+        return reconstruct_profile(
+            moved, line, at_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
+        ).points_mm
 
-    on_sheet = points(sheet.offset_mm)
-    per_mm = (points(sheet.offset_mm + _MOVED_MM) - on_sheet) / _MOVED_MM
+    on_sheet = points()
+    per_mm = (points(_MOVED_MM) - on_sheet) / _MOVED_MM
     in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
     away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
     sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
     # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
-    per_px = (points(sheet.offset_mm, _MOVED_PX) - on_sheet) / _MOVED_PX
+    per_px = (points(further_px=_MOVED_PX) - on_sheet) / _MOVED_PX
     thickest = np.median(width_px) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
     return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
 
@@ -96,10 +95,7 @@ def slopes_of_brightness(
     an exposure is not known, all are taken as equal.
     """
     order = np.argsort(stage_mm, kind="stable")
-    rank = np.empty(len(order), np.intp)
-    rank[order] = np.arange(len(order))
-    used = np.unique(rank[frame])
-    row = np.searchsorted(used, rank[frame])
+    used, row = np.unique(np.argsort(order)[frame], return_inverse=True)
     position = stage_mm[order][used]
     within = np.searchsorted(position, position + _REACH_MM, side="right") - np.arange(len(position)) - 1
     whole = position <= position[-1] - _REACH_MM

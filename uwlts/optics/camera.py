@@ -11,7 +11,7 @@ import numpy as np
 from uwlts.model.calibration import CameraModel, WindowModel
 from uwlts.model.errors import RangeError
 from uwlts.model.sensor import Distortion
-from uwlts.optics.window import check_index, window_normal
+from uwlts.optics.window import check_index, tangent_ratio, window_normal
 
 # Newton's method doubles its digits with each step; only at the edge of the invertible domain, where the distortion's
 # derivative vanishes, it gains a mere bit a step, and the 53 bits of a float end it.
@@ -33,15 +33,10 @@ def directions(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
     A row is NaN where the distortion has no inverse: outside the image of the domain in which it is one-to-one and
     which holds the principal point. The inverse is exact to rounding (Newton's method in the plane).
 
-    Raises
-    ------
-    RangeError
-        A pixel is not finite.
+    Raises RangeError: a pixel is not finite.
     """
-    pixels = np.asarray(pixels, dtype=float)
-    _check_finite("pixels", pixels)
-    x = (pixels[:, 0] - camera.cx_px) / camera.fx_px
-    y = (pixels[:, 1] - camera.cy_px) / camera.fy_px
+    pixels = _finite("pixels", pixels)
+    x, y = (pixels[:, 0] - camera.cx_px) / camera.fx_px, (pixels[:, 1] - camera.cy_px) / camera.fy_px
     if camera.coefficients().any():
         x, y = _undistorted(camera.distortion, x, y)
     result = np.empty((3, len(pixels))).T  # coordinates contiguous: three times faster to refract
@@ -58,14 +53,9 @@ def project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     A row is NaN where the camera has no image of the point: at or behind the plane z = 0, and outside the domain in
     which the distortion is one-to-one, where the polynomial would fold the point back into the image.
 
-    Raises
-    ------
-    RangeError
-        A coordinate is not finite.
+    Raises RangeError: a coordinate is not finite.
     """
-    points = np.asarray(points, dtype=float)
-    _check_finite("points", points)
-    return _projected(camera, points)
+    return _projected(camera, _finite("points", points))
 
 
 def project_through_window(
@@ -81,13 +71,9 @@ def project_through_window(
     A row is NaN where the camera has no image of the point: as for `project`, and for points that do not lie beyond
     the window's outer face.
 
-    Raises
-    ------
-    RangeError
-        A coordinate is not finite, or as for `uwlts.optics.window.trace_window`.
+    Raises RangeError: a coordinate is not finite, or as for `uwlts.optics.window.trace_window`.
     """
-    points = np.asarray(points, dtype=float)
-    _check_finite("points", points)
+    points = _finite("points", points)
     check_index("medium_index", medium_index)
     if window is None:
         return _projected(camera, points)
@@ -106,11 +92,13 @@ def project_through_window(
     return _projected(camera, toward)
 
 
-def _check_finite(name: str, values: np.ndarray) -> None:
+def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    values = np.asarray(values, dtype=float)
     finite = np.isfinite(values)
     if not finite.all():
         example = values[~finite.all(axis=1)][0]
         raise RangeError(f"{name} must be finite, but there is {example}; pass only those that were found")
+    return values
 
 
 def _tangent_in_air(
@@ -118,8 +106,7 @@ def _tangent_in_air(
 ) -> np.ndarray:
     """Tangent (N,) of the angle in the first layer, of index 1, of rays that run ``distance`` sideways in all layers.
 
-    With t the tangent in the rarest layer and m the index of another over its own, the tangent in that other layer is
-    t / sqrt(m^2 + (m^2 - 1) t^2) by Snell's law.
+    The unknown is the tangent in the rarest layer, from which `tangent_ratio` gives those in the others.
     """
     layers = [(height, index) for height, index in zip(heights, indices, strict=True) if np.any(height != 0)]
     rarest = min(index for _, index in layers)
@@ -128,15 +115,14 @@ def _tangent_in_air(
     for _ in range(_MOST_STEPS):
         missing, rise = -distance, 0.0
         for height, square in layers:
-            root = np.sqrt(square + (square - 1.0) * tangent**2)
-            missing = missing + height * tangent / root
-            rise = rise + height * square / root**3
+            ratio = tangent_ratio(square, tangent**2)
+            missing = missing + height * tangent * ratio
+            rise = rise + height * square * ratio**3
         step = missing / rise
         tangent = tangent - step
         if not np.any(np.abs(step) > 1e-10 * (1.0 + tangent)):
             break  # the error left is the square of this step
-    square = rarest**-2
-    return tangent / np.sqrt(square + (square - 1.0) * tangent**2)
+    return tangent * tangent_ratio(rarest**-2, tangent**2)
 
 
 def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
@@ -144,19 +130,19 @@ def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
     if camera.coefficients().any():
-        outside = x * x + y * y >= _largest_square(*_all(camera.distortion))
+        outside = x * x + y * y >= _largest_square(camera.distortion)
         x, y = _distorted(camera.distortion, x, y)
         x[outside] = np.nan
         y[outside] = np.nan
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
 
 
-def _all(d: Distortion) -> tuple[float, float, float, float, float]:
-    return d.k1, d.k2, d.p1, d.p2, d.k3
+def _largest_square(d: Distortion) -> float:
+    return _edge_square(d.k1, d.k2, d.p1, d.p2, d.k3)
 
 
 @lru_cache(maxsize=16)
-def _largest_square(k1: float, k2: float, p1: float, p2: float, k3: float) -> float:
+def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float) -> float:
     """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it.
 
     The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
@@ -173,31 +159,57 @@ def _largest_square(k1: float, k2: float, p1: float, p2: float, k3: float) -> fl
     return float(ends.max() ** -2) if len(ends) else math.inf
 
 
+def _growth(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Square of the radius, and the factor of the coordinates in the Brown-Conrady distortion of `_distorted`."""
+    s = x * x + y * y
+    return s, 1.0 + s * (d.k1 + s * (d.k2 + s * d.k3)) + 2.0 * (d.p1 * y + d.p2 * x)
+
+
 def _distorted(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Brown-Conrady distortion of ideal image coordinates in units of the focal length (OpenCV, module calib3d)."""
-    s = x * x + y * y
-    radial = 1.0 + s * (d.k1 + s * (d.k2 + s * d.k3))
-    bend = 2.0 * (d.p1 * y + d.p2 * x)
-    return x * (radial + bend) + d.p2 * s, y * (radial + bend) + d.p1 * s
+    s, growth = _growth(d, x, y)
+    return x * growth + d.p2 * s, y * growth + d.p1 * s
+
+
+def _jacobian(
+    d: Distortion, x: np.ndarray, y: np.ndarray, s: np.ndarray, growth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Derivatives xx, xy = yx, yy of `_distorted`, with what `_growth` gives."""
+    slope = d.k1 + s * (2.0 * d.k2 + s * (3.0 * d.k3))
+    x_slope, y_slope = 2.0 * (slope * x + d.p2), 2.0 * (slope * y + d.p1)
+    return growth + x * (x_slope + 2.0 * d.p2), x * y_slope + (2.0 * d.p2) * y, growth + y * (y_slope + 2.0 * d.p1)
+
+
+def image_derivatives(camera: CameraModel, pixels: np.ndarray, ideal: np.ndarray) -> np.ndarray:
+    """Derivatives (11, 2, N) of the ideal image coordinates (2, N) of pixels (N, 2): by u, v, fx, fy, cx, cy, k1 to k3.
+
+    The order of the distortion is OpenCV's, k1 k2 p1 p2 k3. The distorted image D(x, y; k) stays at ((u - cx) / fx,
+    (v - cy) / fy), so that dD/d(x, y) d(x, y) is the change of the latter minus dD/dk dk.
+    """
+    (x, y), d = ideal, camera.distortion
+    focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
+    s, growth = _growth(d, x, y)
+    xx, xy, yy = _jacobian(d, x, y, s, growth)
+    change = np.zeros((11, 2, len(x)))
+    change[[0, 1], [0, 1]] = 1.0 / focal[:, None]
+    change[[2, 3], [0, 1]] = (centre - pixels).T / focal[:, None] ** 2
+    change[[4, 5], [0, 1]] = -1.0 / focal[:, None]
+    change[6], change[7], change[10] = -ideal * s, -ideal * s**2, -ideal * s**3
+    change[8] = -2.0 * x * y, -s - 2.0 * y * y
+    change[9] = -s - 2.0 * x * x, -2.0 * x * y
+    first, second = yy * change[:, 0] - xy * change[:, 1], xx * change[:, 1] - xy * change[:, 0]
+    return np.stack([first, second], axis=1) / (xx * yy - xy * xy)
 
 
 def _newton_step(
     d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Newton's step (x, y) towards the inverse of `_distorted`, and how far the present image is from the one seen."""
-    k1, k2, k3, p1, p2 = d.k1, d.k2, d.k3, d.p1, d.p2
-    s = x * x + y * y
-    radial_bend = 1.0 + s * (k1 + s * (k2 + s * k3)) + 2.0 * (p1 * y + p2 * x)
-    x_missing = x_seen - x * radial_bend - p2 * s
-    y_missing = y_seen - y * radial_bend - p1 * s
-    slope = k1 + s * (2.0 * k2 + s * (3.0 * k3))
-    x_slope, y_slope = 2.0 * (slope * x + p2), 2.0 * (slope * y + p1)
-    xx = radial_bend + x * (x_slope + 2.0 * p2)
-    xy = x * y_slope + (2.0 * p2) * y
-    yy = radial_bend + y * (y_slope + 2.0 * p1)
+    s, growth = _growth(d, x, y)
+    x_missing, y_missing = x_seen - x * growth - d.p2 * s, y_seen - y * growth - d.p1 * s
+    xx, xy, yy = _jacobian(d, x, y, s, growth)
     scale = 1.0 / (xx * yy - xy * xy)
-    x_step = (yy * x_missing - xy * y_missing) * scale
-    y_step = (xx * y_missing - xy * x_missing) * scale
+    x_step, y_step = (yy * x_missing - xy * y_missing) * scale, (xx * y_missing - xy * x_missing) * scale
     return x_step, y_step, np.abs(x_missing) + np.abs(y_missing)
 
 
@@ -215,7 +227,7 @@ def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple
             if found.all():
                 break
             x, y = x + x_step, y + y_step
-        found &= x * x + y * y < _largest_square(*_all(d))
+        found &= x * x + y * y < _largest_square(d)
     if not found.all():
         hard = np.flatnonzero(~found)
         x[hard], y[hard] = _undistorted_with_care(d, x_seen[hard], y_seen[hard])
@@ -227,7 +239,7 @@ def _undistorted_with_care(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray
 
     As the Jacobian is positive definite in the domain, Newton's direction always helps if the step is short enough.
     """
-    largest, allowed = _largest_square(*_all(d)), _allowed(x_seen, y_seen)
+    largest, allowed = _largest_square(d), _allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
     x_next, y_next, missing = x, y, np.full_like(x, np.inf)
     for _ in range(_MOST_STEPS):

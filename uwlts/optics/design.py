@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from uwlts.model.errors import DesignError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium, Sensor
+from uwlts.optics.window import tangent_ratio
 
 CLAMPED, UNCLAMPED = 0.75, 1.125
 """K_w of Eq. 3.2. Plate theory (Timoshenko) gives 3/4 for a clamped edge, but 3 (3 + nu) / 8 for a supported one:
@@ -53,7 +54,7 @@ class FlatWindow:
     def slope(self, index: float, slope_squared: np.ndarray | float) -> np.ndarray:
         """Slope in a layer over the slope in air, whose square is given."""
         squared = np.asarray(slope_squared, dtype=float)
-        return 1 / np.sqrt(index**2 + (0.0 if self.paraxial else index**2 - 1) * squared)
+        return tangent_ratio(index**2, 0.0 * squared if self.paraxial else squared)
 
     def layers(self, depth_mm: np.ndarray | float) -> tuple[tuple[np.ndarray, float], ...]:
         """Extent along the axis and index of air, glass, and medium up to a depth."""
@@ -102,11 +103,7 @@ def depth_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 0.0) -> np
     """Depth Z of the sheet at pixels, broadcast: thesis Eq. 2.8, in air Z = B f / (f tan theta_t - s u).
 
     Behind a window Z tan theta_t - B = p M(Z) with `FlatWindow.reach_mm` M, linear in Z.
-
-    Raises
-    ------
-    RangeError
-        A pixel does not see the sheet before the window, or is not finite.
+    RangeError where a pixel does not see the sheet before the window, or is not finite.
     """
     depth = _depth_or_inf(setup, *setup.slopes(u_px, v_px))
     if not ((depth >= setup.window.outer_mm) & (depth < math.inf)).all():
@@ -124,9 +121,8 @@ def depth_per_pixel_mm(setup: Triangulation, u_px: ArrayLike, v_px: ArrayLike = 
     1 / cos theta_t: the thesis's 0.22 mm per pixel is this, in water (0.221).
     """
     p, e = setup.slopes(u_px, v_px)
-    depth = depth_mm(setup, u_px, v_px)
     slope = setup.window.slope(setup.window.medium_index, p**2 + e**2)
-    shift = _growth_mm(setup.window, depth, p, e)
+    shift = _growth_mm(setup.window, depth_mm(setup, u_px, v_px), p, e)
     return shift * setup.pixel_size_mm / setup.focal_length_mm / (math.tan(setup.triangulation_angle_rad) - p * slope)
 
 
@@ -135,11 +131,7 @@ def pixel_of_depth(setup: Triangulation, z_mm: ArrayLike, v_px: ArrayLike = 0.0)
 
     In air u = f (tan theta_t - B / Z) / s. Behind a window by Newton's method: how far a ray goes across, p M, grows
     ever less with p, so that starting from too small a p no step goes too far.
-
-    Raises
-    ------
-    RangeError
-        A depth is not finite or not beyond the window's outer face, or appears too far beside the camera's axis.
+    RangeError where a depth is not finite or not beyond the window's outer face, or appears too far beside the axis.
     """
     depth = np.asarray(z_mm, dtype=np.float64)
     if not ((depth > setup.window.outer_mm) & (depth < math.inf)).all():
@@ -195,11 +187,7 @@ def measuring_volume(setup: Triangulation, *, side_px: float) -> MeasuringVolume
 
     The near limit is the window's outer face where the image reaches so far; the far limit is infinite where the
     image's edge looks along the sheet or past it.
-
-    Raises
-    ------
-    RangeError
-        The camera sees nothing of the sheet before the window.
+    RangeError where the camera sees nothing of the sheet before the window.
     """
     _require_positive(side_px=side_px)
     near, far = _depth_or_inf(setup, *setup.slopes(np.array([-0.5, 0.5]) * side_px, 0.0))
@@ -308,12 +296,8 @@ def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]
 
     A laser placed by its axis, or rolled, counts as the baseline and angle at which its sheet meets the plane of the
     image's middle line across the stripe and the pupil. Lens distortion and tilts are left out.
-
-    Raises
-    ------
-    DesignError
-        The sheet does not cross the camera's axis before the window, the stripe runs along the other side of the image,
-        or no window keeps the medium out.
+    DesignError where the sheet does not cross the camera's axis before the window, the stripe runs along the other side
+    of the image, or no window keeps the medium out.
     """
     camera, wavelength = sensor.camera, sensor.laser.wavelength_nm
     pose, index = laser_pose(sensor), medium.refractive_index(wavelength)

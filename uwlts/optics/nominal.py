@@ -50,20 +50,17 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
         wavelength_nm=sensor.laser.wavelength_nm,
         camera=CameraModel.described(camera),
         window=WindowModel.described(camera.window, sensor.laser.wavelength_nm) if camera.window.mounted else None,
-        sheet=_fan_plane(sensor) if medium is None else _sheet(sensor, medium),
+        sheet=_sheet(sensor, medium),
         camera_from_object=tuple(map(tuple, camera_from_object(sensor))),
         provenance={"source": f"description of the sensor '{sensor.name}'"},
     )
 
 
-def _fan_plane(sensor: Sensor) -> SheetModel:
-    pose = laser_pose(sensor)
-    return SheetModel(normal=tuple(pose.normal), offset_mm=float(pose.normal @ pose.origin_mm))
-
-
-def _sheet(sensor: Sensor, medium: Medium) -> SheetModel:
-    """Plane through the fan's rays in the medium, over the depths that the camera sees."""
+def _sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
+    """Plane of the fan, or through its rays in a medium, over the depths that the camera sees."""
     laser, pose = sensor.laser, laser_pose(sensor)
+    if medium is None:
+        return SheetModel(normal=tuple(pose.normal), offset_mm=float(pose.normal @ pose.origin_mm))
     half = math.radians(laser.fan_angle_deg / 2)
     angle = np.linspace(-half, half, _RAYS)
     fan = np.stack([np.zeros(_RAYS), np.sin(angle), np.cos(angle)], axis=1)

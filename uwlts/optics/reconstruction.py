@@ -25,22 +25,8 @@ _BLOCK = 4096
 
 
 @dataclass(frozen=True)
-class SheetPoints:
-    """Points where camera rays cross the laser sheet, in the camera frame.
-
-    Attributes
-    ----------
-    points_camera_mm : (N, 3) float64, NaN where the status is not OK
-    status : (N,) uint8, `uwlts.optics.window.RayStatus`
-    """
-
-    points_camera_mm: np.ndarray
-    status: np.ndarray
-
-
-@dataclass(frozen=True)
-class ObjectPoints:
-    """Measured points in the object coordinate system (OCS), at the stage position 0.
+class MeasuredPoints:
+    """Measured points: in the camera frame, or in the object coordinate system (OCS) at the stage position 0.
 
     Attributes
     ----------
@@ -60,7 +46,7 @@ def reconstruct_profile(
     medium_index: float,
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
-) -> ObjectPoints:
+) -> MeasuredPoints:
     """Measured points of the stripe centres of one profile, or of many joined together.
 
     ``lines`` (N,) are image columns if the stripe runs along the width, else image rows; ``centres_px`` (N,) is the
@@ -79,22 +65,18 @@ def reconstruct_pixels(
     medium_index: float,
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
-) -> ObjectPoints:
+) -> MeasuredPoints:
     """Measured points in the OCS of pixels (N, 2), given as (u, v) in px; see `points_on_sheet` and `to_object`."""
     found = points_on_sheet(calibration, pixels, medium_index=medium_index)
-    points = to_object(calibration, found.points_camera_mm, stage_mm=stage_mm, stage_direction=stage_direction)
-    return ObjectPoints(points, found.status)
+    points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
+    return MeasuredPoints(points, found.status)
 
 
-def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_index: float) -> SheetPoints:
-    """Crossings of the camera rays of pixels (N, 2), (u, v), with the sheet in the medium (thesis Eqs. 3.3 to 3.9).
+def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_index: float) -> MeasuredPoints:
+    """Crossings of the camera rays of pixels (N, 2), (u, v), with the sheet, camera frame (thesis Eqs. 3.3 to 3.9).
 
     The pixels may be those of many frames. The index of the medium, relative to air, matters only behind a window.
-
-    Raises
-    ------
-    RangeError
-        A pixel is not finite, or the index is not finite and positive.
+    RangeError where a pixel is not finite, or the index is not finite and positive.
     """
     pixels = np.asarray(pixels, dtype=float)
     sheet = sheet_surface(calibration.sheet, medium_index=medium_index)
@@ -102,8 +84,8 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
     for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK)):
         rays = trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index)
         found.append(_crossings(rays, sheet))
-    points, status = zip(*((each.points_camera_mm, each.status) for each in found), strict=True)
-    return SheetPoints(np.concatenate(points), np.concatenate(status))
+    points, status = zip(*found, strict=True)
+    return MeasuredPoints(np.concatenate(points), np.concatenate(status))
 
 
 def to_object(
@@ -134,8 +116,8 @@ def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> n
     return np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
 
 
-def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> SheetPoints:
-    """Crossings of rays in the medium with the sheet (thesis Eq. 3.9 for a plane).
+def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.ndarray]:
+    """Crossings (N, 3) and status (N,) of rays in the medium with the sheet (thesis Eq. 3.9 for a plane).
 
     A crossing that is not ahead of the ray is BEHIND if the light passed the sheet between the pupil and the medium,
     that is, if the two lie on different sides of it; otherwise the ray runs away from the sheet.
@@ -154,7 +136,7 @@ def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> SheetPoints:
         missed = (status == RayStatus.OK) & ~(length > 0)
         status = np.where(missed, np.where(passed, RayStatus.BEHIND, RayStatus.NO_CROSSING), status).astype(np.uint8)
         points[status != RayStatus.OK] = np.nan
-    return SheetPoints(points, status)
+    return points, status
 
 
 def reconstruct_by_polynomials(
@@ -164,7 +146,7 @@ def reconstruct_by_polynomials(
     *,
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
-) -> ObjectPoints:
+) -> MeasuredPoints:
     """Measured points in the OCS at stage position 0 of stripe centres; X is 0 but for the stage's travel.
 
     A centre outside the range that its line was calibrated for, or on a line that was not calibrated, has no point:
@@ -188,7 +170,7 @@ def reconstruct_by_polynomials(
     points[known] = np.column_stack([np.zeros(len(rows)), along, depth])
     points += stage_travel(stage_mm, stage_direction).T
     status = np.where(known, RayStatus.OK, RayStatus.OUTSIDE_CALIBRATION).astype(np.uint8)
-    return ObjectPoints(points, status)
+    return MeasuredPoints(points, status)
 
 
 def _polynomial_values(

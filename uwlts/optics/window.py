@@ -35,16 +35,28 @@ class RayStatus(IntEnum):
 class RaysInMedium:
     """Rays as they run in the medium, in the camera frame.
 
-    Attributes
-    ----------
-    origins : (N, 3) float64, mm, on the window's outer face (the entrance pupil where there is no window)
-    directions : (N, 3) float64, unit vectors away from the sensor
-    status : (N,) uint8, `RayStatus`; origins and directions are NaN where it is not OK
+    ``origins`` (N, 3), mm, lie on the window's outer face (in the entrance pupil where there is no window);
+    ``directions`` (N, 3) are unit vectors away from the sensor; both are NaN where ``status`` (N,), uint8 of
+    `RayStatus`, is not OK.
     """
 
     origins: np.ndarray
     directions: np.ndarray
     status: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RayDerivatives:
+    """Rays in the medium, camera frame, mm, and their derivatives.
+
+    ``origins`` (3, N), ``directions`` (3, N) of length one, and both by C quantities: ``origins_by`` and
+    ``directions_by`` (C, 3, N).
+    """
+
+    origins: np.ndarray
+    directions: np.ndarray
+    origins_by: np.ndarray
+    directions_by: np.ndarray
 
 
 def require_index(index: float) -> None:
@@ -93,6 +105,22 @@ def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tupl
     return refracted.T, total_reflection
 
 
+def tangent_ratio(index_squared: float, tangent_squared: np.ndarray) -> np.ndarray:
+    """Tangent of a ray's angle to the normal behind an interface over that before it, by Snell's law.
+
+    With m the index behind the interface over that before it and t the tangent before: 1 / sqrt(m^2 + (m^2 - 1) t^2).
+    """
+    return 1.0 / np.sqrt(index_squared + (index_squared - 1.0) * tangent_squared)
+
+
+def leaning(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vector (3,) that leans from a direction by slopes (k,) towards others (k, 3), and its derivatives (k, 3)."""
+    raw = direction + slopes @ across
+    length = np.linalg.norm(raw)
+    unit = raw / length
+    return unit, (across - np.outer(across @ unit, unit)) / length
+
+
 def window_normal(window: WindowModel) -> np.ndarray:
     """Unit normal (3,) of a window, along a camera ray; RangeError where the camera looks along the glass."""
     normal = np.array(window.normal)
@@ -135,3 +163,44 @@ def trace_window(directions: np.ndarray, window: WindowModel | None, *, medium_i
     if failed.any():
         origins, directions = (np.where(failed[:, None], np.nan, array) for array in (origins, directions))
     return RaysInMedium(origins, directions, status)
+
+
+def trace_derivatives(
+    rays: np.ndarray, rays_by: np.ndarray, window: WindowModel, *, medium_index: float
+) -> RayDerivatives | None:
+    """Rays (3, N) behind the window, as of `trace_window`, with derivatives; None where a ray does not get there.
+
+    The columns are those of ``rays_by`` (c, 3, N), then the window's distance, the two slopes of its normal, the
+    thickness and the index of the glass, and the medium's index. At a face index times direction changes along the
+    normal only (Snell's law): n' r' = n r + (root - n cosine) normal, with root^2 = n'^2 - n^2 + (n cosine)^2.
+    """
+    count = len(rays_by)
+    of_distance, _, _, of_thickness, of_glass, of_medium = np.eye(count + 6)[count:]
+    by = np.concatenate([rays_by, np.zeros((6, *rays.shape))])
+    normal_by = np.zeros((count + 6, 3))
+    slopes = np.array(window.normal[:2]) / window.normal[2]
+    normal, normal_by[count + 1 : count + 3] = leaning(np.eye(3)[2], np.eye(3)[:2], slopes)
+    distance_by = window.distance_mm * normal_by[:, 2] + normal[2] * of_distance
+    faces = [(window.distance_mm * normal[2], distance_by, medium_index, of_medium)]
+    if window.refractions == 2:
+        faces = [(*faces[0][:2], window.glass_index, of_glass), (window.thickness_mm, of_thickness, *faces[0][2:])]
+    origins, origins_by = np.zeros_like(rays), np.zeros_like(by)
+    index, index_by = 1.0, np.zeros(count + 6)
+    for extent, extent_by, behind, behind_by in faces:
+        cosine, cosine_by = normal @ rays, normal_by @ rays + np.einsum("i,cin->cn", normal, by)
+        if not (cosine > 0).all():
+            return None
+        reach = extent / cosine
+        reach_by = (extent_by[:, None] - reach * cosine_by) / cosine
+        origins, origins_by = origins + reach * rays, origins_by + reach_by[:, None] * rays + reach * by
+        refracted = refract(rays.T, normal, ratio=index / behind)[0].T
+        root = behind * (normal @ refracted)
+        if not (root > 0).all():
+            return None
+        cosine, cosine_by = index * cosine, index_by[:, None] * cosine + index * cosine_by
+        root_by = ((behind * behind_by - index * index_by)[:, None] + cosine * cosine_by) / root
+        by = index * by + index_by[:, None, None] * rays
+        by += (root_by - cosine_by)[:, None] * normal[:, None] + (root - cosine) * normal_by[:, :, None]
+        by = (by - behind_by[:, None, None] * refracted) / behind
+        rays, index, index_by = refracted, behind, behind_by
+    return RayDerivatives(origins, rays, origins_by, by)

@@ -297,7 +297,7 @@ def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
         none = "the calibration does not state which volume its evidence covers: calibrate again"
         return content.model_copy(update={"remark": no_area if found else none})
     use = in_use(calibration, found[0])
-    lengths, known = lengths_over(calibration, use.known, found[0]), use.known
+    lengths, known = lengths_over(use.known, found[0]), use.known
     weak = weaknesses(lengths, known.parameters.keys, known.covariance)
     return content.model_copy(
         update={

@@ -7,7 +7,7 @@ import numpy as np
 from uwlts.calibration.joint.evidence import STEP, STRIPE
 from uwlts.calibration.joint.observability import Lengths, Region, estimate_in, lengths_between, pixels_at, points_at
 from uwlts.calibration.joint.scanned_surfaces import SCANNED
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, require_joint
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import MediumIndex
@@ -88,7 +88,7 @@ def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
 
 def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
     """Lengths between Y and Z (M, 2, 2)."""
-    points = points_at(use.calibration, use.known, ends.reshape(-1, 2))
+    points = points_at(use.known, ends.reshape(-1, 2))
     first = 2 * np.arange(len(ends))
     return lengths_between(points, first, first + 1)
 
@@ -119,12 +119,8 @@ def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
-    points = points_at(use.calibration, use.known, at)
-    std = np.sqrt(np.diag(use.covariance))
-    scale = np.where(std > 0, std, 1.0)
-    values, vectors = np.linalg.eigh(use.covariance / np.outer(scale, scale))
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    moved = without_rigid_motion(at, (points.by_parameters @ root).transpose(2, 0, 1))
+    points = points_at(use.known, at)
+    moved = without_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
     calibration = np.sqrt(np.sum(moved**2, axis=0))
     shown = {"calibration": calibration, "single point": np.hypot(calibration, points.by_px * use.noise_px)}
     maps = {
@@ -197,11 +193,11 @@ def change_from(calibration: Calibration, other: Calibration, region: Region) ->
     """
     require_same_sensor(calibration, other)
     mesh = region.mesh(_ROWS, _COLUMNS)
-    pixels = pixels_at(calibration, estimate_in(calibration, region), mesh.reshape(-1, 2))
+    pixels = pixels_at(estimate_in(calibration, region), mesh.reshape(-1, 2))
     points = []
     for each in (calibration, other):
         through = each if region.view.window else each.model_copy(update={"window": None})
-        found = points_on_sheet(through, pixels, medium_index=each.index_of(region.medium)).points_camera_mm
+        found = points_on_sheet(through, pixels, medium_index=each.index_of(region.medium)).points_mm
         if not np.isfinite(found).all():
             raise CalibrationError("one of the calibrations sees no sheet somewhere in the volume: they do not compare")
         points.append(found)

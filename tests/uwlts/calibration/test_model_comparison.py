@@ -125,7 +125,7 @@ def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
     assert list(ways) == [INSIDE, OUTSIDE]
     inside, outside = ways.values()
     for number, positions in enumerate((AIR, IN_WATER)):
-        lit = np.unique(plain.evidence[number].stripe_image)
+        lit = np.unique(plain.evidence[number].image)
         assert len(lit) > 0.8 * len(positions)
         ends = {(number, int(lit[0])), (number, int(lit[-1]))}
         assert ends <= outside

@@ -230,7 +230,7 @@ def test_measured_points_lie_on_the_sheet_and_are_seen_at_their_pixels(stripe_al
     found = points_on_sheet(calibration, pixels, medium_index=medium_index)
     ok = found.status == RayStatus.OK
     assert ok.sum() > 300
-    points = found.points_camera_mm[ok]
+    points = found.points_mm[ok]
     # Most of the image sees the sheet within 10 m, where roundings are 1e-12 mm; rays nearly along the sheet beyond it.
     near = points[:, 2] < 1e4
     assert near.sum() > 300
@@ -269,9 +269,9 @@ def test_the_axial_ray_meets_the_sheet_or_says_why_not(offset_mm, normal, expect
     found = points_on_sheet(calibration, axis, medium_index=WATER)
     assert found.status.tolist() == [expected]
     assert found.status.dtype == np.uint8
-    assert np.isfinite(found.points_camera_mm).all() == (expected == RayStatus.OK)
+    assert np.isfinite(found.points_mm).all() == (expected == RayStatus.OK)
     if expected == RayStatus.OK:
-        np.testing.assert_allclose(found.points_camera_mm, [[0.0, 0.0, 300.0]], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.points_mm, [[0.0, 0.0, 300.0]], rtol=0, atol=1e-12)
 
 
 def test_failures_of_lens_and_window_keep_their_status_among_good_points():
@@ -280,7 +280,7 @@ def test_failures_of_lens_and_window_keep_their_status_among_good_points():
     # x (1 - 4 x^2) ends at 0.192, the corner lies at 0.347.
     found = points_on_sheet(calibration, np.array([centre, corner, centre]), medium_index=WATER)
     assert found.status.tolist() == [RayStatus.OK, RayStatus.NO_DIRECTION, RayStatus.OK]
-    assert np.isnan(found.points_camera_mm[1]).all() and np.isfinite(found.points_camera_mm[[0, 2]]).all()
+    assert np.isnan(found.points_mm[1]).all() and np.isfinite(found.points_mm[[0, 2]]).all()
 
     wide = camera(focal_px=300.0)
     steep = WindowModel(
@@ -301,7 +301,7 @@ def test_a_calibration_without_a_window_measures_along_straight_rays():
     found = points_on_sheet(bare, pixels, medium_index=WATER)
     ok = found.status == RayStatus.OK
     assert ok.sum() > 40
-    np.testing.assert_allclose(project(bare.camera, found.points_camera_mm[ok]), pixels[ok], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(project(bare.camera, found.points_mm[ok]), pixels[ok], rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("stripe_along", ["width", "height"])
@@ -318,7 +318,7 @@ def test_the_object_frame_holds_the_sheet_at_x_0_and_the_stage_moves_it(stripe_a
     np.testing.assert_allclose((moved.points_mm - still.points_mm)[near], np.outer(stage, direction)[near], atol=1e-12)
     np.testing.assert_array_equal(moved.status, still.status)
     assert moved.points_mm.flags.c_contiguous
-    camera_points = points_on_sheet(calibration, pixels, medium_index=WATER).points_camera_mm[near]
+    camera_points = points_on_sheet(calibration, pixels, medium_index=WATER).points_mm[near]
     homogeneous = np.c_[still.points_mm[near], np.ones(near.sum())]
     np.testing.assert_allclose((homogeneous @ calibration.object_transform().T)[:, :3], camera_points, atol=1e-11)
 
@@ -351,12 +351,12 @@ def test_the_pixels_of_many_frames_give_the_same_points_together_as_apart():
     status = np.concatenate([part.status for part in apart])
     np.testing.assert_array_equal(together.status, status)
     assert set(status) >= {RayStatus.OK, RayStatus.NO_DIRECTION}
-    points = np.concatenate([part.points_camera_mm for part in apart])
+    points = np.concatenate([part.points_mm for part in apart])
     near = points[:, 2] < 1e3
     assert near.sum() > 1000
     # The inverse of the distortion may take a step more or less in other company: 4e-15 over a slope of 1e-4 close to
     # the domain's edge, times 1e3 mm.
-    np.testing.assert_allclose(together.points_camera_mm[near], points[near], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(together.points_mm[near], points[near], rtol=0, atol=1e-7)
 
 
 def test_no_pixels_give_no_points():

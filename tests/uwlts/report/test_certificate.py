@@ -152,7 +152,7 @@ def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
     for stated in length_uncertainties(use):
         if stated.axis == "X" or stated.length_mm not in (20.0, 100.0):
             continue
-        pixels = pixels_at(calibration, known, ends_over(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
+        pixels = pixels_at(known, ends_over(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
         found = np.array([points(calibration, known, values, pixels) for values in drawn])
         lengths = np.linalg.norm(found[:, 1::2] - found[:, ::2], axis=2)
         assert stated.calibration_mm == pytest.approx(2 * np.std(lengths, axis=0).max(), rel=0.2)

@@ -90,7 +90,7 @@ def judge_step(
     except EvaluationError as error:
         reasons.append(f"no step: {error}")
     placed = calibration.model_copy(update={"window": window})
-    depths = points_on_sheet(placed, pixels, medium_index=medium_index).points_camera_mm[:, 2]
+    depths = points_on_sheet(placed, pixels, medium_index=medium_index).points_mm[:, 2]
     if not np.isfinite(depths).any():
         return StepQuality(pixels, None, (*reasons, "the laser line does not lie on the sheet"))
     depth = float(np.median(depths[np.isfinite(depths)])) - window.distance_mm - window.thickness_mm

@@ -1,6 +1,6 @@
 """Checks whether evidence, prior knowledge and noise of a joint estimate agree, and which images and values do not."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import assert_never
 
@@ -21,7 +21,7 @@ from uwlts.model.parameter_keys import (
     TargetParameter,
     WindowParameter,
 )
-from uwlts.model.sensor import Sensor, Uncertainty
+from uwlts.model.sensor import Sensor
 
 _ALIGNMENT = "stage_direction in the captures, or uncertainty.stage_alignment_deg"
 _CHECK: dict[SingleParameter, str] = {
@@ -92,6 +92,10 @@ class Findings:
         return f"the evidence contradicts itself: {said}" + (f"; and {more} more contradictions" if more > 0 else "")
 
 
+_Found = Iterator[tuple[bool, str]]
+"""What speaks against an estimate in words, each after whether it is a contradiction rather than a doubt."""
+
+
 @dataclass(frozen=True)
 class _Image:
     """Robust scatter of one kind of residual in one image, and that of its fine structure, which no parameter moves."""
@@ -102,66 +106,53 @@ class _Image:
     scatter_px: float
     noise_px: float
 
+    @classmethod
+    def of(cls, residuals: Residuals, evidence: Evidence) -> "_Image":
+        values = residuals.values
+        scatter = MAD_TO_STD * float(np.median(np.abs(values)))
+        # Residuals of neighbouring points or lines share what a wrong model does to them.
+        steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
+        noise = MAD_TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
+        source, kind = evidence.sources[residuals.image], residuals.kind
+        return cls(source, kind, (kind, evidence.view), scatter, noise)
+
     def largest_px(self) -> float:
         """Scatter that is too large for its kind, whatever the noise."""
         return _LARGEST_TARGET_PX if self.kind == TARGET else _LARGEST_STRIPE_PX
 
 
-def findings(
-    result: Estimate, evidence: Sequence[Evidence], sources: Sequence[Mapping[int, str]], *, sensor: Sensor
-) -> Findings:
-    """What speaks against an estimate.
-
-    Parameters
-    ----------
-    evidence : what it was made from
-    sources : for every piece of evidence the names of its images by their numbers: capture and frame
-    sensor : as described
-    """
+def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
+    """What speaks against an estimate, by the evidence that it was made from and the sensor as described."""
     images = [
-        _image(residuals, piece, names[residuals.image])
-        for piece, parts, names in zip(evidence, result.residuals, sources, strict=True)
+        _Image.of(residuals, piece)
+        for piece, parts in zip(evidence, result.residuals, strict=True)
         for residuals in parts
         if len(residuals.values) >= _FEWEST_VALUES
     ]
-    contradictions, doubts = _of_priors(result)
-    contradictions += _of_stage(result, evidence, sources, sensor.uncertainty)
-    unlike, unusual = _of_lens(result, sensor)
-    contradictions += unlike
-    if not contradictions:
-        contradictions, of_earlier = _of_earlier(result)
-        doubts += of_earlier
-    worse, doubtful = _of_images(images)
-    contradictions += worse
-    contradictions += _of_kinds(images)
-    waves, slight_waves = _of_shapes(result)
-    contradictions += waves
-    doubts += unusual + doubtful + slight_waves
-    doubts += [
-        f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
+    known = [*_of_priors(result), *_of_stage(result, evidence, sensor)]
+    lens = [*_of_lens(result, sensor)]
+    earlier = [] if any(wrong for wrong, _ in known + lens) else [*_of_earlier(result)]
+    found = [*known, *earlier, *lens, *_of_images(images), *_of_kinds(images), *_of_shapes(result)]
+    found += [
+        (False, f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images")
         for kind, share in much_left_out(result).items()
     ]
     if result.stopped == UNSETTLED:
-        doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
-    return Findings(contradictions, doubts)
+        found.append((False, f"{UNSETTLED}: some of the evidence contradicts the rest"))
+    return Findings([words for wrong, words in found if wrong], [words for wrong, words in found if not wrong])
 
 
-def _image(residuals: Residuals, evidence: Evidence, source: str) -> _Image:
-    values = residuals.values
-    scatter = MAD_TO_STD * float(np.median(np.abs(values)))
-    # Residuals of neighbouring points or lines share what a wrong model does to them.
-    steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
-    noise = MAD_TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
-    return _Image(source, residuals.kind, (residuals.kind, evidence.view), scatter, noise)
-
-
-def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
-    """Parameters far from what was known before."""
+def _of_priors(result: Estimate) -> _Found:
+    """Parameters far from what was known before, the farthest first."""
     parameters = result.parameters
-    mean, before = parameters.prior_mean(), parameters.prior_std()
-    wrong, doubtful = [], []
+    found = []
     for key, value, known, std, after in zip(
-        parameters.keys, result.values, mean, before, np.sqrt(np.diag(result.covariance)), strict=True
+        parameters.keys,
+        result.values,
+        parameters.prior_mean(),
+        parameters.prior_std(),
+        result.std().values(),
+        strict=True,
     ):
         if not np.isfinite(std):
             continue
@@ -170,125 +161,118 @@ def _of_priors(result: Estimate) -> tuple[list[str], list[str]]:
         sigmas = abs(value - known) / share
         if sigmas > _DOUBTFUL:
             alone = known + (value - known) * (std / share) ** 2
-            words = format_deviation(key, alone, known, std, sigmas=sigmas)
-            (wrong if sigmas > _WRONG else doubtful).append((sigmas, words))
-    return [words for _, words in sorted(wrong, reverse=True)], [words for _, words in sorted(doubtful, reverse=True)]
+            found.append((sigmas, format_deviation(key, alone, known, std, sigmas=sigmas)))
+    for sigmas, words in sorted(found, reverse=True):
+        yield sigmas > _WRONG, words
 
 
-def _of_earlier(result: Estimate) -> tuple[list[str], list[str]]:
+def _of_earlier(result: Estimate) -> _Found:
     """The parameter that new evidence moves farthest from an earlier calibration; one is named, as many go with it."""
     earlier = result.parameters.earlier
     if earlier is None:
-        return [], []
+        return
     before, count = earlier.std(), len(earlier.values)
     gained = before**2 - np.diag(result.covariance)[:count]
     sigmas = np.abs(result.values[:count] - earlier.values) / np.sqrt(np.maximum(gained, (0.1 * before) ** 2))
     worst = int(np.argmax(sigmas))
-    if sigmas[worst] <= _DOUBTFUL:
-        return [], []
-    quantity = result.parameters.keys[worst].quantity
-    value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
-    words = (
-        f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in the "
-        f"{quantity.words}: {quantity.format_value(value, std)} against {quantity.format_with_std(known, std)}: check "
-        "heights and media in the captures; if they are right, the sensor has changed, calibrate again"
-    )
-    return ([words], []) if sigmas[worst] > _WRONG else ([], [words])
+    if sigmas[worst] > _DOUBTFUL:
+        quantity = result.parameters.keys[worst].quantity
+        value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
+        yield (
+            bool(sigmas[worst] > _WRONG),
+            f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in "
+            f"the {quantity.words}: {quantity.format_value(value, std)} against "
+            f"{quantity.format_with_std(known, std)}: check heights and media in the captures; if they are right, the "
+            "sensor has changed, calibrate again",
+        )
 
 
-def _of_lens(result: Estimate, sensor: Sensor) -> tuple[list[str], list[str]]:
+def _of_lens(result: Estimate, sensor: Sensor) -> _Found:
     """A focal length far from the lens's: spacing, medium and stage can be wrong together and fit nevertheless."""
     camera, described = result.parameters.camera(result.values), sensor.camera.focal_length_px()
     off = abs(camera.fx_px / described - 1)
-    if off <= _FOCAL_DOUBTFUL:
-        return [], []
-    words = (
-        f"the focal length is {camera.fx_px:.1f} px, by the description {described:.1f} px: check the target's "
-        "spacing, the medium in the captures, and the lens"
-    )
-    return ([words], []) if off > _FOCAL_WRONG else ([], [words])
+    if off > _FOCAL_DOUBTFUL:
+        yield (
+            off > _FOCAL_WRONG,
+            f"the focal length is {camera.fx_px:.1f} px, by the description {described:.1f} px: check the target's "
+            "spacing, the medium in the captures, and the lens",
+        )
 
 
-def _of_stage(
-    result: Estimate, evidence: Sequence[Evidence], sources: Sequence[Mapping[int, str]], uncertainty: Uncertainty
-) -> list[str]:
+def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) -> _Found:
     """Directions and positions of the stage far from what its description says."""
-    found = []
-    std = uncertainty.stage_position_mm
-    for piece, local, names in zip(evidence, result.local, sources, strict=True):
+    alignment, std = sensor.uncertainty.stage_alignment_deg, sensor.uncertainty.stage_position_mm
+    for piece, local in zip(evidence, result.local, strict=True):
         if not (isinstance(piece, TargetEvidence) and piece.staged):
             continue
+        capture = next(iter(piece.sources.values())).split(", frame ")[0]
         tilt = float(np.degrees(np.arctan(np.hypot(*local[6:8]))))
-        if tilt > _WRONG * uncertainty.stage_alignment_deg:
-            found.append(
-                f"{_capture(names)}: the stage moves {tilt:.2g} deg off the target's normal, described as within "
-                f"{uncertainty.stage_alignment_deg:g} deg (uncertainty.stage_alignment_deg)"
+        if tilt > _WRONG * alignment:
+            yield (
+                True,
+                f"{capture}: the stage moves {tilt:.2g} deg off the target's normal, described as within "
+                f"{alignment:g} deg (uncertainty.stage_alignment_deg)",
             )
         errors, images = local[8:], piece.images()
+        if not len(errors):
+            continue
         # The first position has no error of its own, so all others share its.
         errors = errors - np.median(np.append(errors, 0.0))
         # One that is far off bends the camera and so moves the others too.
-        usual = max(std, MAD_TO_STD * float(np.median(np.abs(errors)))) if len(errors) else std
-        wrong = np.abs(errors) > _WRONG * usual
-        rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+        wrong = np.abs(errors) > _WRONG * max(std, MAD_TO_STD * float(np.median(np.abs(errors))))
+        rms = float(np.sqrt(np.mean(errors**2)))
         if 0 < wrong.sum() <= max(1, len(errors) // 4):
-            found += _some(
-                [
-                    f"{names[image]}: the stage stood {error:+.3f} mm from where it said, stated uncertainty {std:g} mm"
-                    for image, error in zip(images[wrong], errors[wrong], strict=True)
-                ]
-            )
+            stood = zip((piece.sources[image] for image in images[wrong]), errors[wrong], strict=True)
+            said = f"mm from where it said, stated uncertainty {std:g} mm"
+            yield from _some((True, f"{source}: the stage stood {error:+.3f} {said}") for source, error in stood)
         elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
-            found.append(
-                f"{_capture(names)}: the stage's positions scatter by {rms:.3f} mm, stated uncertainty {std:g} mm "
-                "(uncertainty.stage_position_mm)"
+            yield (
+                True,
+                f"{capture}: the stage's positions scatter by {rms:.3f} mm, stated uncertainty {std:g} mm "
+                "(uncertainty.stage_position_mm)",
             )
-    return found
 
 
-def _of_images(images: Sequence[_Image]) -> tuple[list[str], list[str]]:
+def _of_images(images: Sequence[_Image]) -> _Found:
     """Images that fit far worse than their like: contradictions where not by their own noise, else doubts."""
-    wrong, doubtful = [], []
+    found = []
     for image in images:
         others = [other.scatter_px for other in images if other.peers == image.peers and other is not image]
         usual = float(np.median(others)) if others else image.noise_px
         if image.scatter_px <= max(_OVER_OTHERS * usual, usual + _OVER_OTHERS_PX):
             continue
         shaped = image.scatter_px > _OVER_NOISE * image.noise_px
-        (wrong if shaped or image.scatter_px > image.largest_px() else doubtful).append(
-            f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), "
-            + (f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px")
-        )
-    return _some(wrong), _some(doubtful)
+        than = f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px"
+        words = f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), {than}"
+        found.append((shaped or image.scatter_px > image.largest_px(), words))
+    for gravity in (True, False):
+        yield from _some((wrong, words) for wrong, words in found if wrong == gravity)
 
 
-def _of_kinds(images: Sequence[_Image]) -> list[str]:
+def _of_kinds(images: Sequence[_Image]) -> _Found:
     """Kinds of residuals that scatter more than images are noisy."""
-    found = []
     for kind in dict.fromkeys(image.kind for image in images):
         of_kind = [image for image in images if image.kind == kind]
-        scatter = float(np.median([image.scatter_px for image in of_kind]))
-        noise = float(np.median([image.noise_px for image in of_kind]))
+        scatter, noise = np.median([(image.scatter_px, image.noise_px) for image in of_kind], axis=0)
         if scatter > of_kind[0].largest_px() or scatter > max(_OVER_NOISE * noise, noise + _OVER_OTHERS_PX):
             worst = max(of_kind, key=lambda image: image.scatter_px)
-            found.append(
+            yield (
+                True,
                 f"the {kind} is {scatter:.2f} px off (rms) in most images, noise accounts for {noise:.2f} px; worst is "
-                f"{worst.source} with {worst.scatter_px:.2f} px"
+                f"{worst.source} with {worst.scatter_px:.2f} px",
             )
-    return found
 
 
-def _of_shapes(result: Estimate) -> tuple[list[str], list[str]]:
+def _of_shapes(result: Estimate) -> _Found:
     """Stripes whose residuals run together over many lines, as those of a wrong height or window do."""
-    wrong, doubtful = [], []
     for kind, noise in result.noise.items():
-        if kind == TARGET or noise.together <= _WAVES_DOUBTFUL:
-            continue
-        (wrong if noise.together > _WAVES_WRONG else doubtful).append(
-            f"the {kind} is off in waves along itself rather than by noise ({noise.sigma_px:.2f} px rms, as good as "
-            f"one independent value in {noise.together:.0f} lines): check heights, media and what else was described"
-        )
-    return wrong, doubtful
+        if kind != TARGET and noise.together > _WAVES_DOUBTFUL:
+            yield (
+                noise.together > _WAVES_WRONG,
+                f"the {kind} is off in waves along itself rather than by noise ({noise.sigma_px:.2f} px rms, as good "
+                f"as one independent value in {noise.together:.0f} lines): check heights, media and what else was "
+                "described",
+            )
 
 
 def much_left_out(result: Estimate) -> dict[str, float]:
@@ -302,11 +286,9 @@ def much_left_out(result: Estimate) -> dict[str, float]:
     return found
 
 
-def _capture(names: Mapping[int, str]) -> str:
-    return next(iter(names.values())).split(", frame ")[0]
-
-
-def _some(lines: list[str]) -> list[str]:
-    if len(lines) <= _MOST_NAMED:
-        return lines
-    return [*lines[:_MOST_NAMED], f"and {len(lines) - _MOST_NAMED} more images"]
+def _some(found: Iterable[tuple[bool, str]]) -> _Found:
+    """The first of findings that are alike, and the number of the others."""
+    every = list(found)
+    yield from every[:_MOST_NAMED]
+    if len(every) > _MOST_NAMED:
+        yield every[0][0], f"and {len(every) - _MOST_NAMED} more images"

@@ -1,6 +1,6 @@
 """The joint least squares: all evidence and all prior knowledge, weighted by the scatter that the evidence shows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,6 @@ from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
 
 Evidence = TargetEvidence | StepProfileEvidence | SurfaceScanEvidence
-Correct = Callable[[Sequence[Evidence], np.ndarray, Sequence[np.ndarray]], list[Evidence]]
 
 _FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3), **dict.fromkeys(SCANNED, Noise(0.3))}
 _SOFT_LIMIT = 3.0  # standard deviations; outliers of the first round, not known yet, count linearly
@@ -33,17 +32,10 @@ _FIRST_ROUNDS = 30  # then outliers are left out and the rest is solved to its e
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The global parameters and what the evidence says of them.
+    """The global parameters, ``values`` (P,) with their ``covariance`` (P, P), and what the evidence says of them.
 
-    Attributes
-    ----------
-    values : (P,)
-    covariance : (P, P)
-    local : list of (b,); of every piece of evidence
-    noise : of every kind of residual
-    residuals : of every piece of evidence, outliers included
-    outliers : residuals left out
-    rounds : of the least squares, summed over all weightings
+    ``local``, (b,) each, and ``residuals``, outliers included, are those of every piece of evidence, ``noise`` that of
+    every kind of residual; ``outliers`` is the number left out, ``rounds`` that of all least squares together.
     """
 
     parameters: Parameters
@@ -68,48 +60,43 @@ def estimate(
     local: Sequence[np.ndarray],
     *,
     uncertainty: Uncertainty,
-    correct: Correct | None = None,
+    diameter_mm: float | None = None,
 ) -> Estimate:
     """Least squares over all evidence, repeated until weights and corrections agree with the solution.
 
-    At first large residuals count linearly; then outliers, beyond five standard deviations, are left out.
-
-    Parameters
-    ----------
-    global_values : (P,); start
-    local : sequence of (b,); starts of the evidence's local parameters
-    correct : callable, optional; evidence as found, global and local parameters to the evidence without what is known
-        to bias it there
+    At first large residuals count linearly; then outliers, beyond five standard deviations, are left out. The start is
+    ``global_values`` (P,) and ``local``, (b,) of every piece of evidence. With ``diameter_mm`` of the target's circles
+    the offsets of their images' centres are taken out.
 
     Raises CalibrationError: the start has no meaning, the evidence does not determine the parameters, or corrections do
     not settle.
     """
-    problem = _Problem(parameters, uncertainty)
-    found, local, rounds = list(evidence), list(local), 0
-    known = dict(_FIRST)
+    found, local, rounds, known = list(evidence), list(local), 0, dict(_FIRST)
     left_out: list[list[np.ndarray]] | None = None
     moved = np.inf
     for number in range(_ROUNDS):
         first, last = number == 0, number == _ROUNDS - 1
         thinned = [e.with_stripes(_FIRST_LINES) if isinstance(e, TargetEvidence) else e for e in evidence]
-        fit = problem.fit(thinned if first else evidence, global_values, local, known, left_out)
+        fit = _fit(parameters, thinned if first else evidence, global_values, local, uncertainty, known, left_out)
         global_values, local, rounds = fit.global_values, fit.local[:-1], rounds + fit.rounds
-        residuals = problem.residuals(evidence, global_values, local)
-        before, known = known, problem.noise(evidence, residuals)
+        residuals = []
+        for piece, values in zip(evidence, local, strict=True):
+            if (parts := piece.residuals(parameters, global_values, values)) is None:
+                raise CalibrationError("the joint calibration diverged: a ray that was seen meets no sheet or target")
+            residuals.append(parts)
+        before, known = known, _noise(evidence, residuals)
         left_out = [[outliers(r, known[r.kind]) for r in parts] for parts in residuals]
-        used, corrected = evidence, found if correct is None else correct(found, global_values, local)
-        evidence = [
-            e.linearised(parts, [~mask for mask in masks])
-            for e, parts, masks in zip(corrected, residuals, left_out, strict=True)
+        used, evidence = evidence, []
+        for piece, values, parts, masks in zip(found, local, residuals, left_out, strict=True):
+            if diameter_mm is not None and isinstance(piece, TargetEvidence):
+                piece = piece.with_centres(parameters, global_values, values, diameter_mm)
+            evidence.append(piece.linearised(parts, [~mask for mask in masks]))
+        changes = [
+            float(np.abs(a.placement.pixels - b.placement.pixels).max())
+            for a, b in zip(used, evidence, strict=True)
+            if isinstance(a, TargetEvidence) and isinstance(b, TargetEvidence)
         ]
-        moved = max(
-            (
-                float(np.abs(a.placement.pixels - b.placement.pixels).max())
-                for a, b in zip(used, evidence, strict=True)
-                if isinstance(a, TargetEvidence)
-            ),
-            default=0.0,
-        )
+        moved = max(changes, default=0.0)
         steady = all(abs(known[k].effective_px() / before[k].effective_px() - 1) < _SETTLED for k in known)
         if moved <= _SETTLED_PX and not first and (steady or last):
             return Estimate(
@@ -129,96 +116,59 @@ def estimate(
     )
 
 
-class _Problem:
-    """The evidence as groups of a least squares with local parameters; the last group is what is known before."""
+def _fit(
+    parameters: Parameters,
+    evidence: Sequence[Evidence],
+    global_values: np.ndarray,
+    local: Sequence[np.ndarray],
+    uncertainty: Uncertainty,
+    noise: dict[str, Noise],
+    left_out: list[list[np.ndarray]] | None,
+) -> SchurFit:
+    """Every piece of evidence as a group with local parameters; the last group is what is known before."""
 
-    def __init__(self, parameters: Parameters, uncertainty: Uncertainty):
-        self._parameters = parameters
-        self._alignment = float(np.tan(np.radians(uncertainty.stage_alignment_deg)))
-        self._position_mm = uncertainty.stage_position_mm
+    def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
+        if group == len(evidence):
+            return _known_before(parameters, global_values)
+        piece = evidence[group]
+        parts = piece.residuals(parameters, global_values, local)
+        if parts is None:
+            return None
+        rows = []
+        for number, part in enumerate(parts):
+            used = slice(None) if left_out is None else ~left_out[group][number]
+            columns, scale = (part.values[:, None], part.by_global, part.by_local), noise[part.kind].effective_px()
+            values, by_global, by_local = (column[used] / scale for column in columns)
+            rows.append(Observation(values, by_global, by_local, part.local_columns))
+        off, by_local = piece.known_before(local, uncertainty)
+        return [*rows, Observation(off[:, None], np.zeros((len(off), len(global_values))), by_local)]
 
-    def fit(
-        self,
-        evidence: Sequence[Evidence],
-        global_values: np.ndarray,
-        local: Sequence[np.ndarray],
-        noise: dict[str, Noise],
-        left_out: list[list[np.ndarray]] | None,
-    ) -> SchurFit:
-        def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
-            if group == len(evidence):
-                return self._before(global_values)
-            piece = evidence[group]
-            parts = piece.residuals(self._parameters, global_values, local)
-            if parts is None:
-                return None
-            masks = [np.zeros(len(r.values), dtype=bool) for r in parts] if left_out is None else left_out[group]
-            rows = [_weighted(r, ~mask, noise[r.kind]) for r, mask in zip(parts, masks, strict=True)]
-            std = piece.local_std(alignment=self._alignment, position_mm=self._position_mm)
-            known = np.flatnonzero(np.isfinite(std))
-            rows.append(_of_local(local[known] / std[known], np.diag(1.0 / std[known]), known, len(global_values)))
-            if isinstance(piece, SurfaceScanEvidence):
-                off, by_local = piece.known_lengths(local)
-                rows.append(_of_local(off, by_local, np.arange(by_local.shape[1]), len(global_values)))
-            return rows
-
-        starts = [*local, np.empty(0)]
-        if left_out is not None:
-            return schur_least_squares(model, global_values, starts, smallest_gain=_SMALLEST_GAIN, damping=_DAMPING)
-        return schur_least_squares(
-            model,
-            global_values,
-            starts,
-            smallest_gain=_FIRST_GAIN,
-            damping=_FIRST_DAMPING,
-            soft_limit=_SOFT_LIMIT,
-            enough_rounds=_FIRST_ROUNDS,
-        )
-
-    def _before(self, global_values: np.ndarray) -> list[Observation]:
-        """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
-        std = self._parameters.prior_std()
-        known = np.isfinite(std)
-        off = (global_values - self._parameters.prior_mean())[known] / std[known]
-        found = [Observation(off[:, None], np.diag(1.0 / std)[known], np.empty((len(off), 0)))]
-        if self._parameters.earlier is not None:
-            off, by_global = self._parameters.earlier.residuals(global_values)
-            found.append(Observation(off[:, None], by_global, np.empty((len(off), 0))))
-        return found
-
-    def residuals(
-        self, evidence: Sequence[Evidence], global_values: np.ndarray, local: Sequence[np.ndarray]
-    ) -> list[list[Residuals]]:
-        found = []
-        for piece, values in zip(evidence, local, strict=True):
-            parts = piece.residuals(self._parameters, global_values, values)
-            if parts is None:
-                raise CalibrationError("the joint calibration diverged: a ray that was seen meets no sheet or target")
-            found.append(parts)
-        return found
-
-    def noise(self, evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> dict[str, Noise]:
-        result = {}
-        for kind in {r.kind: None for parts in residuals for r in parts}:
-            points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
-            of_kind = [r for parts in residuals for r in parts if r.kind == kind]
-            result[kind] = judged(kind, of_kind, points)
-            if kind in SCANNED:
-                scanned = [e.surface for e in evidence if isinstance(e, SurfaceScanEvidence)]
-                bodies = sum(surface.count for surface in scanned if surface.kind == kind)
-                each = sum(len(r.values) for r in of_kind) / bodies
-                result[kind] = with_slope_bias(result[kind], points_per_body=each)
-        return result
+    starts = [*local, np.empty(0)]
+    if left_out is not None:
+        return schur_least_squares(model, global_values, starts, smallest_gain=_SMALLEST_GAIN, damping=_DAMPING)
+    first = {"smallest_gain": _FIRST_GAIN, "damping": _FIRST_DAMPING, "soft_limit": _SOFT_LIMIT}
+    return schur_least_squares(model, global_values, starts, **first, enough_rounds=_FIRST_ROUNDS)
 
 
-def _of_local(off: np.ndarray, by_local: np.ndarray, local: np.ndarray, global_values: int) -> Observation:
-    """What is known of local parameters, in standard uncertainties."""
-    return Observation(off[:, None], np.zeros((len(off), global_values)), by_local, local)
+def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
+    """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
+    std = parameters.prior_std()
+    known = np.isfinite(std)
+    found = [((global_values - parameters.prior_mean())[known] / std[known], np.diag(1.0 / std)[known])]
+    if parameters.earlier is not None:
+        found.append(parameters.earlier.residuals(global_values))
+    return [Observation(off[:, None], by_global, np.empty((len(off), 0))) for off, by_global in found]
 
 
-def _weighted(residuals: Residuals, used: np.ndarray, noise: Noise) -> Observation:
-    scale = noise.effective_px()
-    values = residuals.values[used, None] / scale
-    return Observation(
-        values, residuals.by_global[used] / scale, residuals.by_local[used] / scale, residuals.local_columns
-    )
+def _noise(evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> dict[str, Noise]:
+    result = {}
+    for kind in dict.fromkeys(r.kind for parts in residuals for r in parts):
+        points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
+        of_kind = [r for parts in residuals for r in parts if r.kind == kind]
+        result[kind] = judged(kind, of_kind, points)
+        if kind in SCANNED:
+            scanned = [e.surface for e in evidence if isinstance(e, SurfaceScanEvidence)]
+            bodies = sum(surface.count for surface in scanned if surface.kind == kind)
+            each = sum(len(r.values) for r in of_kind) / bodies
+            result[kind] = with_slope_bias(result[kind], points_per_body=each)
+    return result

@@ -1,30 +1,31 @@
 """Residuals in pixels of target points, stripes on the target and stripes on steps, with their derivatives."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Self
 
 import cv2
 import numpy as np
 
-from uwlts.calibration.joint.derivatives import COLUMNS
+from uwlts.calibration.camera import centre_offsets
+from uwlts.calibration.joint.derivatives import COLUMNS, PointDerivatives
 from uwlts.calibration.joint.parameters import Parameters, View
 from uwlts.calibration.target_images import Placement
-from uwlts.model.parameter_keys import StageParameter, StepHeight, TargetParameter
+from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
+from uwlts.model.sensor import Uncertainty
+from uwlts.optics.window import leaning
 
 TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals (n,) in px of one kind from one image, with their derivatives by global and local parameters.
+    """Residuals ``values`` (n,) in px of one kind from one image; of the target's points both coordinates in turn.
 
-    Attributes
-    ----------
-    values : (n,); of the target's points both coordinates in turn
-    by_global : (n, P)
-    by_local : (n, c); by those of the evidence's local parameters that matter in this image
-    local_columns : (c,); which of them these are
-    image : number of the image
+    ``by_global`` (n, P) are the derivatives by the global parameters, ``by_local`` (n, c) those by the evidence's local
+    parameters that matter in this image, of the numbers ``local_columns`` (c,).
     """
 
     kind: str
@@ -36,7 +37,104 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False)
-class TargetEvidence:
+class Distances:
+    """Signed distances ``values_mm`` (N,) of points from a surface, positive on the side of its normals.
+
+    ``outward`` (3, N) are the derivatives by the points, the unit normals; ``by_local`` (N, k) those by local
+    parameters, ``by_global`` (N,) each those by global parameters other than of the camera's rays and the sheet.
+    """
+
+    values_mm: np.ndarray
+    outward: np.ndarray
+    by_local: np.ndarray
+    by_global: Mapping[ParameterKey, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StripeEvidence(ABC):
+    """Stripe ``pixels`` (N, 2) on something, with local parameters of its own.
+
+    ``across``, 0 or 1, is the coordinate of the pixel that runs across the stripe; ``sources`` names capture and frame
+    of the images by their numbers. Rays are taken at the pixels, or at ``predicted`` ones (N, 2) near them.
+    """
+
+    view: View
+    pixels: np.ndarray
+    across: int
+    sources: Mapping[int, str] = field(default_factory=dict)
+    predicted: np.ndarray | None = None
+
+    @abstractmethod
+    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
+        """Those of each image; None where a ray meets nothing."""
+
+    @abstractmethod
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
+        """Standard uncertainty (b,) of the local parameters before; infinite where nothing is known."""
+
+    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
+        """What local parameters are off (c,) what is known before, in standard uncertainties; derivatives (c, b)."""
+        std = self.local_std(uncertainty)
+        known = np.isfinite(std)
+        return local[known] / std[known], np.diag(1.0 / std)[known]
+
+    def lit(self, image: int) -> np.ndarray:
+        """The stripe pixels (N,) of an image."""
+        return np.ones(len(self.pixels), dtype=bool)
+
+    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
+        predicted = self.pixels.copy()
+        for part, kept in zip(residuals, used, strict=True):
+            if part.kind != TARGET:
+                predicted[self.lit(part.image), self.across] -= np.where(kept, part.values, 0.0)
+        return replace(self, predicted=predicted)
+
+    def on_sheet(
+        self, parameters: Parameters, global_values: np.ndarray, here: np.ndarray | slice = slice(None)
+    ) -> PointDerivatives | None:
+        """Points of the sheet that the pixels show; None where a ray misses it."""
+        at_px = self.pixels if self.predicted is None else self.predicted
+        return parameters.on_sheet(global_values, self.view, at_px[here])
+
+    def stripe_residuals(
+        self,
+        parameters: Parameters,
+        points: PointDerivatives,
+        off: Distances,
+        *,
+        kind: str,
+        local_columns: np.ndarray,
+        image: int,
+        here: np.ndarray | slice = slice(None),
+        least_share: float = 0.0,
+    ) -> Residuals:
+        """Distances of points of the sheet from a surface as pixels across the stripe.
+
+        Where a pixel moves the distance by less than ``least_share`` of how far it moves the point, that share counts.
+        """
+        by_rays = np.einsum("in,cin->cn", off.outward, points.by_rays)
+        by_global = parameters.by_global(by_rays, self.view, np.einsum("in,cin->cn", off.outward, points.by_sheet))
+        for key, column in off.by_global.items():
+            parameters.add(by_global, key, column)
+        column = COLUMNS.index("uv"[self.across])
+        per_px, found_px = by_rays[column], self.pixels[here, self.across]
+        at_px = found_px if self.predicted is None else self.predicted[here, self.across]
+        if least_share:
+            least = least_share * np.linalg.norm(points.by_rays[column], axis=0)
+            per_px = np.copysign(np.maximum(np.abs(per_px), least), per_px)
+        return Residuals(
+            kind,
+            (found_px - at_px) * (by_rays[column] / per_px) + off.values_mm / per_px,
+            by_global / per_px[:, None],
+            off.by_local / per_px[:, None],
+            local_columns,
+            image,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TargetEvidence(StripeEvidence):
     """Images of one placement of the target with the stripes on it; local parameters are its pose, and the stage's.
 
     The local parameters are rotation vector and shift ``T_camera_target`` at the first image, and where the stage
@@ -44,88 +142,87 @@ class TargetEvidence:
 
     Attributes
     ----------
-    placement : the target's points as found
-    stripe_pixels : (M, 2)
-    stripe_image : (M,); number of each stripe pixel's image
-    stripe_shifts_mm : (M,); stage position of each, from that of the first image
-    across : {0, 1}; the coordinate of the pixel that runs across the stripe
+    placement, predicted_points : the target's points as found; (M, 2), their pixels as ``predicted`` for the stripe
+    image : (N,); number of each stripe pixel's image
+    shifts_mm : (N,); stage position of each stripe pixel, from that of the first image
     staged : whether the images are joined by the stage's motion
-    radius_mm : largest distance of a point of the target from its middle; there the target's bow is given
-    middle_mm : (2,)
-    predicted : (N, 2), optional; pixels near those predicted of the target's points, where rays are taken; as found
-        unless given
-    stripe_predicted : (M, 2), optional; the same of the stripe
+    extent_mm : (K, 2); corners of the target, whose bow is given at the one farthest from the middle
     """
 
-    view: View
     placement: Placement
-    stripe_pixels: np.ndarray
-    stripe_image: np.ndarray
-    stripe_shifts_mm: np.ndarray
-    across: int
+    image: np.ndarray
+    shifts_mm: np.ndarray
     staged: bool
-    radius_mm: float
-    middle_mm: np.ndarray
-    predicted: np.ndarray | None = None
-    stripe_predicted: np.ndarray | None = None
+    extent_mm: np.ndarray
+    predicted_points: np.ndarray | None = None
+    middle_mm: np.ndarray = field(init=False)
+    radius_mm: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        middle = self.extent_mm.mean(axis=0)
+        object.__setattr__(self, "middle_mm", middle)
+        object.__setattr__(self, "radius_mm", float(np.linalg.norm(self.extent_mm - middle, axis=1).max()))
 
     def images(self) -> np.ndarray:
         """Numbers of the images whose stage positions have errors of their own."""
         return np.unique(self.placement.image)[1:] if self.staged else np.empty(0, dtype=int)
 
-    def with_stripes(self, chosen: np.ndarray | slice) -> "TargetEvidence":
+    def lit(self, image: int) -> np.ndarray:
+        return self.image == image
+
+    def with_stripes(self, chosen: np.ndarray | slice) -> Self:
         """The same with some of the stripe pixels only."""
-        return replace(
-            self,
-            stripe_pixels=self.stripe_pixels[chosen],
-            stripe_image=self.stripe_image[chosen],
-            stripe_shifts_mm=self.stripe_shifts_mm[chosen],
-        )
+        return replace(self, pixels=self.pixels[chosen], image=self.image[chosen], shifts_mm=self.shifts_mm[chosen])
+
+    def with_centres(
+        self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
+    ) -> Self:
+        """The same with the images of the circles' centres instead of the centres of the circles' images."""
+        placement, seen_by = self.placement, partial(parameters.project, global_values, self.view)
+        pixels = placement.pixels.copy()
+        for image in np.unique(placement.image):
+            pose, here = self.pose(parameters, global_values, local, image), placement.image == image
+            pixels[here] -= centre_offsets(seen_by, pose, placement.points_mm[here], diameter_mm=diameter_mm)
+        return replace(self, placement=replace(placement, pixels=pixels))
 
     def pose(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int) -> np.ndarray:
         """``T_camera_target`` (4, 4) of one of the images."""
-        pose = _Pose.of(self, parameters, global_values, local, image)
+        pose = _Pose(self, parameters, global_values, local, image)
         result = np.eye(4)
         result[:3, :3] = pose.rotation
         result[:3, 3] = pose.shift - pose.rotation @ (pose.direction * pose.travel)
         return result
 
-    def local_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
-        """Standard uncertainty (b,) of the local parameters before; infinite for the pose."""
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         if not self.staged:
             return np.full(6, np.inf)
-        return np.concatenate([np.full(6, np.inf), [alignment] * 2, np.full(len(self.images()), position_mm)])
+        tilt, position = uncertainty.stage_lean(), uncertainty.stage_position_mm
+        return np.array([*[np.inf] * 6, tilt, tilt, *[position] * len(self.images())])
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
         """Those of the target's points and of the stripe, image by image; None where a ray meets nothing."""
         found = []
         for image in np.unique(self.placement.image):
-            pose = _Pose.of(self, parameters, global_values, local, image)
-            here, lit = self.placement.image == image, self.stripe_image == image
-            parts = [self._of_points(parameters, global_values, pose, here)]
-            if lit.any():
-                parts.append(self._of_stripe(parameters, global_values, pose, lit))
+            pose = _Pose(self, parameters, global_values, local, image)
+            parts = [self._of_points(parameters, global_values, pose)]
+            if self.lit(image).any():
+                parts.append(self._of_stripe(parameters, global_values, pose))
             if any(part is None for part in parts):
                 return None
             found += parts
         return found
 
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> "TargetEvidence":
-        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
-        predicted, stripe_predicted = self.placement.pixels.copy(), self.stripe_pixels.copy()
+    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+        points = self.placement.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
-            moved = np.where(kept, part.values, 0.0)
             if part.kind == TARGET:
-                predicted[self.placement.image == part.image] -= moved.reshape(-1, 2)
-            else:
-                stripe_predicted[self.stripe_image == part.image, self.across] -= moved
-        return replace(self, predicted=predicted, stripe_predicted=stripe_predicted)
+                points[self.placement.image == part.image] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
+        return replace(super().linearised(residuals, used), predicted_points=points)
 
-    def _of_points(
-        self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose", here: np.ndarray
-    ) -> Residuals | None:
+    def _of_points(self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose") -> Residuals | None:
+        here = self.placement.image == pose.image
         found_px = self.placement.pixels[here]
-        at_px = found_px if self.predicted is None else self.predicted[here]
+        at_px = found_px if self.predicted_points is None else self.predicted_points[here]
         rays = parameters.rays(global_values, self.view, at_px)
         if rays is None:
             return None
@@ -137,14 +234,13 @@ class TargetEvidence:
         if not (reach > 0).all():
             return None
         at = rays.origins + reach * rays.directions
-        by_rays = pose.rotation.T @ (rays.origins_by + reach * rays.directions_by)
         slope = along[:2] / along[2]
 
         def flat(moved: np.ndarray) -> np.ndarray:
             """From a change (..., 3, N) of the point to that (..., 2, N) of where the ray meets the target."""
             return moved[..., :2, :] - slope * moved[..., 2:, :]
 
-        by_rays = flat(by_rays)
+        by_rays = flat(pose.rotation.T @ (rays.origins_by + reach * rays.directions_by))
         found = (start + reach * along)[:2] - known[:, :2].T
         into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), target mm to px
 
@@ -158,44 +254,29 @@ class TargetEvidence:
             by_global[axis] = parameters.by_global(by_rays[:, axis], self.view)
             parameters.add(by_global[axis], TargetParameter.BOW, slope[axis] * bulge)
             parameters.add(by_global[axis], StageParameter.SCALE, by_scale[axis])
-        return Residuals(
-            kind=TARGET,
-            values=(found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel(),
-            by_global=to_pixels(by_global),
-            by_local=to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0)),
-            local_columns=pose.local_columns,
-            image=pose.image,
-        )
+        values = (found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel()
+        by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
+        return Residuals(TARGET, values, to_pixels(by_global), by_local, pose.local_columns, pose.image)
 
-    def _of_stripe(
-        self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose", here: np.ndarray
-    ) -> Residuals | None:
-        found_px = self.stripe_pixels[here]
-        at_px = found_px if self.stripe_predicted is None else self.stripe_predicted[here]
-        points = parameters.on_sheet(global_values, self.view, at_px)
+    def _of_stripe(self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose") -> Residuals | None:
+        here = self.lit(pose.image)
+        points = self.on_sheet(parameters, global_values, here)
         if points is None:
             return None
         at = pose.into_target(points.points)
-        bow = parameters.value(global_values, TargetParameter.BOW)
-        offset = at[:2] - self.middle_mm[:, None]
+        bow, bulge = parameters.value(global_values, TargetParameter.BOW), self._bulge(at.T)
         # Height above the bent target: its gradient by the point in the target's frame.
+        offset = at[:2] - self.middle_mm[:, None]
         gradient = np.stack([*(-2.0 * bow / self.radius_mm**2 * offset), np.ones(at.shape[1])])
-        in_camera = pose.rotation @ gradient
-        by_rays = np.einsum("in,cin->cn", in_camera, points.by_rays)
-        by_sheet = np.einsum("in,cin->cn", in_camera, points.by_sheet)
-        bulge = self._bulge(at.T)
-        by_global = parameters.by_global(by_rays, self.view, by_sheet)
-        parameters.add(by_global, TargetParameter.BOW, -bulge)
-        parameters.add(by_global, StageParameter.SCALE, pose.by_scale() @ gradient)
-        by_local = np.einsum("in,cin->nc", gradient, pose.by_local(points.points))
-        per_px = by_rays[COLUMNS.index("uv"[self.across])]
-        return Residuals(
-            kind=STRIPE,
-            values=(found_px - at_px)[:, self.across] + (at[2] - bow * bulge) / per_px,
-            by_global=by_global / per_px[:, None],
-            by_local=by_local / per_px[:, None],
-            local_columns=pose.local_columns,
-            image=pose.image,
+        off = Distances(
+            at[2] - bow * bulge,
+            pose.rotation @ gradient,
+            np.einsum("in,cin->nc", gradient, pose.by_local(points.points)),
+            {TargetParameter.BOW: -bulge, StageParameter.SCALE: pose.by_scale() @ gradient},
+        )
+        columns = pose.local_columns
+        return self.stripe_residuals(
+            parameters, points, off, kind=STRIPE, local_columns=columns, image=pose.image, here=here
         )
 
     def _bulge(self, points: np.ndarray) -> np.ndarray:
@@ -203,7 +284,6 @@ class TargetEvidence:
         return np.sum((points[:, :2] - self.middle_mm) ** 2, axis=1) / self.radius_mm**2
 
 
-@dataclass(frozen=True, eq=False)
 class _Pose:
     """How the target stands to the camera in one image, and its derivatives by the parameters ``local_columns`` (c,).
 
@@ -211,41 +291,22 @@ class _Pose:
     own, that is the last of the parameters.
     """
 
-    rotation: np.ndarray
-    rotation_by: np.ndarray
-    shift: np.ndarray
-    direction: np.ndarray
-    direction_by: np.ndarray
-    travel: float
-    nominal: float
-    local_columns: np.ndarray
-    image: int
-
-    @classmethod
-    def of(
-        cls, evidence: TargetEvidence, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int
-    ) -> "_Pose":
-        rotation, by = cv2.Rodrigues(local[:3])
-        direction = evidence.placement.direction(local[6:8])
-        by_tilt, nominal, travel, columns = np.zeros((0, 3)), 0.0, 0.0, np.arange(6)
+    def __init__(
+        self, evidence: TargetEvidence, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int
+    ):
+        placement = evidence.placement
+        self.rotation, rotation_by = cv2.Rodrigues(local[:3])
+        self._rotation_by = rotation_by.reshape(3, 3, 3)
+        self.shift, self.image = local[3:6], int(image)
+        tilt = local[6:8] if evidence.staged else np.zeros(2)
+        self.direction, self._direction_by = leaning(np.array([0.0, 0.0, placement.along_z]), np.eye(3)[:2], tilt)
+        self._nominal = self.travel = 0.0
+        self.local_columns = np.arange(6)
         if evidence.staged:
-            by_tilt = ((np.eye(3) - np.outer(direction, direction))[:, :2] * abs(direction[2])).T
-            columns = np.append(np.arange(8), 8 + np.flatnonzero(evidence.images() == image))
-            nominal = float(evidence.placement.shifts_mm[evidence.placement.image == image][0])
-            travel = nominal * (1.0 + parameters.value(global_values, StageParameter.SCALE)) + float(
-                local[columns[8:]].sum()
-            )
-        return cls(
-            rotation=rotation,
-            rotation_by=by.reshape(3, 3, 3),
-            shift=local[3:6],
-            direction=direction,
-            direction_by=by_tilt,
-            travel=travel,
-            nominal=nominal,
-            local_columns=columns,
-            image=int(image),
-        )
+            self.local_columns = np.append(np.arange(8), 8 + np.flatnonzero(evidence.images() == image))
+            self._nominal = float(placement.shifts_mm[placement.image == image][0])
+            scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
+            self.travel = self._nominal * scale + float(local[self.local_columns[8:]].sum())
 
     def into_target(self, points: np.ndarray) -> np.ndarray:
         """Points (3, N) of the camera frame in the target's frame at the first image."""
@@ -253,81 +314,48 @@ class _Pose:
 
     def by_scale(self) -> np.ndarray:
         """Derivative (3,) of `into_target` by the stage's scale."""
-        return self.direction * self.nominal
+        return self.direction * self._nominal
 
     def by_local(self, points: np.ndarray) -> np.ndarray:
         """Derivatives (c, 3, N) of `into_target` by the local parameters."""
         result = np.empty((len(self.local_columns), 3, points.shape[1]))
-        result[:3] = self.rotation_by.transpose(0, 2, 1) @ (points - self.shift[:, None])
+        result[:3] = self._rotation_by.transpose(0, 2, 1) @ (points - self.shift[:, None])
         result[3:6] = -self.rotation[:, :, None]
         if len(self.local_columns) > 6:
-            result[6:8] = self.direction_by[:, :, None] * self.travel
+            result[6:8] = self._direction_by[:, :, None] * self.travel
             result[8:] = self.direction[:, None]
         return result
 
 
-@dataclass(frozen=True, eq=False)
-class StepProfileEvidence:
-    """Stripe pixels on both treads of a step standard in one image; local parameters are the lower tread's line.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepProfileEvidence(StripeEvidence):
+    """Stripe pixels on both faces of a step standard in one image; local parameters are the lower face's line.
 
-    The treads are planes square to ``upward + slope * along``; the lower one lies at a distance of the local parameters
+    The faces are planes square to ``upward + slope * along``; the lower one lies at a distance of the local parameters
     (slope, distance in mm), the upper one higher by the standard's height, which is the global parameter ``height``.
-
-    Attributes
-    ----------
-    pixels : (N, 2)
-    upper : (N,) bool; which of them lie on the upper tread
-    upward, along : (3,); unit vectors of the camera frame: away from the sensor turned round, that is from the lower
-        tread to the upper one, and along the stripe
-    across : {0, 1}
-    height : the global parameter
-    image : number of the image among all of steps
-    predicted : (N, 2), optional; pixels near those predicted, where rays are taken; as found unless given
+    ``upward``, from the lower face to the upper one, and ``along`` the stripe are unit vectors (3,) of the camera frame;
+    ``upper`` (N,) marks the pixels on the upper face. ``image`` is the number of the image among all of steps.
     """
 
-    view: View
-    pixels: np.ndarray
     upper: np.ndarray
     upward: np.ndarray
     along: np.ndarray
-    across: int
     height: StepHeight
     image: int
-    predicted: np.ndarray | None = None
 
-    def local_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
-        """Nothing is known of the line before."""
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         return np.full(2, np.inf)
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        """One for every pixel; None where a ray misses the sheet."""
-        at_px = self.pixels if self.predicted is None else self.predicted
-        points = parameters.on_sheet(global_values, self.view, at_px)
+        points = self.on_sheet(parameters, global_values)
         if points is None:
             return None
-        raw = self.upward + local[0] * self.along
-        length = np.linalg.norm(raw)
-        normal = raw / length
-        by_slope = (self.along - normal * (normal @ self.along)) / length
-        by_rays = np.einsum("i,cin->cn", normal, points.by_rays)
-        by_global = parameters.by_global(by_rays, self.view, np.einsum("i,cin->cn", normal, points.by_sheet))
-        parameters.add(by_global, self.height, -self.upper.astype(np.float64))
-        per_px = by_rays[COLUMNS.index("uv"[self.across])]
-        off = normal @ points.points - local[1] - self.upper * parameters.value(global_values, self.height)
-        by_local = np.stack([by_slope @ points.points, np.full(len(off), -1.0)], axis=1)
-        return [
-            Residuals(
-                kind=STEP,
-                values=(self.pixels - at_px)[:, self.across] + off / per_px,
-                by_global=by_global / per_px[:, None],
-                by_local=by_local / per_px[:, None],
-                local_columns=np.arange(2),
-                image=self.image,
-            )
-        ]
-
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> "StepProfileEvidence":
-        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
-        predicted = self.pixels.copy()
-        predicted[:, self.across] -= np.where(used[0], residuals[0].values, 0.0)
-        return replace(self, predicted=predicted)
+        normal, by_slope = leaning(self.upward, self.along[None], local[:1])
+        off = Distances(
+            normal @ points.points - local[1] - self.upper * parameters.value(global_values, self.height),
+            np.broadcast_to(normal[:, None], points.points.shape),
+            np.column_stack([by_slope[0] @ points.points, np.full(len(self.pixels), -1.0)]),
+            {self.height: -self.upper.astype(np.float64)},
+        )
+        columns = np.arange(2)
+        return [self.stripe_residuals(parameters, points, off, kind=STEP, local_columns=columns, image=self.image)]

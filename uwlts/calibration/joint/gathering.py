@@ -1,20 +1,20 @@
 """Evidence of captures and prior knowledge from descriptions, as the joint calibration needs them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
-from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
-from uwlts.calibration.joint.initial_scans import ScanStripes, scan_stripes
-from uwlts.calibration.joint.parameters import Prior, View
+from uwlts.calibration.joint.derivatives import SHEET
+from uwlts.calibration.joint.parameters import Prior, View, window_values
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sources_of
 from uwlts.calibration.target_images import Placement, placements
+from uwlts.model.artefacts import Pipe, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import CalibrationError
+from uwlts.model.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.joint_estimate import Origin
 from uwlts.model.parameter_keys import (
     MediumIndex,
@@ -23,20 +23,20 @@ from uwlts.model.parameter_keys import (
     StageParameter,
     StepHeight,
     TargetParameter,
-    WindowParameter,
 )
 from uwlts.model.sensor import Medium, Sensor
+from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
+from uwlts.stripe import StripeOptions, find_stripes
+
+Scanned = SphereStandard | PlaneStandard | Pipe
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Images of the target seen through the same.
+    """Images of the target seen through the same, in captures of these names.
 
-    Attributes
-    ----------
-    approaching : whether the stage moves the sensor towards the target; None where it moves otherwise
-    names : of the captures
+    ``approaching`` says whether the stage moves the sensor towards the target; None where it moves otherwise.
     """
 
     view: View
@@ -48,17 +48,37 @@ class Series:
         """The images joined by the stage's motion, or one by one."""
         return placements(self.found.images, approaching=None if free else self.approaching)
 
+    def sources(self, images: np.ndarray) -> dict[int, str]:
+        """Capture and frame of images by their numbers."""
+        frames = {int(image): self.found.frames[image] for image in images}
+        return {image: f"{self.names[capture]}, frame {frame}" for image, (capture, frame) in frames.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class ScanStripes:
+    """The stripe centres (N,) of a scan, the stage's positions (F,), and what is known of what was scanned.
+
+    ``slopes`` (N,) are those of the brightness (`uwlts.optics.brightness.slopes_of_brightness`).
+    """
+
+    source: str
+    frame: np.ndarray
+    line: np.ndarray
+    centre_px: np.ndarray
+    width_px: np.ndarray
+    slopes: np.ndarray
+    stage_mm: np.ndarray
+    stage_direction: np.ndarray
+    artefact: Scanned
+    view: View
+
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
     """All that the captures show.
 
-    Attributes
-    ----------
-    sensor : as the first capture describes it, with the window as mounted in the medium of use
-    media : media other than air by their names
-    series : target images, by what they were seen through
-    steps : list of (StepEvidence, View)
+    ``sensor`` is as the first capture describes it, with the window as mounted in the medium of use; ``media`` are
+    those other than air by their names, ``series`` the target images by what they were seen through.
     """
 
     sensor: Sensor
@@ -73,16 +93,10 @@ class Gathered:
         """Through what each series of target images, each step image and each scan was seen."""
         return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
-    def sources(self, *, free: bool) -> list[dict[int, str]]:
-        """Capture and frame of every target image of every placement, in the order of `series_start`."""
-        return [
-            {
-                int(image): f"{part.names[part.found.frames[image][0]]}, frame {part.found.frames[image][1]}"
-                for image in np.unique(placement.image)
-            }
-            for part in self.series
-            for placement in part.placements(free=free)
-        ]
+    def indices(self, options: CalibrationOptions) -> list[float]:
+        """Refractive indices of the media, as described or as the options give them."""
+        wavelength = self.sensor.laser.wavelength_nm
+        return [options.medium_index or medium.refractive_index(wavelength) for medium in self.media.values()]
 
 
 def gather_jointly(
@@ -95,73 +109,76 @@ def gather_jointly(
 ) -> Gathered:
     """Find the target, the stripes on it and those on steps and scanned surfaces in all images.
 
-    Raises
-    ------
-    CalibrationError
-        The captures come from different sensors, show no target or several, mean different media by one name, or one
-        is given twice; no step image shows a stripe, or a scan carries poses.
-    DescriptionError
-        A capture describes its target wrongly, or not its step standard or what it scans.
-    CaptureError
-        A scan shows no stripe, or an image is damaged.
+    Raises CalibrationError: the captures come from different sensors, show no target or several, mean different media
+    by one name, or one is given twice, so that its noise would count as two independent ones; no step image shows a
+    stripe, or a scan carries poses. DescriptionError: a capture describes its target wrongly, or not its step standard
+    or what it scans. CaptureError: a scan shows no stripe, or an image is damaged.
     """
-    sensor = common_sensor([*targets, *steps, *scans])
-    provenance = sources_of(targets, steps, scans)
-    _refuse_twice(provenance)
-    media: dict[str, Medium] = {}
-    views: dict[View, list[Capture]] = {}
-    for capture in targets:
-        views.setdefault(_view(capture, media), []).append(capture)
-    series, warnings = [], []
-    for view, captures in views.items():
-        found = air_evidence(captures, stripe=options.stripe, progress=progress)
-        warnings += found.warnings
-        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
-    on_steps = []
-    for capture in steps:
-        view = _view(capture, media)
-        found_steps, left_out = step_evidence(
-            [capture], medium_index=options.medium_index, stripe=options.stripe, progress=progress
-        )
-        on_steps += [(step, view) for step in found_steps]
-        warnings += left_out
-    if steps and not on_steps:
-        raise CalibrationError(no_stripe_in(steps))
-    on_scans = []
-    for capture in scans:
-        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
-        on_scans.append(scan_stripes(capture, _view(capture, media, name), stripe=options.stripe))
-    windowed = [c for c in [*steps, *targets, *scans] if c.header.sensor.camera.window.mounted]
-    return Gathered(
-        sensor=windowed[0].header.sensor if windowed else sensor,
-        media=media,
-        series=series,
-        steps=on_steps,
-        scans=on_scans,
-        provenance=provenance,
-        warnings=warnings,
-    )
-
-
-def refuse_two_lenses(gathered: Gathered) -> None:
-    """CalibrationError where a lens that looks straight into a medium would have to be the one seen otherwise."""
-    views = gathered.views()
-    for view in views:
-        if view.medium is None or view.window or all(other == view for other in views):
-            continue
-        raise CalibrationError(
-            f"some captures in {list(gathered.media)[view.medium]} were taken without a window and others were not: a "
-            "lens that touches the medium is another lens; calibrate it by itself, or set window.mounted"
-        )
-
-
-def _refuse_twice(provenance: Mapping[str, JsonValue]) -> None:
-    """CalibrationError where two captures are the same, as their noise would count as two independent ones."""
+    sensor, provenance = common_sensor([*targets, *steps, *scans]), sources_of(targets, steps, scans)
     names: dict[str, str] = {}
     for source in Origin.model_validate(provenance).captures():
         if source.sha256 in names:
             raise CalibrationError(f"{names[source.sha256]} and {source.file} are the same capture: give it once")
         names[source.sha256] = source.file
+    media: dict[str, Medium] = {}
+    views: dict[View, list[Capture]] = {}
+    for capture in targets:
+        views.setdefault(_view(capture, media), []).append(capture)
+    series, on_steps, on_scans, warnings = [], [], [], []
+    for view, captures in views.items():
+        found = air_evidence(captures, stripe=options.stripe, progress=progress)
+        warnings += found.warnings
+        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
+    for capture in steps:
+        view, index = _view(capture, media), options.medium_index
+        found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)
+        on_steps += [(step, view) for step in found_steps]
+        warnings += left_out
+    if steps and not on_steps:
+        raise CalibrationError(no_stripe_in(steps))
+    for capture in scans:
+        name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
+        on_scans.append(scan_stripes(capture, _view(capture, media, name), stripe=options.stripe))
+    seen = [capture.header.sensor for capture in [*steps, *targets, *scans]]
+    sensor = next((each for each in seen if each.camera.window.mounted), sensor)
+    return Gathered(sensor, media, series, on_steps, on_scans, provenance, warnings)
+
+
+def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> ScanStripes:
+    """Find the stripes of a scan.
+
+    Raises DescriptionError: the capture does not describe spheres, a plane or a pipe. CaptureError: no image shows a
+    stripe. CalibrationError: the images carry poses of their own.
+    """
+    wanted = "a scan to calibrate from shows spheres, a plane or a pipe, described as its artefact"
+    if capture.header.artefact is None:
+        raise DescriptionError(f"{capture.path.name} does not say what it shows: {wanted}")
+    try:
+        artefact = parse_artefact(capture.header.artefact)
+    except EvaluationError as error:
+        raise DescriptionError(f"{capture.path.name} does not describe what it shows: {error}") from error
+    if not isinstance(artefact, Scanned):
+        raise DescriptionError(f"{capture.path.name} shows a {artefact.kind}: {wanted}")
+    if np.isfinite(capture.pose).any():
+        raise CalibrationError(
+            f"the images of {capture.path.name} carry poses: in a scan to calibrate from the stage alone moves the "
+            "sensor, take one without poses"
+        )
+    found = find_stripes(capture, options=stripe)
+    found = found[sharp_lines(found)[0]]
+    stage = capture.stage_mm[:]
+    return ScanStripes(
+        source=capture.path.name,
+        frame=found.frame,
+        line=found.line,
+        centre_px=found.centre_px,
+        width_px=found.width_px,
+        slopes=slopes_of_brightness(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]),
+        stage_mm=stage,
+        stage_direction=np.array(capture.header.stage_direction),
+        artefact=artefact,
+        view=view,
+    )
 
 
 def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> View:
@@ -185,33 +202,23 @@ def _approaching(captures: Sequence[Capture]) -> bool | None:
 def priors_of(
     gathered: Gathered,
     window: WindowModel | None,
-    indices: list[float],
     turns: np.ndarray,
     heights: dict[StepHeight, Prior],
     options: CalibrationOptions,
 ) -> dict[ParameterKey, Prior]:
     """What is known of all global parameters but the lens's.
 
-    Parameters
-    ----------
-    window : as described
-    indices : of the media, as described
-    turns : (3,); where the sheet's turns and shift start
-    heights : of the step standards
+    ``window`` is as described; the sheet's turns and shift start at ``turns`` (3,); ``heights`` are of step standards.
     """
     sensor, known = gathered.sensor, gathered.sensor.uncertainty
     priors: dict[ParameterKey, Prior] = {}
     if window is not None:
         tilt = float(np.tan(np.radians(known.window_tilt_deg)))
-        normal = np.array(window.normal) / window.normal[2]
+        std = (known.window_distance_mm, tilt, tilt, known.glass_thickness_mm, known.glass_index)
         priors |= {
-            WindowParameter.DISTANCE: Prior(window.distance_mm, known.window_distance_mm),
-            WindowParameter.SLOPE_X: Prior(float(normal[0]), tilt),
-            WindowParameter.SLOPE_Y: Prior(float(normal[1]), tilt),
-            WindowParameter.THICKNESS: Prior(window.thickness_mm, known.glass_thickness_mm),
-            WindowParameter.GLASS_INDEX: Prior(window.glass_index, known.glass_index),
+            key: Prior(value, each) for (key, value), each in zip(window_values(window).items(), std, strict=True)
         }
-    for (name, medium), index in zip(gathered.media.items(), indices, strict=True):
+    for (name, medium), index in zip(gathered.media.items(), gathered.indices(options), strict=True):
         std = medium.index_uncertainty(sensor.laser.wavelength_nm, known)
         priors[MediumIndex(name)] = Prior(index, known.index if options.medium_index else std)
     priors |= {key: Prior(float(value), np.inf) for key, value in zip(SHEET[:3], turns, strict=True)}
@@ -220,8 +227,7 @@ def priors_of(
     if gathered.media and sensor.laser.window.mounted:
         priors[SheetParameter.WINDOW_TURN] = Prior(float(np.arcsin(sensor.laser.window.normal()[0])), float(turn))
     if gathered.scans:
-        lean = float(np.tan(np.radians(known.stage_alignment_deg)))
-        priors |= dict.fromkeys(SLOPES, Prior(0.0, lean))
+        priors |= dict.fromkeys(SLOPES, Prior(0.0, known.stage_lean()))
     if options.poses != "free" or gathered.scans:
         priors[StageParameter.SCALE] = Prior(0.0, known.stage_scale)
     priors[TargetParameter.BOW] = Prior(0.0, known.target_bow_mm)

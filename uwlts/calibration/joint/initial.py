@@ -1,57 +1,101 @@
-"""Initial values of the joint estimate: camera, poses and sheet, and lines of steps."""
+"""Initial values of the joint estimate: camera, poses and sheet, lines of steps, surfaces of scans."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import assert_never
 
 import cv2
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from uwlts.calibration.camera import CameraSolution, placement_pose, solve_camera
-from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
+from uwlts.calibration.camera import placement_pose, solve_camera
+from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
-from uwlts.calibration.joint.gathering import Gathered, Series
+from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series
 from uwlts.calibration.joint.parameters import Parameters, Prior, View
+from uwlts.calibration.joint.scanned_surfaces import Cylinder, Plane, Spheres, Surface, SurfaceScanEvidence, across_of
+from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.calibration.sheet import fit_sheet, object_frame
 from uwlts.calibration.target_images import Placement
 from uwlts.calibration.window import label_step
+from uwlts.metrology.artefacts import evaluate_pipe, evaluate_plane
+from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace
+from uwlts.model.artefacts import Pipe, PlaneStandard, SphereStandard
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
+from uwlts.optics.brightness import beside_sheet
 from uwlts.optics.camera import directions
+from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.optics.window import trace_window
 
 _LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3
 """Pixels, or a share of the focal length: what the stage's errors leave in the images that a start is found from."""
 # As robust as a median can be; what is left out here is judged again with the final sheet.
 _LARGEST_REJECTED = 0.45
+_MOST_POINTS = 2000  # more points of a scan add little: neighbours err together
+_FEWEST_POINTS = 100  # of an image, before thinning
+_STEEPEST = 0.3
+"""Slope of the brightness, per mm of the stage, beyond which the place that the light comes from is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesStart:
-    """Start of lens (L,) and of all placements' local parameters, with the stripes that lie on the target."""
+    """Start of lens (L,) and of all placements' local parameters, with the stripes that lie on the target.
 
+    Sensor, window and the ``indices`` of the media are as described.
+    """
+
+    sensor: Sensor
+    window: WindowModel | None
+    indices: Sequence[float]
     intrinsics: Intrinsics
     lens: np.ndarray
     evidence: list[TargetEvidence]
     local: list[np.ndarray]
 
-    def calibration(self, sensor: Sensor, window: WindowModel | None, model: SheetModel) -> Calibration:
-        """A calibration of the start, good enough to tell the treads of a step apart."""
-        frame = object_frame(model, laser_axis=laser_pose(sensor).axis)
+    def calibration(self, sheet: SheetModel) -> Calibration:
+        """A calibration of the start, good enough to separate the faces of a step."""
+        frame = object_frame(sheet, laser_axis=laser_pose(self.sensor).axis)
         return Calibration(
-            sensor_name=sensor.name,
-            stripe_along=sensor.camera.stripe_along,
-            wavelength_nm=sensor.laser.wavelength_nm,
+            sensor_name=self.sensor.name,
+            stripe_along=self.sensor.camera.stripe_along,
+            wavelength_nm=self.sensor.laser.wavelength_nm,
             camera=self.intrinsics.model(self.lens),
-            window=window,
-            sheet=model,
+            window=self.window,
+            sheet=sheet,
             camera_from_object=tuple(map(tuple, frame.tolist())),
         )
+
+    def sheet(self) -> tuple[DescribedSheet, np.ndarray] | None:
+        """The sheet as described, and turns and shift (3,) to the plane through the stripes.
+
+        Those count that the window disturbs least; None where no stripe falls on the target. Raises CalibrationError:
+        the stripes do not lie on a plane, or do not determine one.
+        """
+        views = {e.view for e in self.evidence if len(e.pixels)}
+        if not views:
+            return None
+        view = min(views, key=lambda v: (v.medium is not None, v.window))
+        seen_by = _Viewpoint(self.intrinsics.model(self.lens), self.window, self.indices, view)
+        points = []
+        for piece, local in zip(self.evidence, self.local, strict=True):
+            if piece.view == view and len(piece.pixels):
+                moved = piece.shifts_mm[:, None] * piece.placement.direction(np.empty(0))
+                at = seen_by.on_target(piece.pixels, local, moved)
+                points.append((at - moved) @ cv2.Rodrigues(local[:3])[0].T + local[3:6])
+        pose, glass = laser_pose(self.sensor), self.sensor.laser.window
+        sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
+        normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
+        middle = camera_from_object(self.sensor)[:3, 3]
+        outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
+        described = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
+        turns = (normal @ pose.axis / along, normal @ pose.fan / along)
+        return described, np.array([*turns, sheet.offset_mm - normal @ middle])
 
 
 def series_start(
@@ -60,86 +104,50 @@ def series_start(
     window: WindowModel | None,
     indices: Sequence[float],
     *,
-    options: CameraOptions,
-    free: bool,
-    margin_mm: float | None,
+    options: CalibrationOptions,
 ) -> SeriesStart:
     """Camera from the series that the window disturbs least, poses of all series, stripes that fall on the target.
 
     Seen paraxially through the window, a pane d away from the pupil, t thick, of the index g, the medium of the index n
     looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
+
+    Raises CalibrationError: a camera without a window in air does not explain the images by and large.
     """
-    image = sensor.camera
-    intrinsics = Intrinsics(options, width_px=image.width_px, height_px=image.height_px)
+    width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
+    intrinsics = Intrinsics(options.camera, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
     staged = not free and base.approaching is not None
     seen = solve_camera(
         base.found.images,
-        width_px=image.width_px,
-        height_px=image.height_px,
+        width_px=width_px,
+        height_px=height_px,
         poses="stage-normal" if staged else "free",
         approaching=bool(base.approaching),
-        options=options,
+        options=options.camera,
     )
-    if not base.view.window and base.view.medium is None:
-        _refuse_misfits(base, seen)
+    rms = seen.image_rms_px()
+    explained = np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px)
+    if base.view == View(False, None) and not explained:
+        image = int(np.argmax(rms))
+        raise CalibrationError(
+            f"no camera explains the target images in air: {np.median(rms):.1f} px (rms) are left in most of them, and "
+            f"{rms.max():.1f} px in {base.sources(np.array([image]))[image]}: check the target's spacing, the stage's "
+            "positions, and that all captures come from the same camera and medium"
+        )
     lens = intrinsics.from_model(seen.model)
     index = _index(base.view, indices)
     for place, name in enumerate(intrinsics.names):
         lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
-    camera, evidence, local = intrinsics.model(lens), [], []
+    start = SeriesStart(sensor, window, indices, intrinsics, lens, [], [])
     for part in series:
-        seen_by = _Viewpoint.of(camera, part.view, window, indices)
-        alone = free or part.approaching is None
+        seen_by = _Viewpoint(intrinsics.model(lens), window, indices, part.view)
+        staged = not free and part.approaching is not None
         for placement in part.placements(free=free):
             pose = seen_by.pose(placement)
-            piece = _evidence(part, placement, seen_by, pose, sensor, margin_mm, staged=not alone)
-            evidence.append(piece)
-            local.append(pose if alone else np.concatenate([pose, np.zeros(2 + len(piece.images()))]))
-    return SeriesStart(intrinsics, lens, evidence, local)
-
-
-def sheet_start(
-    start: SeriesStart, sensor: Sensor, window: WindowModel | None, indices: Sequence[float]
-) -> tuple[DescribedSheet, np.ndarray] | None:
-    """The sheet as described, and turns and shift (3,) to the plane through the stripes that the window disturbs least.
-
-    None where no stripe falls on the target.
-
-    Raises CalibrationError: the stripes do not lie on a plane, or do not determine one.
-    """
-    views = {e.view for e in start.evidence if len(e.stripe_pixels)}
-    if not views:
-        return None
-    view = min(views, key=lambda v: (v.medium is not None, v.window))
-    seen_by = _Viewpoint.of(start.intrinsics.model(start.lens), view, window, indices)
-    points = []
-    for piece, local in zip(start.evidence, start.local, strict=True):
-        if piece.view == view and len(piece.stripe_pixels):
-            moved = piece.stripe_shifts_mm[:, None] * piece.placement.direction(np.empty(0))
-            at = seen_by.on_target(piece.stripe_pixels, local, moved)
-            points.append((at - moved) @ cv2.Rodrigues(local[:3])[0].T + local[3:6])
-    pose, glass = laser_pose(sensor), sensor.laser.window
-    sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
-    normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
-    middle = camera_from_object(sensor)[:3, 3]
-    outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
-    described = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + outer * pose.axis)
-    turns = (normal @ pose.axis / along, normal @ pose.fan / along)
-    return described, np.array([*turns, sheet.offset_mm - normal @ middle])
-
-
-def _refuse_misfits(series: Series, seen: CameraSolution) -> None:
-    """CalibrationError where a camera without a window in air does not explain the images by and large."""
-    rms = seen.image_rms_px()
-    if np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px):
-        return
-    capture, frame = series.found.frames[int(np.argmax(rms))]
-    raise CalibrationError(
-        f"no camera explains the target images in air: {np.median(rms):.1f} px (rms) are left in most of them, and "
-        f"{rms.max():.1f} px in {series.names[capture]}, frame {frame}: check the target's spacing, the stage's "
-        "positions, and that all captures come from the same camera and medium"
-    )
+            piece = _evidence(part, placement, seen_by, pose, sensor, options.margin_mm, staged=staged)
+            start.evidence.append(piece)
+            start.local.append(np.append(pose, np.zeros(2 + len(piece.images()) if staged else 0)))
+    return start
 
 
 def _index(view: View, indices: Sequence[float]) -> float:
@@ -147,33 +155,27 @@ def _index(view: View, indices: Sequence[float]) -> float:
     return indices[view.medium] if view.window and view.medium is not None else 1.0
 
 
-@dataclass(frozen=True, eq=False)
 class _Viewpoint:
     """A camera with the window in its view and the index behind it."""
 
-    camera: CameraModel
-    window: WindowModel | None
-    index: float
-
-    @classmethod
-    def of(cls, camera: CameraModel, view: View, window: WindowModel | None, indices: Sequence[float]) -> "_Viewpoint":
-        return cls(camera, window if view.window else None, _index(view, indices))
+    def __init__(self, camera: CameraModel, window: WindowModel | None, indices: Sequence[float], view: View):
+        self._camera, self._window, self._index = camera, window if view.window else None, _index(view, indices)
 
     def pose(self, placement: Placement) -> np.ndarray:
         """Rotation vector and shift (6,) of a placement, seen through the window as if from a single viewpoint."""
-        rays = directions(self.camera, placement.pixels)
+        rays = directions(self._camera, placement.pixels)
         if not np.isfinite(rays).all():
             raise CalibrationError("the distortion found first has no inverse where the target is seen: fix some of it")
         seen = replace(placement, pixels=rays[:, :2] / rays[:, 2:])
-        pose, window = placement_pose(seen, np.diag([self.index, self.index, 1.0])), self.window
+        pose, window = placement_pose(seen, np.diag([self._index, self._index, 1.0])), self._window
         if window is not None:
             outer = window.distance_mm + window.thickness_mm
-            pose[5] += outer - self.index * (window.distance_mm + window.thickness_mm / window.glass_index)
+            pose[5] += outer - self._index * (window.distance_mm + window.thickness_mm / window.glass_index)
         return pose
 
     def on_target(self, pixels: np.ndarray, pose: np.ndarray, moved_mm: np.ndarray) -> np.ndarray:
         """Points (N, 3) of the moved target where rays meet it, in its frame; NaN where one does not."""
-        rays = trace_window(directions(self.camera, pixels), self.window, medium_index=self.index)
+        rays = trace_window(directions(self._camera, pixels), self._window, medium_index=self._index)
         rotation = cv2.Rodrigues(pose[:3])[0]
         start = (rays.origins - pose[3:6]) @ rotation + moved_mm
         along = rays.directions @ rotation
@@ -191,8 +193,7 @@ def _evidence(
     *,
     staged: bool,
 ) -> TargetEvidence:
-    found = series.found
-    numbers = np.unique(placement.image)
+    found, numbers = series.found, np.unique(placement.image)
     pixels = np.vstack([found.stripes[number] for number in numbers])
     image = np.repeat(numbers, [len(found.stripes[number]) for number in numbers])
     stage_mm = np.array([entry.stage_mm for entry in found.images])
@@ -203,55 +204,178 @@ def _evidence(
     hull = ConvexHull(extent).equations
     with np.errstate(invalid="ignore"):
         on_target = (at[:, :2] @ hull[:, :2].T + hull[:, 2] <= margin).all(axis=1)
-    middle = extent.mean(axis=0)
-    return TargetEvidence(
+    evidence = TargetEvidence(
         view=series.view,
         placement=placement,
-        stripe_pixels=pixels[on_target],
-        stripe_image=image[on_target],
-        stripe_shifts_mm=shifts[on_target],
+        pixels=pixels,
+        image=image,
+        shifts_mm=shifts,
         across=1 if sensor.camera.stripe_along == "width" else 0,
+        sources=series.sources(numbers),
         staged=staged,
-        radius_mm=float(np.linalg.norm(extent - middle, axis=1).max()),
-        middle_mm=middle,
+        extent_mm=extent,
     )
+    return evidence.with_stripes(np.flatnonzero(on_target))
 
 
 def step_profiles(
     gathered: Gathered, start: Calibration, window: WindowModel | None
-) -> tuple[list[tuple[StepProfileEvidence, Prior]], list[str]]:
-    """Evidence of every step image with what is known of its height, by a calibration nearly as sought; warnings."""
+) -> tuple[list[StepProfileEvidence], dict[StepHeight, Prior], list[str]]:
+    """Evidence of every step image and what is known of heights, by a calibration nearly as sought; warnings."""
     transform = start.object_transform()
     usual = gathered.sensor.uncertainty.step_height_mm
-    found, warnings = [], []
+    found, heights, warnings = [], {}, []
     for number, (step, view) in enumerate(gathered.steps):
         try:
             image = label_step(start, window, step)
         except EvaluationError as error:
             warnings.append(f"{step.source}: left out, {error}")
             continue
-        on_tread = image.labels != StepFace.NEITHER
+        on_face = image.labels != StepFace.NEITHER
         height, stated = step.standard.height_mm, step.standard.height_uncertainty_mm
         evidence = StepProfileEvidence(
             view=view,
-            pixels=image.pixels[on_tread],
-            upper=image.labels[on_tread] == StepFace.UPPER,
+            pixels=image.pixels[on_face],
+            across=1 if gathered.sensor.camera.stripe_along == "width" else 0,
+            sources={number: step.source},
+            upper=image.labels[on_face] == StepFace.UPPER,
             upward=-transform[:3, 2],
             along=transform[:3, 1],
-            across=1 if gathered.sensor.camera.stripe_along == "width" else 0,
             height=StepHeight(height),
             image=number,
         )
-        found.append((evidence, Prior(height, stated / 2 if stated else usual)))
-    return found, warnings
+        found.append(evidence)
+        heights[evidence.height] = Prior(height, stated / 2 if stated else usual)
+    return found, heights, warnings
 
 
 def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
-    """The lower tread's line (2,) at the parameters' start."""
-    points = parameters.on_sheet(global_values, evidence.view, evidence.pixels)
+    """The lower face's line (2,) at the parameters' start."""
+    points = evidence.on_sheet(parameters, global_values)
     if points is None:
         raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
     up = evidence.upward @ points.points - evidence.upper * parameters.value(global_values, evidence.height)
-    along = evidence.along @ points.points
-    slope, offset = np.polyfit(along, up, 1)
+    slope, offset = np.polyfit(evidence.along @ points.points, up, 1)
     return np.array([-slope, offset / np.hypot(1.0, slope)])
+
+
+def surface_scan(
+    stripes: ScanStripes, start: Calibration, sensor: Sensor, *, medium_index: float, sizes_known: bool, image: int
+) -> tuple[SurfaceScanEvidence, np.ndarray]:
+    """Evidence and the start of its local parameters, by a calibration nearly as sought.
+
+    Raises EvaluationError: the points do not show what was scanned.
+    """
+    line, centre, direction = stripes.line, stripes.centre_px, stripes.stage_direction
+    across = 1 if start.stripe_along == "width" else 0
+    pixels = np.stack((line, centre) if across else (centre, line), axis=1).astype(np.float64)
+    stage_mm = stripes.stage_mm[stripes.frame]
+    points = reconstruct_pixels(
+        start, pixels, medium_index=medium_index, stage_mm=stage_mm, stage_direction=direction
+    ).points_mm
+    width, slopes, along = stripes.width_px, stripes.slopes, tuple(direction.tolist())
+    beside = beside_sheet(start, sensor, line, centre, width, slopes, medium_index=medium_index, stage_direction=along)
+    points = points + beside
+    # At the rims few points are left, and those are doubtful, as are those where the brightness changes fast.
+    often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS
+    good = often & (np.abs(stripes.slopes) < _STEEPEST) & np.isfinite(points).all(axis=1)
+    if not good.any():
+        raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} profile lines, sharp and evenly bright")
+    there = np.flatnonzero(good)
+    there = there[:: -(-len(there) // _MOST_POINTS)]
+    transform = start.object_transform()
+    used, surface, local = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
+    kept = there[used]
+    frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
+    rotation, stage_mm = transform[:3, :3], stripes.stage_mm[frames]
+    evidence = SurfaceScanEvidence(
+        view=stripes.view,
+        pixels=pixels[kept],
+        across=across,
+        sources={image + n: f"{stripes.source}, at {position:g} mm" for n, position in enumerate(stage_mm)},
+        beside_mm=rotation @ beside[kept].T,
+        surface=surface,
+        frame=frame,
+        stage_mm=stage_mm,
+        direction=rotation @ direction,
+        across_stage=across_of(direction) @ rotation.T,
+        image=image,
+    )
+    return evidence, np.append(local, np.zeros(len(frames)))
+
+
+def surface_scans(
+    scans: Sequence[ScanStripes], start: Calibration, sensor: Sensor, indices: Sequence[float], *, sizes_known: bool
+) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
+    """Evidence of every scan with the start of its local parameters, and warnings about scans left out.
+
+    Raises CalibrationError: the scans move along different directions.
+    """
+    found, warnings, image = [], [], 0
+    if any(not np.allclose(scan.stage_direction, scans[0].stage_direction) for scan in scans):
+        raise CalibrationError("the scans move along different directions: calibrate with those along one of them")
+    for stripes in scans:
+        index = 1.0 if stripes.view.medium is None else indices[stripes.view.medium]
+        through = start if stripes.view.window else start.model_copy(update={"window": None})
+        try:
+            evidence, local = surface_scan(
+                stripes, through, sensor, medium_index=index, sizes_known=sizes_known, image=image
+            )
+        except EvaluationError as error:
+            warnings.append(f"{stripes.source}: left out, {error}")
+            continue
+        found.append((evidence, local))
+        image += len(evidence.stage_mm)
+    return found, warnings
+
+
+def _surface(
+    artefact: Scanned, points: np.ndarray, transform: np.ndarray, *, sizes_known: bool
+) -> tuple[np.ndarray, Surface, np.ndarray]:
+    """Which points (N, 3) of the OCS lie on the surface (N,), that surface in the camera frame, its start (k,).
+
+    Raises EvaluationError: the points do not show what was scanned.
+    """
+    rotation = transform[:3, :3]
+
+    def std(expanded_mm: float | None) -> float:
+        """Standard uncertainty of a certificate's expanded one; infinite where it states none."""
+        return expanded_mm / 2 if sizes_known and expanded_mm else np.inf
+
+    def in_camera(point_mm: Sequence[float]) -> np.ndarray:
+        return rotation @ point_mm + transform[:3, 3]
+
+    match artefact:
+        case SphereStandard():
+            spheres = evaluate_spheres(points, artefact)
+            used = np.isfinite(spheres.deviation_mm)
+            centres = np.array([sphere.centre_mm for sphere in spheres.spheres])
+            diameters = np.array([sphere.diameter_mm for sphere in spheres.spheres])
+            off = np.abs(np.linalg.norm(points[used][:, None] - centres, axis=2) - diameters / 2)
+            nominal, spacings = np.array(artefact.diameters_mm), np.array(artefact.spacings_mm)
+            surface = Spheres(
+                diameters_mm=nominal,
+                diameter_std_mm=np.full(len(nominal), std(artefact.diameter_uncertainty_mm)),
+                spacings_mm=spacings,
+                spacing_std_mm=np.full(len(spacings), std(artefact.spacing_uncertainty_mm)),
+                sphere=np.argmin(off, axis=1),
+            )
+            return used, surface, np.append((centres @ rotation.T + transform[:3, 3]).ravel(), diameters - nominal)
+        case PlaneStandard():
+            plane = evaluate_plane(points, artefact)
+            normal = np.array(plane.normal)
+            surface = Plane(in_camera(plane.point_mm), rotation @ normal, across_of(normal) @ rotation.T)
+            return np.isfinite(plane.deviation_mm), surface, np.zeros(3)
+        case Pipe():
+            pipe = evaluate_pipe(points, artefact)
+            axis = np.array(pipe.axis)
+            surface = Cylinder(
+                point_mm=in_camera(pipe.point_mm),
+                axis=rotation @ axis,
+                across=across_of(axis) @ rotation.T,
+                diameter_mm=artefact.diameter_mm,
+                diameter_std_mm=std(artefact.diameter_uncertainty_mm),
+            )
+            return np.isfinite(pipe.deviation_mm), surface, np.array([0.0, 0.0, 0.0, 0.0, pipe.diameter_error_mm])
+        case _:
+            assert_never(artefact)

@@ -15,19 +15,15 @@ _SLOPE_BIAS_PX = 0.01
 """Size of the error of a stripe's centre that goes with the slope of the surface, of which
 `uwlts.optics.brightness` takes out two thirds where rendered spheres show it."""
 
-_FINEST_PX = 1e-3  # no point of an image counts as better known, lest what is known before counts for nothing
+_FINEST_PX = 1e-3  # no point of an image counts as better known: what is known before would count for nothing
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Scatter of one kind of residual.
+    """Scatter of one kind of residual: ``sigma_px``, the standard deviation of one, without outliers.
 
-    Attributes
-    ----------
-    sigma_px : standard deviation of one residual, without outliers
-    together : variance of a mean of many over that of as many independent ones: neighbours along a stripe, or images of
-        the same point of the target, err together
-    besides : what to add to that for errors that the residuals do not show
+    ``together`` is the variance of a mean of many over that of as many independent ones, as neighbours along a stripe
+    and images of the same point of the target err together; ``besides`` adds to that for errors that do not show.
     """
 
     sigma_px: float

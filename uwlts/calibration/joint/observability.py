@@ -7,13 +7,11 @@ import numpy as np
 
 from uwlts.calibration.joint.derivatives import COLUMNS
 from uwlts.calibration.joint.parameters import View
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, found_estimate, require_joint
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, found_estimate, require_joint
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
-from uwlts.model.joint_estimate import CoveredRegion
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Medium
-from uwlts.optics.camera import project_through_window
 
 _ROWS, _COLUMNS = 7, 9  # of a mesh: 1953 lengths, between ends in all parts of a region
 _INSET = 0.02  # share of the depth left out at either end, where an outline may come to a point
@@ -22,15 +20,10 @@ _LEAST_MM = 1.0  # extent of a region over which lengths mean something
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A region of the sheet that evidence covers.
+    """A region of the sheet that evidence covers, in the medium of a name, and through what it was seen.
 
-    Attributes
-    ----------
-    name : of the medium
-    view : through what it was seen
-    outline_mm : (K, 2); convex, Y and Z in the OCS
-    camera_depth_mm : (2,); nearest and farthest depth along the camera's axis, from its entrance pupil
-    points : stripe pixels in it
+    ``outline_mm`` (K, 2) is convex, Y and Z in the OCS; ``camera_depth_mm`` (2,) are the nearest and farthest depths
+    along the camera's axis from its entrance pupil; ``points`` is the number of stripe pixels in it.
     """
 
     name: str
@@ -65,13 +58,9 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class SheetPoints:
-    """Points of the sheet and how they move, OCS, mm.
+    """Points of the sheet at Y and Z (N, 2) of the OCS, and how they move, mm.
 
-    Attributes
-    ----------
-    at_mm : (N, 2); Y and Z
-    by_parameters : (N, 3, P)
-    by_px : (N, 3); for one pixel across the stripe
+    The derivatives are ``by_parameters`` (N, 3, P), and ``by_px`` (N, 3) for one pixel across the stripe.
     """
 
     at_mm: np.ndarray
@@ -81,14 +70,10 @@ class SheetPoints:
 
 @dataclass(frozen=True, eq=False)
 class Lengths:
-    """Lengths between points of the sheet.
+    """Lengths (M,) between points of the sheet, at Y and Z of both ends (M, 2, 2).
 
-    Attributes
-    ----------
-    ends_mm : (M, 2, 2); Y and Z of both ends
-    length_mm : (M,)
-    by_parameters : (M, P)
-    by_px : (M,); for a pixel's noise at each end, independent of the other's
+    The derivatives are ``by_parameters`` (M, P), and ``by_px`` (M,) for a pixel's noise at each end, independent of the
+    other's.
     """
 
     ends_mm: np.ndarray
@@ -104,22 +89,15 @@ class Lengths:
 
 def regions(calibration: Calibration) -> list[Region]:
     """The regions that a joint calibration's evidence covers, that of its use first; CalibrationError if damaged."""
-    found = [_region(calibration, entry) for entry in require_joint(calibration).covered]
+    found = []
+    for covered in require_joint(calibration).covered:
+        number = covered.medium
+        if number is not None and number >= len(calibration.media):
+            raise CalibrationError(f"the calibration's covered volume is damaged: it has no medium number {number}")
+        medium = Medium(kind="air") if number is None else calibration.media[number].medium
+        outline, depth = np.array(covered.outline_mm).reshape(-1, 2), np.array(covered.camera_depth_mm)
+        found.append(Region(covered.name, medium, View(covered.window, number), outline, depth, covered.point_count))
     return sorted(found, key=lambda region: (region.view.medium is None, -region.points))
-
-
-def _region(calibration: Calibration, covered: CoveredRegion) -> Region:
-    number = covered.medium
-    if number is not None and number >= len(calibration.media):
-        raise CalibrationError(f"the calibration's covered volume is damaged: it has no medium number {number}")
-    return Region(
-        name=covered.name,
-        medium=Medium(kind="air") if number is None else calibration.media[number].medium,
-        view=View(covered.window, number),
-        outline_mm=np.array(covered.outline_mm, dtype=np.float64).reshape(-1, 2),
-        camera_depth_mm=np.array(covered.camera_depth_mm, dtype=np.float64),
-        points=covered.point_count,
-    )
 
 
 def estimate_in(calibration: Calibration, region: Region) -> StoredEstimate:
@@ -127,35 +105,22 @@ def estimate_in(calibration: Calibration, region: Region) -> StoredEstimate:
     return replace(found_estimate(calibration, region.medium), view=region.view)
 
 
-def points_at(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray) -> SheetPoints:
-    """Points of the sheet at Y and Z (N, 2) of the OCS, with their derivatives.
-
-    Raises CalibrationError: the camera does not see one of them.
-    """
-    transform = calibration.object_transform()
-    pixels = pixels_at(calibration, known, at_mm)
+def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetPoints:
+    """Points of the sheet at Y and Z (N, 2) of the OCS; CalibrationError where the camera does not see one of them."""
+    pixels = pixels_at(known, at_mm)
     points = known.parameters.on_sheet(known.values, known.view, pixels) if np.isfinite(pixels).all() else None
     if points is None:
         raise CalibrationError("the calibration's covered volume lies outside the camera's view: calibrate again")
-    by = np.stack(
-        [
-            known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    across = COLUMNS.index("v" if calibration.stripe_along == "width" else "u")
-    into_object = transform[:3, :3].T
-    return SheetPoints(at_mm, np.einsum("ij,njp->nip", into_object, by), points.by_rays[across].T @ into_object.T)
+    into_object = known.calibration.object_transform()[:3, :3].T
+    by = [known.parameters.by_global(points.by_rays[:, i], known.view, points.by_sheet[:, i]) for i in range(3)]
+    by_px = points.by_rays[COLUMNS.index("uv"[known.across()])].T @ into_object.T
+    return SheetPoints(at_mm, np.einsum("ij,jnp->nip", into_object, np.stack(by)), by_px)
 
 
-def pixels_at(calibration: Calibration, known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
+def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
     """Where the camera sees points at Y and Z (N, 2) of the OCS: (N, 2), NaN where it does not."""
-    transform, parameters = calibration.object_transform(), known.parameters
-    in_camera = at_mm @ transform[:3, 1:3].T + transform[:3, 3]
-    window = parameters.window_model(known.values) if known.view.window else None
-    index = parameters.medium_index(known.values, known.view)
-    return project_through_window(parameters.camera(known.values), window, in_camera, medium_index=index)
+    transform = known.calibration.object_transform()
+    return known.project(at_mm @ transform[:3, 1:3].T + transform[:3, 3])
 
 
 def lengths_between(points: SheetPoints, start: np.ndarray, end: np.ndarray) -> Lengths:
@@ -165,18 +130,14 @@ def lengths_between(points: SheetPoints, start: np.ndarray, end: np.ndarray) -> 
     unit = apart / length[:, None]
     moved = points.by_parameters[end, 1:] - points.by_parameters[start, 1:]
     by_px = [np.einsum("mi,mi->m", unit, points.by_px[side, 1:]) for side in (start, end)]
-    return Lengths(
-        ends_mm=np.stack([points.at_mm[start], points.at_mm[end]], axis=1),
-        length_mm=length,
-        by_parameters=np.einsum("mi,mip->mp", unit, moved),
-        by_px=np.hypot(*by_px),
-    )
+    ends = np.stack([points.at_mm[start], points.at_mm[end]], axis=1)
+    return Lengths(ends, length, np.einsum("mi,mip->mp", unit, moved), np.hypot(*by_px))
 
 
-def lengths_over(calibration: Calibration, known: StoredEstimate, region: Region) -> Lengths:
+def lengths_over(known: StoredEstimate, region: Region) -> Lengths:
     """Lengths between all pairs of points of a region's mesh."""
     at = region.mesh().reshape(-1, 2)
-    return lengths_between(points_at(calibration, known, at), *np.triu_indices(len(at), k=1))
+    return lengths_between(points_at(known, at), *np.triu_indices(len(at), k=1))
 
 
 _MOST = 3  # more than a reader keeps in mind are not named
@@ -191,16 +152,11 @@ _AXIS_COSINE = 0.9  # within 26 deg a length runs along an axis
 
 @dataclass(frozen=True)
 class Weakness:
-    """A direction that the evidence leaves open.
+    """A direction that the evidence leaves open, with the parameters that make it up, the most important first.
 
-    Attributes
-    ----------
-    parameters : those that make it up, the most important first
-    confused : whether the evidence cannot separate them, rather than knows each too little
-    cost_mm : standard uncertainty that it adds to the length that it changes most
-    length_mm : that length
-    along : which way it runs: "Y", "Z" or "Y and Z"
-    depth_mm : largest depth Z of its ends, OCS
+    ``confused`` says whether the evidence cannot separate these, rather than knows each too little. ``cost_mm`` is the
+    standard uncertainty that it adds to the length that it changes most, which runs ``along`` "Y", "Z" or "Y and Z" and
+    whose ends lie at most at the depth Z ``depth_mm`` of the OCS.
     """
 
     parameters: tuple[ParameterInFile, ...]
@@ -213,27 +169,19 @@ class Weakness:
     def words(self) -> str:
         """The weakness as a sentence without its full stop."""
         names = [key.quantity.words for key in self.parameters]
-        listed = names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
         what = f"{self.cost_mm:.3f} mm in a length of {self.length_mm:.0f} mm along {self.along}"
         if len(names) == 1:
-            return f"{listed} is known too little; it costs {what}"
-        if self.confused:
-            return f"{listed} cannot be separated by these images; together they cost {what}"
-        return f"{listed} are known too little; together they cost {what}"
+            return f"{names[0]} is known too little; it costs {what}"
+        why = "cannot be separated by these images" if self.confused else "are known too little"
+        return f"{', '.join(names[:-1])} and {names[-1]} {why}; together they cost {what}"
 
 
 def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.ndarray) -> list[Weakness]:
     """The directions that cost most, at most three; none where no length becomes uncertain by a micrometre.
 
-    Parameters
-    ----------
-    lengths : over the volume
-    covariance : (P, P)
+    The lengths are those over the volume; ``covariance`` is (P, P).
     """
-    std = np.sqrt(np.diag(covariance))
-    scale = np.where(std > 0, std, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    std, root = np.sqrt(np.diag(covariance)), covariance_root(covariance)
     _, sizes, parts = np.linalg.svd(lengths.by_parameters @ root, full_matrices=False)
     total = float(np.sum(sizes**2))
     found = []
@@ -245,13 +193,15 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
             break
         named = _named(lengths, direction, std)
         start, end = lengths.ends_mm[worst]
+        along_y, along_z = np.abs(end - start) / np.linalg.norm(end - start) > _AXIS_COSINE
+        correlation = covariance[np.ix_(named, named)] / np.outer(std[named], std[named])
         found.append(
             Weakness(
                 parameters=tuple(keys[place] for place in named),
-                confused=len(named) > 1 and _confused(covariance, named),
+                confused=len(named) > 1 and bool(np.linalg.eigvalsh(correlation)[0] < _CONFUSED),
                 cost_mm=float(abs(changes[worst])),
                 length_mm=float(lengths.length_mm[worst]),
-                along=_way(end - start),
+                along="Z" if along_z else "Y" if along_y else "Y and Z",
                 depth_mm=float(max(start[1], end[1])),
             )
         )
@@ -276,14 +226,3 @@ def _named(lengths: Lengths, direction: np.ndarray, std: np.ndarray) -> list[int
     if share.max() < _CAUSE_SHARE:
         share = np.linalg.norm(lengths.by_parameters, axis=0) * np.abs(direction)
     return [int(place) for place in np.argsort(-share) if share[place] >= _NAMED_SHARE * share.max()][:_MOST]
-
-
-def _confused(covariance: np.ndarray, named: Sequence[int]) -> bool:
-    part = covariance[np.ix_(named, named)]
-    std = np.sqrt(np.diag(part))
-    return bool(np.linalg.eigvalsh(part / np.outer(std, std))[0] < _CONFUSED)
-
-
-def _way(apart: np.ndarray) -> str:
-    across, along = np.abs(apart) / np.linalg.norm(apart)
-    return "Z" if along > _AXIS_COSINE else "Y" if across > _AXIS_COSINE else "Y and Z"

@@ -8,34 +8,26 @@ from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.joint.derivatives import (
     COLUMNS,
     LENS,
+    SHEET,
     WINDOW,
     DescribedSheet,
     PointDerivatives,
-    RayDerivatives,
     points_on_sheet,
     ray_derivatives,
 )
-from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
 from uwlts.model.calibration import CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import MediumIndex, ParameterKey
+from uwlts.optics.camera import project_through_window
+from uwlts.optics.window import RayDerivatives
 
 
 @dataclass(frozen=True, eq=False)
 class EarlierEstimate:
-    """What an earlier estimate says of the first K parameters of a vector.
+    """What an earlier estimate says of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
 
-    Attributes
-    ----------
-    values : (K,)
-    covariance : (K, K)
-    whitening : (K, K); W with W^T W the inverse of the covariance: W (x - values) are K residuals of variance one,
-        independent
-
-    Raises
-    ------
-    CalibrationError
-        The covariance is not positive definite.
+    ``whitening`` (K, K) is W with W^T W the inverse of the covariance: W (x - values) are K independent residuals of
+    variance one. Raises CalibrationError: the covariance is not positive definite.
     """
 
     values: np.ndarray
@@ -87,17 +79,20 @@ class Prior:
     std: float
 
 
+def window_values(window: WindowModel) -> dict[ParameterKey, float]:
+    """The parameters of a window in their order."""
+    slope_x, slope_y, _ = (np.array(window.normal) / window.normal[2]).tolist()
+    values = (window.distance_mm, slope_x, slope_y, window.thickness_mm, window.glass_index)
+    return dict(zip(WINDOW, values, strict=True))
+
+
 @dataclass(frozen=True, eq=False)
 class Parameters:
     """Keys and places of the global parameters in one vector (P,).
 
-    Attributes
-    ----------
-    sheet : the sheet as described
-    window : the window as described; None where nothing is seen through it
-    media : names of the media other than air
-    priors : `Prior` of every parameter but the lens's, in the order of the vector, which lacks those that are held
-    earlier : what an earlier calibration says of the first parameters of the vector, besides the priors
+    ``sheet`` and ``window`` are as described, the window None where nothing is seen through it; ``media`` are the names
+    of those other than air. ``priors`` has every parameter but the lens's, in the order of the vector, which lacks
+    those that are held; ``earlier`` is what an earlier calibration says of the vector's first parameters besides.
     """
 
     intrinsics: Intrinsics
@@ -114,15 +109,15 @@ class Parameters:
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""
-        return np.concatenate([lens, [prior.mean for prior in self._estimated()]])
+        return np.concatenate([lens, self.prior_mean()[len(lens) :]])
 
     def prior_std(self) -> np.ndarray:
         """Standard uncertainty (P,) of each parameter before; infinite where nothing is known."""
-        return np.concatenate([np.full(len(self.intrinsics.names), np.inf), [p.std for p in self._estimated()]])
+        return np.array([self.priors[key].std if key in self.priors else np.inf for key in self.keys])
 
     def prior_mean(self) -> np.ndarray:
         """What each parameter (P,) is before: where nothing is known its start, of the lens's zero."""
-        return np.concatenate([np.zeros(len(self.intrinsics.names)), [p.mean for p in self._estimated()]])
+        return np.array([self.priors[key].mean if key in self.priors else 0.0 for key in self.keys])
 
     def camera(self, values: np.ndarray) -> CameraModel:
         """The camera of a vector."""
@@ -134,14 +129,8 @@ class Parameters:
             return None
         distance, slope_x, slope_y, thickness, index = (self.value(values, key) for key in WINDOW)
         normal = np.array([slope_x, slope_y, 1.0])
-        return self.window.model_copy(
-            update={
-                "distance_mm": distance,
-                "thickness_mm": thickness,
-                "glass_index": index,
-                "normal": tuple((normal / np.linalg.norm(normal)).tolist()),
-            }
-        )
+        found = {"distance_mm": distance, "thickness_mm": thickness, "glass_index": index}
+        return self.window.model_copy(update=found | {"normal": tuple((normal / np.linalg.norm(normal)).tolist())})
 
     def sheet_model(self, values: np.ndarray) -> SheetModel:
         """The sheet of a vector."""
@@ -163,21 +152,23 @@ class Parameters:
             return None
         return points_on_sheet(self.sheet, self._sheet_values(values), rays, self.medium_index(values, view))
 
+    def project(self, values: np.ndarray, view: View, points: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of points (N, 3) in the camera frame, seen through a view; NaN where there is none."""
+        window = self.window_model(values) if view.window else None
+        return project_through_window(self.camera(values), window, points, medium_index=self.medium_index(values, view))
+
     def by_global(self, by_rays: np.ndarray, view: View, by_sheet: np.ndarray | None = None) -> np.ndarray:
         """Derivatives (N, P) by the global parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
         result = np.zeros((by_rays.shape[1], len(self.keys)))
-        lens = by_rays[2 : 2 + len(LENS)]
-        result[:, : len(self.intrinsics.names)] = lens.T @ self.intrinsics.map
+        result[:, : len(self.intrinsics.names)] = by_rays[2 : 2 + len(LENS)].T @ self.intrinsics.map
+        index = () if view.medium is None else (self.index_key(view.medium),)
+        columns: list[tuple[ParameterKey, np.ndarray]] = []
         if view.window:
-            for key in WINDOW:
-                self.add(result, key, by_rays[COLUMNS.index(key)])
-        if view.medium is not None and view.window:
-            self.add(result, self.index_key(view.medium), by_rays[COLUMNS.index("medium_index")])
+            columns += zip((*WINDOW, *index), by_rays[COLUMNS.index(WINDOW[0]) :], strict=False)
         if by_sheet is not None:
-            for key, column in zip(SHEET, by_sheet[:5], strict=True):
-                self.add(result, key, column)
-            if view.medium is not None:
-                self.add(result, self.index_key(view.medium), by_sheet[5])
+            columns += zip((*SHEET, *index), by_sheet, strict=False)
+        for key, column in columns:
+            self.add(result, key, column)
         return result
 
     def value(self, values: np.ndarray, key: ParameterKey) -> float:
@@ -194,9 +185,6 @@ class Parameters:
     def index_key(self, medium: int) -> MediumIndex:
         """The index of a medium by its number."""
         return MediumIndex(self.media[medium])
-
-    def _estimated(self) -> list[Prior]:
-        return [self.priors[key] for key in self.keys[len(self.intrinsics.names) :]]
 
     def _sheet_values(self, values: np.ndarray) -> np.ndarray:
         return np.array([self.value(values, key) for key in SHEET])

@@ -1,31 +1,23 @@
 """The joint calibration from captures: target images in air and in water, stripes on it, steps, scans; in any mix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.camera import centre_offsets
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.consistency import findings
+from uwlts.calibration.joint.consistency import Findings, findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.evidence import TargetEvidence
-from uwlts.calibration.joint.evidence_summary import joint_estimate, lens_and_window_figures
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of, refuse_two_lenses
-from uwlts.calibration.joint.initial import line_start, series_start, sheet_start, step_profiles
-from uwlts.calibration.joint.initial_scans import surface_scans
-from uwlts.calibration.joint.parameters import Parameters, View
+from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
+from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
+from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
+from uwlts.calibration.joint.stored_estimate import calibration_of
 from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.calibration.sheet import object_frame
-from uwlts.model.calibration import Calibration, KnownMedium, KnownStage, WindowModel
+from uwlts.model.calibration import Calibration, KnownStage, WindowModel
 from uwlts.model.errors import CalibrationError
-from uwlts.model.joint_estimate import JointEstimate
-from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Uncertainty
-from uwlts.optics.camera import project_through_window
+from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 
 
@@ -33,21 +25,16 @@ from uwlts.storage.capture import Capture
 class JointProblem:
     """All evidence with what is to be estimated from it, and where that starts.
 
-    Attributes
-    ----------
-    global_values : (P,); start
-    local : list of (b,); starts of the evidence's local parameters
-    diameter_mm : of the target's circles, whose images are to be corrected; None where nothing is
-    sources : for every piece of evidence the names of its images by their numbers
+    The start is ``global_values`` (P,) and ``local``, (b,) of every piece of evidence. ``diameter_mm`` is that of the
+    target's circles, whose images are to be corrected; None where nothing is.
     """
 
     parameters: Parameters
-    evidence: list[Evidence]
+    evidence: Sequence[Evidence]
     global_values: np.ndarray
     local: list[np.ndarray]
-    uncertainty: Uncertainty
+    sensor: Sensor
     diameter_mm: float | None
-    sources: list[dict[int, str]]
     warnings: list[str]
 
     def solve(self) -> Estimate:
@@ -57,9 +44,14 @@ class JointProblem:
             self.evidence,
             self.global_values,
             self.local,
-            uncertainty=self.uncertainty,
-            correct=None if self.diameter_mm is None else partial(centred, self.parameters, self.diameter_mm),
+            uncertainty=self.sensor.uncertainty,
+            diameter_mm=self.diameter_mm,
         )
+
+    def judged(self) -> tuple[Estimate, Findings]:
+        """The estimate and what speaks against it; errors as `estimate`."""
+        result = self.solve()
+        return result, findings(result, self.evidence, sensor=self.sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +80,10 @@ def calibrate_jointly(
         sheet too.
     steps : a step standard in a medium
     scans : scans of spheres, a plane or a pipe that stand still while the stage moves the sensor
-    options : its ``refractions`` do not count: windows are plates as described
+    options : its ``refractions`` do not count: windows are panes as described
 
-    Raises
-    ------
-    CalibrationError
-        No target is among the captures; the evidence does not determine the calibration or contradicts it.
-    DescriptionError
-        A capture describes its target wrongly, or not its step standard or what it scans.
-    CaptureError
-        A scan shows no stripe, or an image is damaged.
+    Raises CalibrationError: no target is among the captures; the evidence does not determine the calibration or
+    contradicts it. DescriptionError and CaptureError: as `gather_jointly`.
     """
     options = CalibrationOptions() if options is None else options
     return solve_jointly(gather_jointly(targets, steps, scans, options=options, progress=progress), options=options)
@@ -105,56 +91,52 @@ def calibrate_jointly(
 
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
     """What is to be estimated from what the captures show, with a start; errors as `calibrate_jointly`."""
-    sensor, warnings = gathered.sensor, list(gathered.warnings)
+    sensor, views = gathered.sensor, gathered.views()
     if not gathered.series:
         raise CalibrationError("no capture shows a target: the joint calibration starts with one in air or in water")
-    refuse_two_lenses(gathered)
+    bare = next((v.medium for v in views if v.medium is not None and not v.window and set(views) != {v}), None)
+    if bare is not None:
+        raise CalibrationError(
+            f"some captures in {list(gathered.media)[bare]} were taken without a window and others were not: a lens "
+            "that touches the medium is another lens; calibrate it by itself, or set window.mounted"
+        )
     window = None
-    if any(view.window for view in gathered.views()):
+    if any(view.window for view in views):
         window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm)
-    wavelength, free = sensor.laser.wavelength_nm, options.poses == "free"
-    indices = [options.medium_index or medium.refractive_index(wavelength) for medium in gathered.media.values()]
-    start = series_start(
-        gathered.series, sensor, window, indices, options=options.camera, free=free, margin_mm=options.margin_mm
-    )
-    found = sheet_start(start, sensor, window, indices)
+    indices = gathered.indices(options)
+    start = series_start(gathered.series, sensor, window, indices, options=options)
+    found = start.sheet()
     if found is None:
         reasons = [each.found.no_stripe for each in gathered.series if each.found.no_stripe]
         raise CalibrationError(
             "; ".join(reasons) or "no stripe was found on the target: check its description and the stage positions"
         )
     sheet, turns = found
-    first = sheet.model(np.append(turns, (0.0, 0.0)))
-    first_calibration = start.calibration(sensor, window, first)
-    steps, left_out = step_profiles(gathered, first_calibration, window)
-    scans, missed = surface_scans(gathered.scans, first_calibration, sensor, indices, sizes_known=options.sizes_known)
-    warnings += [*left_out, *missed]
-    priors = priors_of(gathered, window, indices, turns, {e.height: known for e, known in steps}, options)
+    first = start.calibration(sheet.model(np.append(turns, (0.0, 0.0))))
+    steps, heights, left_out = step_profiles(gathered, first, window)
+    scans, missed = surface_scans(gathered.scans, first, sensor, indices, sizes_known=options.sizes_known)
+    priors = priors_of(gathered, window, turns, heights, options)
     parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors)
-    evidence: list[Evidence] = [*start.evidence, *(e for e, _ in steps), *(e for e, _ in scans)]
     global_values = parameters.start(start.lens)
-    local = [
-        *start.local,
-        *(line_start(e, parameters, global_values) for e, _ in steps),
-        *(local for _, local in scans),
-    ]
-    target = gathered.series[0].found.target
-    diameter_mm = target.circle_diameter_mm if options.correct_circles else None
-    sources = gathered.sources(free=free)
-    sources += [{e.image: gathered.steps[e.image][0].source} for e, _ in steps]
-    sources += [e.sources() for e, _ in scans]
-    return JointProblem(parameters, evidence, global_values, local, sensor.uncertainty, diameter_mm, sources, warnings)
+    lines = [line_start(step, parameters, global_values) for step in steps]
+    return JointProblem(
+        parameters,
+        evidence=[*start.evidence, *steps, *(evidence for evidence, _ in scans)],
+        global_values=global_values,
+        local=[*start.local, *lines, *(local for _, local in scans)],
+        sensor=sensor,
+        diameter_mm=gathered.series[0].found.target.circle_diameter_mm if options.correct_circles else None,
+        warnings=[*gathered.warnings, *left_out, *missed],
+    )
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
     sensor, problem = gathered.sensor, joint_problem(gathered, options=options)
-    evidence, sources, warnings = problem.evidence, problem.sources, list(problem.warnings)
-    parameters, result = problem.parameters, problem.solve()
-    against = findings(result, evidence, sources, sensor=sensor)
+    result, against = problem.judged()
     if against.contradictions:
         raise CalibrationError(against.refusal())
-    warnings += against.doubts
+    warnings = problem.warnings + against.doubts
     provenance: dict[str, JsonValue] = {
         **gathered.provenance,
         "poses": options.poses,
@@ -163,73 +145,13 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
         "target": gathered.series[0].found.target.model_dump(mode="json"),
         "warnings": [*warnings],
     }
-    frame = object_frame(parameters.sheet_model(result.values), laser_axis=laser_pose(sensor).axis)
-    kept = joint_estimate(result, evidence, sources, frame)
-    stages = [
-        KnownStage(
+    calibration = calibration_of(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
+    scans = [e for e in problem.evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)]
+    if scans:
+        direction = scans[0].moved_direction(problem.parameters, result.values)[0]
+        stage = KnownStage(
             described=gathered.scans[0].stage_direction.tolist(),
-            direction=(scan.moved_direction(parameters, result.values) @ frame[:3, :3]).tolist(),
+            direction=(direction @ calibration.object_transform()[:3, :3]).tolist(),
         )
-        for scan in [e for e in evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)][:1]
-    ]
-    calibration = _calibration(gathered, result, frame, stages, kept, provenance)
+        calibration = calibration.model_copy(update={"stages": (stage,)})
     return JointResult(calibration, result, warnings)
-
-
-def _calibration(
-    gathered: Gathered,
-    result: Estimate,
-    frame: np.ndarray,
-    stages: list[KnownStage],
-    joint: JointEstimate,
-    provenance: dict[str, JsonValue],
-) -> Calibration:
-    sensor, parameters, values = gathered.sensor, result.parameters, result.values
-    sheet = parameters.sheet_model(values)
-    wet = parameters.window is None and gathered.media
-    return Calibration(
-        sensor_name=sensor.name,
-        stripe_along=sensor.camera.stripe_along,
-        wavelength_nm=sensor.laser.wavelength_nm,
-        medium_kind=next(iter(gathered.media.values())).kind if wet else "air",
-        camera=parameters.camera(values),
-        window=parameters.window_model(values),
-        sheet=sheet,
-        camera_from_object=tuple(map(tuple, frame.tolist())),
-        stages=tuple(stages),
-        media=tuple(
-            KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
-            for number, medium in enumerate(gathered.media.values())
-        ),
-        residuals={**lens_and_window_figures(result)},
-        joint=joint,
-        provenance=provenance,
-    )
-
-
-def centred(
-    parameters: Parameters,
-    diameter_mm: float,
-    found: Sequence[Evidence],
-    global_values: np.ndarray,
-    local: Sequence[np.ndarray],
-) -> list[Evidence]:
-    """The evidence with the images of the circles' centres instead of the centres of the circles' images."""
-    return [
-        _with_centres(e, parameters, global_values, o, diameter_mm) if isinstance(e, TargetEvidence) else e
-        for e, o in zip(found, local, strict=True)
-    ]
-
-
-def _with_centres(
-    evidence: TargetEvidence, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
-) -> TargetEvidence:
-    view, placement = evidence.view, evidence.placement
-    camera, index = parameters.camera(global_values), parameters.medium_index(global_values, view)
-    window = parameters.window_model(global_values) if view.window else None
-    seen_by = partial(project_through_window, camera, window, medium_index=index)
-    pixels = placement.pixels.copy()
-    for image in np.unique(placement.image):
-        pose, here = evidence.pose(parameters, global_values, local, image), placement.image == image
-        pixels[here] -= centre_offsets(seen_by, pose, placement.points_mm[here], diameter_mm=diameter_mm)
-    return replace(evidence, placement=replace(placement, pixels=pixels))

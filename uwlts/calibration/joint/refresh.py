@@ -1,6 +1,7 @@
 """Refresh of a joint calibration by images in new water: its index, and the uncertainty of lengths in it."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,24 +9,28 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.consistency import Findings, findings
-from uwlts.calibration.joint.derivatives import PARAMETERS as SHEET
-from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.evidence import StepProfileEvidence
-from uwlts.calibration.joint.evidence_summary import joint_estimate, lens_and_window_figures, outline
+from uwlts.calibration.joint.derivatives import SHEET
+from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, step_profiles
-from uwlts.calibration.joint.observability import Lengths, Region, estimate_in, lengths_over, regions
-from uwlts.calibration.joint.parameters import EarlierEstimate, Parameters, View
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, found_estimate, require_joint
+from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import EarlierEstimate, View
+from uwlts.calibration.joint.procedure import JointProblem
+from uwlts.calibration.joint.stored_estimate import (
+    StoredEstimate,
+    calibration_of,
+    found_estimate,
+    outline,
+    require_joint,
+    with_independent,
+)
 from uwlts.calibration.sequential import CalibrationOptions, sources_of
-from uwlts.calibration.sheet import object_frame
 from uwlts.model.any_calibration import calibration_digest, check_fits
-from uwlts.model.calibration import Calibration, KnownMedium, KnownStage
+from uwlts.model.calibration import Calibration, KnownStage
 from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import MediumIndex
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Medium
 from uwlts.optics.window import require_index
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, opened_captures
@@ -34,12 +39,9 @@ from uwlts.stripe import StripeOptions
 
 @dataclass(frozen=True)
 class LengthChange:
-    """The length over the volume that was known worst before.
+    """The length over the volume that was known worst before, and by how much it is measured longer than before.
 
-    Attributes
-    ----------
-    before_mm, after_mm : standard uncertainty by the calibration
-    longer_mm : by how much it is measured longer than by what was known before
+    ``before_mm`` and ``after_mm`` are its standard uncertainty by the calibration.
     """
 
     length_mm: float
@@ -65,8 +67,7 @@ class WaterChange:
             f"index of {self.name}: {self.index_before:.5f} ± {self.std_before:.2g} before, {self.index:.5f} ± "
             f"{self.std:.2g} by the step (standard uncertainties)"
         ]
-        if self.length is not None:
-            length = self.length
+        if (length := self.length) is not None:
             lines.append(
                 f"a length of {length.length_mm:.0f} mm, the one known worst: ± {2 * length.before_mm:.4f} mm before, "
                 f"± {2 * length.after_mm:.4f} mm now (k = 2, by the calibration); it is measured "
@@ -75,21 +76,11 @@ class WaterChange:
         return lines
 
 
-def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChange]:
-    """What an estimate to which an earlier one was known says of the media that are new in it and were seen.
-
-    Parameters
-    ----------
-    calibration : that of the estimate
-    """
-    parameters, earlier = result.parameters, result.parameters.earlier
-    if earlier is None:
-        return []
-    count, before = len(earlier.values), parameters.prior_mean()
-    before[:count] = earlier.values
-    covariance = np.diag(parameters.prior_std() ** 2)
-    covariance[:count] = 0.0
-    covariance[:count, :count] = earlier.covariance
+def water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEstimate) -> list[WaterChange]:
+    """What the estimate of a calibration says of the media that it has beyond an earlier one, if they were seen."""
+    parameters, count = result.parameters, len(earlier.values)
+    before = np.append(earlier.values, parameters.prior_mean()[count:])
+    covariance = with_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
     std_before, std = np.sqrt(np.diag(covariance)), result.std()
     seen = {region.view.medium: region for region in regions(calibration)}
     found = []
@@ -98,43 +89,21 @@ def water_changes(calibration: Calibration, result: Estimate) -> list[WaterChang
         place = parameters.keys.index(key)
         if place < count or number not in seen:
             continue
-        lengths = _lengths(calibration, seen[number])
-        found.append(
-            WaterChange(
-                name,
-                float(before[place]),
-                float(std_before[place]),
-                float(result.values[place]),
-                std[key],
-                None if lengths is None else _length_change(lengths, result, before, covariance),
-            )
-        )
+        length = None
+        if seen[number].has_area():
+            lengths = lengths_over(estimate_in(calibration, seen[number]), seen[number])
+            known, now = lengths.std_mm(covariance), lengths.std_mm(result.covariance)
+            worst = int(np.argmax(known))
+            longer = lengths.by_parameters[worst] @ (result.values - before)
+            figures = (lengths.length_mm[worst], known[worst], now[worst], longer)
+            length = LengthChange(*map(float, figures))
+        was, std_was, found_index = (float(each[place]) for each in (before, std_before, result.values))
+        found.append(WaterChange(name, was, std_was, found_index, std[key], length))
     return found
 
 
-def _lengths(calibration: Calibration, region: Region) -> Lengths | None:
-    return lengths_over(calibration, estimate_in(calibration, region), region) if region.has_area() else None
-
-
-def _length_change(lengths: Lengths, result: Estimate, before: np.ndarray, covariance: np.ndarray) -> LengthChange:
-    std = lengths.std_mm(covariance)
-    worst = int(np.argmax(std))
-    return LengthChange(
-        length_mm=float(lengths.length_mm[worst]),
-        before_mm=float(std[worst]),
-        after_mm=float(lengths.std_mm(result.covariance)[worst]),
-        longer_mm=float(lengths.by_parameters[worst] @ (result.values - before)),
-    )
-
-
 def refreshed_calibration(
-    earlier: Calibration,
-    gathered: Gathered,
-    result: Estimate,
-    evidence: Sequence[Evidence],
-    sources: Sequence[Mapping[int, str]],
-    *,
-    warnings: list[str],
+    earlier: Calibration, gathered: Gathered, result: Estimate, evidence: Sequence[Evidence], *, warnings: list[str]
 ) -> Calibration:
     """The calibration of an estimate to which an earlier one was known.
 
@@ -142,29 +111,20 @@ def refreshed_calibration(
     ``std_before`` of what was known before any. Where the camera's pixels were calibrated in earlier water they are in
     the new as well, so that the volume is the same. Directions of stages stay as they were found.
     """
-    parameters, values = result.parameters, result.values
-    sheet = parameters.sheet_model(values)
-    frame = object_frame(sheet, laser_axis=parameters.sheet.axis)
-    turned = frame[:3, :3].T @ earlier.object_transform()[:3, :3]
     media = [*(known.medium for known in earlier.media), *gathered.media.values()]
+    new = calibration_of(result, evidence, gathered.sensor, media, _provenance(earlier, gathered, warnings))
+    turned = new.object_transform()[:3, :3].T @ earlier.object_transform()[:3, :3]
+    found = ("camera", "window", "sheet", "camera_from_object", "media", "provenance")
+    figures = {name: earlier.figures(name) | new.figures(name) for name in new.residuals}
     return earlier.model_copy(
-        update={
-            "camera": parameters.camera(values),
-            "window": parameters.window_model(values),
-            "sheet": sheet,
-            "camera_from_object": tuple(map(tuple, frame.tolist())),
+        update={name: getattr(new, name) for name in found}
+        | {
             "stages": tuple(
                 KnownStage(described=stage.described, direction=tuple((turned @ stage.direction).tolist()))
                 for stage in earlier.stages
             ),
-            "media": tuple(
-                KnownMedium(medium=medium, index=parameters.medium_index(values, View(True, number)))
-                for number, medium in enumerate(media)
-            ),
-            "residuals": earlier.residuals
-            | {name: earlier.figures(name) | figures for name, figures in lens_and_window_figures(result).items()},
-            "joint": _joint(require_joint(earlier), joint_estimate(result, evidence, sources, frame)),
-            "provenance": _provenance(earlier, gathered, warnings),
+            "residuals": earlier.residuals | figures,
+            "joint": _joint(require_joint(earlier), require_joint(new)),
         }
     )
 
@@ -227,17 +187,12 @@ def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -
 
 _AIR = Medium(kind="air")
 _ANY_INDEX = 0.02  # standard uncertainty of the index of a liquid of which nothing is known
-_TELLING = 4.0  # standard uncertainties by which steps contradict an index
+_CONTRADICTED = 4.0  # standard uncertainties by which steps contradict an index
 
 
 @dataclass(frozen=True, eq=False)
 class Refreshed:
-    """A calibration for new water besides the old, and what that changed.
-
-    Attributes
-    ----------
-    changes : one for each new water
-    """
+    """A calibration for new water besides the old, and what that changed, one entry for each new water."""
 
     calibration: Calibration
     changes: list[WaterChange]
@@ -307,60 +262,37 @@ def solve_refreshed(
 ) -> Refreshed:
     """The same from what the captures show, with the errors of `refresh`."""
     known = _earlier(calibration)
-    gathered = _after(gathered, known.parameters.media)
-    sensor, window = gathered.sensor, calibration.window
-    profiles, left_out = step_profiles(gathered, calibration, window)
+    old = known.parameters
+    gathered = _after(gathered, old.media)
+    profiles, heights, left_out = step_profiles(gathered, calibration, calibration.window)
     warnings = [*gathered.warnings, *left_out]
     if not profiles:
         raise CalibrationError("; ".join(warnings))
-    wavelength = calibration.wavelength_nm
-    indices = [options.medium_index or medium.refractive_index(wavelength) for medium in gathered.media.values()]
-    heights = {evidence.height: height for evidence, height in profiles}
-    turns = known.values[[known.parameters.keys.index(key) for key in SHEET[:3]]]
-    described = priors_of(gathered, window, indices, turns, heights, options)
-    priors = known.parameters.priors | {k: p for k, p in described.items() if k not in known.parameters.priors}
+    turns = known.values[[old.keys.index(key) for key in SHEET[:3]]]
+    described = priors_of(gathered, calibration.window, turns, heights, options)
+    priors = old.priors | {key: prior for key, prior in described.items() if key not in old.priors}
     if index_std is not None:
-        for name in gathered.media:
-            priors[MediumIndex(name)] = replace(priors[MediumIndex(name)], std=index_std)
+        priors |= {key: replace(priors[key], std=index_std) for key in map(MediumIndex, gathered.media)}
     earlier = EarlierEstimate(known.values, known.covariance)
-    parameters = replace(
-        known.parameters, media=(*known.parameters.media, *gathered.media), priors=priors, earlier=earlier
-    )
-    evidence = [profile for profile, _ in profiles]
-    sources = [{profile.image: gathered.steps[profile.image][0].source} for profile in evidence]
-    result, against = _judged(parameters, earlier, evidence, sources, sensor)
+    parameters = replace(old, media=(*old.media, *gathered.media), priors=priors, earlier=earlier)
+    start = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
+    lines = [line_start(profile, parameters, start) for profile in profiles]
+    problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
+    result, against = problem.judged()
     if against.contradictions:
-        raise CalibrationError(_other_water(parameters, earlier, evidence, sources, sensor) or against.refusal())
+        raise CalibrationError(_other_water(problem, earlier) or against.refusal())
     warnings += against.doubts
-    refreshed = refreshed_calibration(calibration, gathered, result, evidence, sources, warnings=warnings)
-    return Refreshed(refreshed, water_changes(refreshed, result), warnings)
+    refreshed = refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
+    return Refreshed(refreshed, water_changes(refreshed, result, earlier), warnings)
 
 
-def _judged(
-    parameters: Parameters,
-    earlier: EarlierEstimate,
-    evidence: Sequence[StepProfileEvidence],
-    sources: Sequence[Mapping[int, str]],
-    sensor: Sensor,
-) -> tuple[Estimate, Findings]:
-    global_values = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
-    local = [line_start(profile, parameters, global_values) for profile in evidence]
-    result = estimate(parameters, evidence, global_values, local, uncertainty=sensor.uncertainty)
-    return result, findings(result, evidence, sources, sensor=sensor)
-
-
-def _other_water(
-    parameters: Parameters,
-    earlier: EarlierEstimate,
-    evidence: Sequence[StepProfileEvidence],
-    sources: Sequence[Mapping[int, str]],
-    sensor: Sensor,
-) -> str:
+def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
     """With which indices steps agree that contradict those described, in words; empty where with none."""
+    parameters = problem.parameters
     new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
-    without = replace(parameters, priors=parameters.priors | free)
-    result, against = _judged(without, earlier, evidence, sources, sensor)
+    freed = replace(problem, parameters=replace(parameters, priors=parameters.priors | free))
+    result, against = freed.judged()
     if against.contradictions:
         return ""
     found = dict(zip(parameters.keys, result.values, strict=True))
@@ -368,12 +300,11 @@ def _other_water(
     for key in new:
         known, std = parameters.priors[key], result.std()[key]
         sigmas = abs(found[key] - known.mean) / np.hypot(std, known.std)
-        if sigmas < _TELLING:
-            continue
-        words.append(
-            f"the steps say that the {key.text} is {found[key]:.4f} +- {std:.2g}, {sigmas:.1f} standard uncertainties "
-            f"from the {known.mean:.5f} +- {known.std:.2g} described"
-        )
+        if sigmas >= _CONTRADICTED:
+            words.append(
+                f"the steps say that the {key.text} is {found[key]:.4f} +- {std:.2g}, {sigmas:.1f} standard "
+                f"uncertainties from the {known.mean:.5f} +- {known.std:.2g} described"
+            )
     advice = (
         ": check the step's height and the water's temperature and salinity in the captures, or give with --index and "
         "--index-std what is known of it; if they are right, the sensor has changed: calibrate again"
@@ -393,32 +324,28 @@ def _earlier(calibration: Calibration) -> StoredEstimate:
 
 def _refuse_unsuitable(capture: Capture, calibration: Calibration) -> None:
     check_fits(capture.header, calibration, source=capture.path.name)
-    header, name = capture.header, capture.path.name
-    if header.sensor.name != calibration.sensor_name:
-        raise CalibrationError(
-            f"{name} was taken by the sensor '{header.sensor.name}', the calibration is that of "
-            f"'{calibration.sensor_name}'"
-        )
-    if header.sensor.laser.wavelength_nm != calibration.wavelength_nm:
-        raise CalibrationError(
-            f"{name} was taken with a laser of {header.sensor.laser.wavelength_nm:g} nm, the calibration is for "
-            f"{calibration.wavelength_nm:g} nm"
-        )
-    if header.medium.kind == "air":
-        raise CalibrationError(f"{name} was taken in air: the index of new water shows in an image of a step in it")
-    if not header.sensor.camera.window.mounted:
-        raise CalibrationError(f"{name} was taken without the camera's window: new water is seen through that")
+    sensor, wavelength = capture.header.sensor, capture.header.sensor.laser.wavelength_nm
+    if sensor.name != calibration.sensor_name:
+        reason = f"by the sensor '{sensor.name}', the calibration is that of '{calibration.sensor_name}'"
+    elif wavelength != calibration.wavelength_nm:
+        reason = f"with a laser of {wavelength:g} nm, the calibration is for {calibration.wavelength_nm:g} nm"
+    elif capture.header.medium.kind == "air":
+        reason = "in air: the index of new water shows in an image of a step in it"
+    elif not sensor.camera.window.mounted:
+        reason = "without the camera's window: new water is seen through that"
+    else:
+        return
+    raise CalibrationError(f"{capture.path.name} was taken {reason}")
 
 
 def _after(gathered: Gathered, media: Sequence[str]) -> Gathered:
     """The same with its media numbered after earlier ones, and named otherwise than those."""
-    names: list[str] = []
-    for name in gathered.media:
-        taken = {*media, *names}
-        numbered = (f"{name} {number}" for number in range(2, len(taken) + 3))
-        names.append(name if name not in taken else next(other for other in numbered if other not in taken))
+    renamed: dict[str, Medium] = {}
+    for name, medium in gathered.media.items():
+        names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))
+        renamed[next(other for other in names if other not in {*media, *renamed})] = medium
     steps = [
         (step, view if view.medium is None else View(view.window, len(media) + view.medium))
         for step, view in gathered.steps
     ]
-    return replace(gathered, media=dict(zip(names, gathered.media.values(), strict=True)), steps=steps)
+    return replace(gathered, media=renamed, steps=steps)

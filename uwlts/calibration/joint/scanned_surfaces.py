@@ -1,50 +1,30 @@
 """Scans of spheres, planes and pipes as evidence: distances of points from the surface, with their derivatives."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
-from uwlts.calibration.joint.derivatives import COLUMNS
-from uwlts.calibration.joint.evidence import Residuals
-from uwlts.calibration.joint.parameters import Parameters, View
+from uwlts.calibration.joint.evidence import Distances, Residuals, StripeEvidence
+from uwlts.calibration.joint.parameters import Parameters
 from uwlts.model.parameter_keys import StageParameter
-
-
-@dataclass(frozen=True, eq=False)
-class Distances:
-    """Of points from a surface.
-
-    Attributes
-    ----------
-    values_mm : (N,); signed, positive on the side of the normals
-    outward : (3, N); unit normals, the derivatives by the points
-    by_local : (N, k); derivatives by the surface's local parameters
-    """
-
-    values_mm: np.ndarray
-    outward: np.ndarray
-    by_local: np.ndarray
+from uwlts.model.sensor import Uncertainty
+from uwlts.optics.window import leaning
 
 
 class Surface(ABC):
     """One surface, or several of a kind, all in the camera frame at the stage position 0.
 
-    ``kind`` names what a stripe on it gives; ``local_std`` (k,) is the standard uncertainty of its local parameters
-    before, infinite where nothing is known.
+    ``kind`` names what a stripe on it gives, ``count`` is the number of its bodies.
     """
 
     kind: ClassVar[str]
-
-    @property
-    def count(self) -> int:
-        """How many bodies it consists of."""
-        return 1
+    count: int = 1
 
     @abstractmethod
-    def local_std(self) -> np.ndarray: ...
+    def local_std(self) -> np.ndarray:
+        """Standard uncertainty (k,) of its local parameters before; infinite where nothing is known."""
 
     @abstractmethod
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
@@ -57,13 +37,10 @@ class Surface(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Spheres(Surface):
-    """S spheres. Own parameters: the centres in mm, then what the diameters are more than ``diameters_mm``.
+    """S spheres. Local parameters: the centres in mm, then what the diameters are more than ``diameters_mm`` (S,).
 
-    Attributes
-    ----------
-    diameters_mm, diameter_std_mm : (S,); as known before; the standard uncertainty is infinite for unknown ones
-    spacings_mm, spacing_std_mm : (S - 1,); distances of consecutive centres, likewise
-    sphere : (N,) int; on which of them each pixel of the scan lies
+    ``spacings_mm`` (S - 1,) are the distances of consecutive centres; the standard uncertainties of both are infinite
+    for unknown ones. ``sphere`` (N,) says on which of them each pixel of the scan lies.
     """
 
     kind: ClassVar[str] = "stripe on the spheres"
@@ -74,9 +51,8 @@ class Spheres(Surface):
     spacing_std_mm: np.ndarray
     sphere: np.ndarray
 
-    @property
-    def count(self) -> int:
-        return len(self.diameters_mm)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "count", len(self.diameters_mm))
 
     def local_std(self) -> np.ndarray:
         return np.concatenate([np.full(3 * self.count, np.inf), self.diameter_std_mm])
@@ -108,12 +84,10 @@ class Spheres(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Plane(Surface):
-    """A plane near another. Own parameters: two slopes of its normal, and its distance in mm, from that one's.
+    """A plane near another through ``point_mm`` (3,) with the unit ``normal`` (3,).
 
-    Attributes
-    ----------
-    point_mm, normal : (3,); of the plane nearby; the distance is that from the point
-    across : (2, 3); unit vectors across the normal and each other, towards which the slopes lean
+    Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), which are square to the other
+    normal and each other, and its distance in mm from the point.
     """
 
     kind: ClassVar[str] = "stripe on the plane"
@@ -134,16 +108,11 @@ class Plane(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(Surface):
-    """A cylinder near another, seen from outside or inside.
+    """A cylinder near another with the unit ``axis`` (3,) through ``point_mm`` (3,), seen from outside or inside.
 
-    Own parameters: two shifts of its axis in mm and two slopes of it from that one's, at ``point_mm``, and what the
-    diameter is more than ``diameter_mm``.
-
-    Attributes
-    ----------
-    point_mm, axis : (3,); of the axis nearby
-    across : (2, 3); unit vectors across the axis and each other, along which it shifts and leans
-    diameter_mm, diameter_std_mm : as known before; the standard uncertainty is infinite for an unknown one
+    Local parameters: two shifts of its axis in mm at the point and two slopes of it, along the unit vectors ``across``
+    (2, 3), which are square to the other axis and each other, and what the diameter is more than ``diameter_mm``, whose
+    standard uncertainty is infinite for an unknown one.
     """
 
     kind: ClassVar[str] = "stripe on the pipe"
@@ -164,131 +133,90 @@ class Cylinder(Surface):
         radial = away - axis[:, None] * along
         distance = np.linalg.norm(radial, axis=0)
         outward = radial / distance
-        by_local = np.column_stack(
-            [-(self.across @ outward).T, -(along * (by_slopes @ outward)).T, np.full(len(distance), -0.5)]
-        )
+        by_slopes = -(along * (by_slopes @ outward)).T
+        by_local = np.column_stack([-(self.across @ outward).T, by_slopes, np.full(len(distance), -0.5)])
         return Distances(distance - 0.5 * (self.diameter_mm + local[4]), outward, by_local)
 
 
 SCANNED = (Spheres.kind, Plane.kind, Cylinder.kind)
 """What residuals on such surfaces are called."""
-
-
-def leaning(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A unit vector (3,) that leans from a direction by slopes (2,) towards two others (2, 3); its derivatives (2, 3).
-
-    Unit vectors across the direction and each other are expected.
-    """
-    raw = direction + slopes @ across
-    length = np.linalg.norm(raw)
-    unit = raw / length
-    return unit, (across - np.outer(across @ unit, unit)) / length
-
-
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
 """How far the stage's direction leans from the one described, towards two directions across it."""
 # Where the ray's crossing with the sheet moves almost along the surface, a residual in px would be out of all bounds.
 _LEAST_SHARE = 0.4
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceScanEvidence:
-    """Stripe pixels on something that stands still while the stage moves the sensor.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SurfaceScanEvidence(StripeEvidence):
+    """Stripe pixels on a surface that stands still while the stage moves the sensor.
 
     The local parameters are those of the surface, camera frame at the stage position 0, and an error of each of the F
-    stage positions.
+    stage positions ``stage_mm``.
 
     Attributes
     ----------
-    pixels : (N, 2)
-    beside_mm : (3, N); from the sheet's middle to where their light comes from, camera frame; see
-        `uwlts.optics.brightness`
-    surface : on which they lie
+    beside_mm : (3, N); from the sheet's middle to where their light comes from, camera frame: `uwlts.optics.brightness`
     frame : (N,) int; in which image each lies, from 0
-    stage_mm : (F,); positions of the stage
     direction, across_stage : (3,), (2, 3); in which growing positions move the sensor as described, and two directions
         across, orthonormal, camera frame
-    across : {0, 1}; the coordinate of the pixel that runs across the stripe
     image : number of the scan's first image among all of scans
-    source : name of the capture
-    predicted : (N, 2), optional; pixels near those predicted, where rays are taken; as found unless given
     """
 
-    view: View
-    pixels: np.ndarray
     beside_mm: np.ndarray
     surface: Surface
     frame: np.ndarray
     stage_mm: np.ndarray
     direction: np.ndarray
     across_stage: np.ndarray
-    across: int
     image: int
-    source: str
-    predicted: np.ndarray | None = None
 
-    def sources(self) -> dict[int, str]:
-        """Where each image comes from."""
-        return {self.image + n: f"{self.source}, at {position:g} mm" for n, position in enumerate(self.stage_mm)}
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
+        positions = np.full(len(self.stage_mm), uncertainty.stage_position_mm)
+        return np.concatenate([self.surface.local_std(), positions])
 
-    def local_std(self, *, alignment: float, position_mm: float) -> np.ndarray:
-        """Standard uncertainty (k + F,) of the local parameters before; infinite where nothing is known."""
-        return np.concatenate([self.surface.local_std(), np.full(len(self.stage_mm), position_mm)])
+    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
+        off, by_local = super().known_before(local, uncertainty)
+        lengths, by_surface = self.surface.known_lengths(local[: -len(self.stage_mm)])
+        by_lengths = np.pad(by_surface, ((0, 0), (0, len(self.stage_mm))))
+        return np.concatenate([off, lengths]), np.vstack([by_local, by_lengths])
+
+    def lit(self, image: int) -> np.ndarray:
+        return self.frame == image - self.image
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        """Those of each image; None where a ray misses the sheet."""
-        at_px = self.pixels if self.predicted is None else self.predicted
-        points = parameters.on_sheet(global_values, self.view, at_px)
+        points = self.on_sheet(parameters, global_values)
         if points is None:
             return None
         count = len(local) - len(self.stage_mm)
-        direction, by_slopes = self._direction(parameters, global_values)
+        direction, by_slopes = self.moved_direction(parameters, global_values)
         nominal = self.stage_mm[self.frame]
         travel = nominal * (1.0 + parameters.value(global_values, StageParameter.SCALE)) + local[count:][self.frame]
         off = self.surface.distances(points.points + self.beside_mm + direction[:, None] * travel, local[:count])
-        by_rays = np.einsum("in,cin->cn", off.outward, points.by_rays)
-        by_global = parameters.by_global(by_rays, self.view, np.einsum("in,cin->cn", off.outward, points.by_sheet))
         by_position = direction @ off.outward
-        parameters.add(by_global, StageParameter.SCALE, by_position * nominal)
-        for key, by in zip(SLOPES, by_slopes, strict=True):
-            parameters.add(by_global, key, (by @ off.outward) * travel)
-        column = COLUMNS.index("uv"[self.across])
-        least = _LEAST_SHARE * np.linalg.norm(points.by_rays[column], axis=0)
-        per_px = np.copysign(np.maximum(np.abs(by_rays[column]), least), by_rays[column])
-        values = (self.pixels - at_px)[:, self.across] * (by_rays[column] / per_px) + off.values_mm / per_px
-        by_local = np.column_stack([off.by_local, by_position])
-        found = []
+        by_global = {key: (by @ off.outward) * travel for key, by in zip(SLOPES, by_slopes, strict=True)}
+        off = replace(
+            off,
+            by_local=np.column_stack([off.by_local, by_position]),
+            by_global=by_global | {StageParameter.SCALE: by_position * nominal},
+        )
+        kind, surface_columns, found = self.surface.kind, np.arange(count), []
+        of_all = self.stripe_residuals(
+            parameters,
+            points,
+            off,
+            kind=kind,
+            local_columns=surface_columns,
+            image=self.image,
+            least_share=_LEAST_SHARE,
+        )
         for number in np.unique(self.frame):
-            here = self.frame == number
-            found.append(
-                Residuals(
-                    kind=self.surface.kind,
-                    values=values[here],
-                    by_global=by_global[here] / per_px[here, None],
-                    by_local=by_local[here] / per_px[here, None],
-                    local_columns=np.append(np.arange(count), count + number),
-                    image=self.image + int(number),
-                )
-            )
+            here, columns = self.frame == number, np.append(surface_columns, count + number)
+            rows = of_all.values[here], of_all.by_global[here], of_all.by_local[here]
+            found.append(Residuals(kind, *rows, columns, self.image + int(number)))
         return found
 
-    def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What calibrated lengths are off (c,), in standard uncertainties, and derivatives (c, k) by the surface's."""
-        return self.surface.known_lengths(local[: len(local) - len(self.stage_mm)])
-
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> "SurfaceScanEvidence":
-        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
-        predicted = self.pixels.copy()
-        for part, kept in zip(residuals, used, strict=True):
-            predicted[self.frame == part.image - self.image, self.across] -= np.where(kept, part.values, 0.0)
-        return replace(self, predicted=predicted)
-
-    def moved_direction(self, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
-        """The stage's direction (3,), camera frame."""
-        return self._direction(parameters, global_values)[0]
-
-    def _direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The stage's direction (3,) and its derivatives (2, 3) by the slopes."""
+    def moved_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The stage's direction (3,), camera frame, and its derivatives (2, 3) by the slopes."""
         slopes = np.array([parameters.value(global_values, key) for key in SLOPES])
         return leaning(self.direction, self.across_stage, slopes)
 

@@ -1,27 +1,159 @@
-"""A joint estimate read back from its calibration: parameters, values and covariance, also for another medium."""
+"""The joint estimate in a calibration: written with a summary of its evidence, and read back, also for other media."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import JsonValue
+from scipy.spatial import ConvexHull, QhullError
 
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
-from uwlts.calibration.joint.derivatives import WINDOW, DescribedSheet
-from uwlts.calibration.joint.parameters import Parameters, Prior, View
-from uwlts.model.calibration import Calibration
+from uwlts.calibration.joint.derivatives import DescribedSheet
+from uwlts.calibration.joint.estimate import Estimate, Evidence
+from uwlts.calibration.joint.evidence import TARGET
+from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.parameters import Parameters, Prior, View, window_values
+from uwlts.calibration.sheet import object_frame
+from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.errors import CalibrationError
-from uwlts.model.joint_estimate import JointEstimate
-from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey, SheetParameter, parameter_of
+from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
+from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
+
+
+def calibration_of(
+    result: Estimate,
+    evidence: Sequence[Evidence],
+    sensor: Sensor,
+    media: Sequence[Medium],
+    provenance: dict[str, JsonValue],
+) -> Calibration:
+    """The calibration of a joint estimate, by the evidence it was made from, in media other than air."""
+    parameters, values = result.parameters, result.values
+    sheet = parameters.sheet_model(values)
+    frame = object_frame(sheet, laser_axis=parameters.sheet.axis)
+    indices = [parameters.medium_index(values, View(True, number)) for number in range(len(media))]
+    return Calibration(
+        sensor_name=sensor.name,
+        stripe_along=sensor.camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
+        medium_kind=media[0].kind if parameters.window is None and media else "air",
+        camera=parameters.camera(values),
+        window=parameters.window_model(values),
+        sheet=sheet,
+        camera_from_object=tuple(map(tuple, frame.tolist())),
+        media=tuple(KnownMedium(medium=m, index=index) for m, index in zip(media, indices, strict=True)),
+        residuals=_lens_and_window(result),
+        joint=_joint_estimate(result, evidence, frame),
+        provenance=provenance,
+    )
+
+
+def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame: np.ndarray) -> JointEstimate:
+    """The estimate with the fit of each image and the covered regions in the OCS, at ``T_camera_object`` (4, 4)."""
+    images = []
+    lit: dict[View, list[np.ndarray]] = {}
+    for piece, parts in zip(evidence, result.residuals, strict=True):
+        for part in parts:
+            left_out = outliers(part, result.noise[part.kind])
+            used = part.values[~left_out]
+            images.append(
+                ImageFit(
+                    source=piece.sources[part.image],
+                    kind=part.kind,
+                    rms_px=float(np.sqrt(np.mean(used**2))) if len(used) else None,
+                    residual_count=len(part.values),
+                    outlier_count=int(left_out.sum()),
+                )
+            )
+            if part.kind != TARGET:
+                lit.setdefault(piece.view, []).append(piece.pixels[piece.lit(part.image)][~left_out])
+    return JointEstimate(
+        parameters=result.parameters.keys,
+        values=tuple(result.values.tolist()),
+        std=tuple(result.std().values()),
+        std_before=tuple(float(std) if np.isfinite(std) else None for std in result.parameters.prior_std()),
+        covariance=tuple(map(tuple, result.covariance.tolist())),
+        nominal_sheet=result.parameters.sheet.nominal(),
+        scatter_px={kind: noise.sigma_px for kind, noise in result.noise.items()},
+        shared_variance={kind: noise.together for kind, noise in result.noise.items()},
+        residual_count=sum(len(r.values) for parts in result.residuals for r in parts),
+        outlier_count=result.outliers,
+        rounds=result.rounds,
+        stopped=result.stopped,
+        images=tuple(images),
+        covered=tuple(_covered(result, view, np.vstack(pixels), object_frame) for view, pixels in lit.items()),
+    )
+
+
+def _lens_and_window(result: Estimate) -> dict[str, JsonValue]:
+    """Standard uncertainties of lens and window, by the names that sequential calibrations give them in files."""
+    std = result.std()
+    camera: dict[str, JsonValue] = {"std": {key.text: std[key] for key in std if isinstance(key, LensParameter)}}
+    if TARGET in result.noise:
+        camera["sigma_px"] = result.noise[TARGET].sigma_px
+    figures: dict[str, JsonValue] = {"camera": camera}
+    if WindowParameter.DISTANCE in std:
+        figures["window"] = {"std_mm": std[WindowParameter.DISTANCE]}
+    return figures
+
+
+def _covered(result: Estimate, view: View, pixels: np.ndarray, object_frame: np.ndarray) -> CoveredRegion:
+    seen = result.parameters.on_sheet(result.values, view, pixels)
+    if seen is None:
+        raise CalibrationError("a stripe that was used meets no sheet by the joint estimate")
+    at = (object_frame[:3, 1:3].T @ (seen.points - object_frame[:3, 3:4])).T
+    return CoveredRegion(
+        medium=view.medium,
+        name="air" if view.medium is None else result.parameters.media[view.medium],
+        window=view.window,
+        point_count=len(at),
+        camera_depth_mm=(float(seen.points[2].min()), float(seen.points[2].max())),
+        outline_mm=tuple(map(tuple, np.round(outline(at), 3).tolist())),
+    )
+
+
+def outline(at: np.ndarray) -> np.ndarray:
+    """Corners (K, 2) of the convex hull; of points on a line its ends."""
+    try:
+        return at[ConvexHull(at).vertices]
+    except QhullError:
+        along = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][0]
+        order = (at - at.mean(axis=0)) @ along
+        return at[[int(np.argmin(order)), int(np.argmax(order))]]
 
 
 @dataclass(frozen=True, eq=False)
 class StoredEstimate:
     """Parameters, their values (P,), their covariance (P, P), and through what a scan was seen."""
 
+    calibration: Calibration
     parameters: Parameters
     values: np.ndarray
     covariance: np.ndarray
     view: View
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where there is none."""
+        return self.parameters.project(self.values, self.view, points)
+
+    def across(self) -> int:
+        """The coordinate of the pixel that runs across the stripe."""
+        return 1 if self.calibration.stripe_along == "width" else 0
+
+
+def with_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
+    """The covariance (P, P) with k more quantities of these standard uncertainties, independent of all others."""
+    return np.pad(covariance, (0, len(std))) + np.diag([*[0.0] * len(covariance), *np.square(std)])
+
+
+def covariance_root(covariance: np.ndarray) -> np.ndarray:
+    """A matrix (P, R) whose product with its transpose is the covariance (P, P), by the correlations."""
+    scale = np.sqrt(np.diag(covariance))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > 0
+    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
 
 
 def require_joint(calibration: Calibration) -> JointEstimate:
@@ -62,44 +194,31 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         raise _damaged(f"it has {len(media)} indices of media, the calibration {len(calibration.media)} media")
     # As `Calibration.index_of`: the last of equal ones.
     known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
-    window = mounted and calibration.window is not None
-    view = View(window, None if medium.kind == "air" else known)
+    seen_in = None if medium.kind == "air" else known
     if known is not None:
         place = keys.index(MediumIndex(media[known]))
         drift = medium.index_per_kelvin(calibration.wavelength_nm) * uncertainty.drift_k
         covariance[place, place] += drift**2
     elif medium.kind != "air":
+        seen_in = len(media)
         media.append("the scan")
         keys.append(MediumIndex(media[-1]))
-        index = calibration.index_of(medium)
-        std = medium.index_uncertainty(calibration.wavelength_nm, uncertainty)
-        values = np.append(values, index)
-        covariance = np.block(
-            [[covariance, np.zeros((len(covariance), 1))], [np.zeros((1, len(covariance))), np.array([[std**2]])]]
-        )
-        view = View(window, len(media) - 1)
+        values = np.append(values, calibration.index_of(medium))
+        covariance = with_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
         raise _damaged("its parameters do not fit together")
+    # Parameters that were held and not estimated are what the calibration's models say of window and sheet.
+    held = {} if calibration.window is None else window_values(calibration.window)
+    if (fan := calibration.sheet.fan) is not None:
+        held |= {SheetParameter.BOW: fan.bow_rad, SheetParameter.WINDOW_TURN: fan.window_turn_rad}
     priors = {key: Prior(value, np.inf) for key, value in zip(keys[lens:], values[lens:], strict=True)}
-    priors |= {key: Prior(value, 0.0) for key, value in _held(calibration).items() if key not in priors}
+    priors |= {key: Prior(value, 0.0) for key, value in held.items() if key not in priors}
     sheet = DescribedSheet.of(joint.nominal_sheet)
-    return StoredEstimate(
-        Parameters(intrinsics, sheet, calibration.window, tuple(media), priors), values, covariance, view
-    )
+    parameters = Parameters(intrinsics, sheet, calibration.window, tuple(media), priors)
+    view = View(mounted and calibration.window is not None, seen_in)
+    return StoredEstimate(calibration, parameters, values, covariance, view)
 
 
 def _damaged(reason: str) -> CalibrationError:
     return CalibrationError(f"the calibration's joint estimate is damaged: {reason}")
-
-
-def _held(calibration: Calibration) -> dict[ParameterKey, float]:
-    """What the calibration's models say of window and sheet, for parameters that were held and not estimated."""
-    held: dict[ParameterKey, float] = {}
-    if (window := calibration.window) is not None:
-        normal = np.array(window.normal) / window.normal[2]
-        values = (window.distance_mm, float(normal[0]), float(normal[1]), window.thickness_mm, window.glass_index)
-        held |= dict(zip(WINDOW, values, strict=True))
-    if (fan := calibration.sheet.fan) is not None:
-        held |= {SheetParameter.BOW: fan.bow_rad, SheetParameter.WINDOW_TURN: fan.window_turn_rad}
-    return held

@@ -14,7 +14,7 @@ from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.evidence import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.parameters import Parameters, View
-from uwlts.calibration.joint.procedure import JointProblem, centred
+from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.target_images import pose_values
 from uwlts.model.calibration import WindowModel
@@ -149,10 +149,7 @@ def _by_depth(problem: JointProblem) -> dict[View, list[tuple[float, Image]]]:
     found: dict[View, list[tuple[float, Image]]] = {}
     for number, piece in enumerate(problem.evidence):
         if isinstance(piece, TargetEvidence):
-            places = {
-                int(image): piece.stripe_pixels[piece.stripe_image == image, piece.across]
-                for image in np.unique(piece.stripe_image)
-            }
+            places = {int(image): piece.pixels[piece.image == image, piece.across] for image in np.unique(piece.image)}
         elif isinstance(piece, StepProfileEvidence):
             places = {piece.image: piece.pixels[:, piece.across]}
         else:
@@ -187,7 +184,7 @@ def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence
     here = np.isin(placement.image, wanted)
     kept = {name: getattr(placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
     some = replace(evidence, placement=replace(placement, **kept))
-    return some.with_stripes(np.isin(evidence.stripe_image, wanted))
+    return some.with_stripes(np.isin(evidence.image, wanted))
 
 
 _ROUNDS, _SETTLED_PX = 20, 1e-4  # steps of the pose, far below the noise of a centre
@@ -302,8 +299,8 @@ def _residuals(
 
 def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray) -> list[Residuals]:
     parameters, values = estimate.parameters, estimate.values
-    if problem.diameter_mm is not None:
-        evidence = centred(parameters, problem.diameter_mm, [evidence], values, [local])[0]
+    if problem.diameter_mm is not None and isinstance(evidence, TargetEvidence):
+        evidence = evidence.with_centres(parameters, values, local, problem.diameter_mm)
     parts = evidence.residuals(parameters, values, local)
     if parts is None:
         raise CalibrationError("by this model a ray that was seen meets no sheet or target")

@@ -7,7 +7,6 @@ import pytest
 
 from tests.uwlts.calibration_views import WATER, built_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
-from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.initial import series_start
@@ -106,7 +105,7 @@ def at_truth(view):
     sheet = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + 36.0 * pose.axis)
     series = target_series(BUILT, medium=view.medium, window=view.window, positions=IN_WATER[:4])
     window = nominal.window
-    start = series_start([series], BUILT, window, [WATER], options=CameraOptions(), free=False, margin_mm=None)
+    start = series_start([series], BUILT, window, [WATER], options=OPTIONS)
     normal = np.array(window.normal) / window.normal[2]
     known = {
         "window_distance": window.distance_mm,
@@ -142,13 +141,7 @@ def test_every_derivative_is_what_differences_say(view, kind):
     if kind is TargetEvidence:
         evidence, local = start.evidence[0], start.local[0].copy()
         local[6:] = rng.normal(0, 1e-3, len(local) - 6)
-        keep = np.arange(0, len(evidence.stripe_pixels), 40)
-        evidence = replace(
-            evidence,
-            stripe_pixels=evidence.stripe_pixels[keep],
-            stripe_image=evidence.stripe_image[keep],
-            stripe_shifts_mm=evidence.stripe_shifts_mm[keep],
-        )
+        evidence = evidence.with_stripes(slice(None, None, 40))
     else:
         frame = camera_from_object(BUILT)
         pixels = np.column_stack([np.linspace(200, 1000, 30), np.linspace(450, 550, 30)])
@@ -174,13 +167,13 @@ def test_every_derivative_is_what_differences_say(view, kind):
 def _without_residuals(evidence, parts):
     if isinstance(evidence, StepProfileEvidence):
         return replace(evidence, pixels=evidence.pixels - np.outer(parts[0].values, (0, 1)))
-    pixels, stripe = evidence.placement.pixels.copy(), evidence.stripe_pixels.copy()
+    pixels, stripe = evidence.placement.pixels.copy(), evidence.pixels.copy()
     for part in parts:
         if part.kind == TARGET:
             pixels[evidence.placement.image == part.image] -= part.values.reshape(-1, 2)
         else:
-            stripe[evidence.stripe_image == part.image, 1] -= part.values
-    return replace(evidence, placement=replace(evidence.placement, pixels=pixels), stripe_pixels=stripe)
+            stripe[evidence.image == part.image, 1] -= part.values
+    return replace(evidence, placement=replace(evidence.placement, pixels=pixels), pixels=stripe)
 
 
 @pytest.fixture(scope="module")

@@ -67,7 +67,7 @@ def lengths(by_parameters):
 def of_calibration(calibration):
     region = regions(calibration)[0]
     known = estimate_in(calibration, region)
-    over = lengths_over(calibration, known, region)
+    over = lengths_over(known, region)
     return known, over, weaknesses(over, known.parameters.keys, known.covariance)
 
 
@@ -158,7 +158,7 @@ def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
     frame[:3, :3] = frame[:3, :3] @ turn
     moved = from_water.model_copy(update={"camera_from_object": tuple(map(tuple, frame.tolist()))})
     region = replace(regions(from_water)[0], outline_mm=outline)
-    there = lengths_over(moved, known, region).std_mm(known.covariance)
+    there = lengths_over(replace(known, calibration=moved), region).std_mm(known.covariance)
     # Meshes of a turned outline differ; the largest length runs between the same corners but for the inset of 2 %.
     assert there.max() == pytest.approx(over.std_mm(known.covariance).max(), rel=0.06)
 

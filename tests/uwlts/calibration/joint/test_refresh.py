@@ -231,7 +231,7 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     known = estimate_in(calibration, region)
     assert known.parameters.medium_index(known.values, known.view) == calibration.media[1].index
     assert stored_estimate(calibration, thesis, WARM).view == View(True, 1)
-    std = lengths_over(calibration, known, region).std_mm(known.covariance)
+    std = lengths_over(known, region).std_mm(known.covariance)
     assert std.max() == pytest.approx(result.changes[0].length.after_mm, rel=0.1)
     assert certificate_of(calibration, path, issued="2026-01-01").validity[0].name == "water 2"
     again = refreshed(calibration, steps(thesis, seed=2), index_std=POORLY_KNOWN)

@@ -12,7 +12,8 @@ from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.evidence import STEP, Residuals
-from uwlts.calibration.joint.initial_scans import scan_stripes, surface_scan, surface_scans
+from uwlts.calibration.joint.gathering import scan_stripes
+from uwlts.calibration.joint.initial import surface_scan, surface_scans
 from uwlts.calibration.joint.parameters import Parameters, Prior
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
@@ -121,15 +122,15 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
 
 def test_known_lengths_are_off_by_their_standard_uncertainties():
     evidence, local = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
-    local = true_own("spheres", evidence)
-    assert evidence.known_lengths(local)[0] == pytest.approx([0.0], abs=1e-9)
+    local, lengths = true_own("spheres", evidence)[: -len(STAGE)], evidence.surface.known_lengths
+    assert lengths(local)[0] == pytest.approx([0.0], abs=1e-9)
     local[3:6] += 0.03 * (local[3:6] - local[:3]) / SPACING
-    off, by_local = evidence.known_lengths(local)
+    off, by_local = lengths(local)
     assert off == pytest.approx([3.0])
     for place, column in enumerate(by_local.T):
         moved = local.copy()
         moved[place] += 1e-4
-        assert evidence.known_lengths(moved)[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
+        assert lengths(moved)[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
 
 
 class _Held:
@@ -138,8 +139,8 @@ class _Held:
     def __init__(self, lens):
         self._lens = lens
 
-    def local_std(self, *, alignment, position_mm):
-        return np.empty(0)
+    def known_before(self, local, uncertainty):
+        return np.empty(0), np.empty((0, 0))
 
     def residuals(self, parameters, global_values, local):
         count = len(self._lens)
