@@ -333,7 +333,7 @@ class StepProfileEvidence(StripeEvidence):
 
     The faces are planes square to ``upward + slope * along``; the lower one lies at a distance of the local parameters
     (slope, distance in mm), the upper one higher by the standard's height, which is the global parameter ``height``.
-    ``upward``, from the lower face to the upper one, and ``along`` the stripe are unit vectors (3,) of the camera frame;
+    ``upward``, from the lower face to the upper one, and ``along`` the stripe are unit vectors (3,), camera frame;
     ``upper`` (N,) marks the pixels on the upper face. ``image`` is the number of the image among all of steps.
     """
 

@@ -94,7 +94,10 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
     for words, shot, pose in _candidates(known, region.name, depths, uncertainty):
         added = None if shot is None else _information(shot, uncertainty)
         if shot is not None and added is not None:
-            covariance = _with(shot[0].covariance, added)[:count, :count]
+            # By a root of the covariance, as its inverse may be out of reach of rounding.
+            root = covariance_root(shot[0].covariance)
+            covariance = root @ np.linalg.solve(np.eye(root.shape[1]) + root.T @ added @ root, root.T)
+            covariance = covariance[:count, :count]
             after_mm = _rms(lengths.std_mm(covariance))
             found.append(Outlook(words, before_mm, after_mm, covariance, shot[0].view, pose))
     return sorted(found, key=lambda outlook: outlook.after_mm)
@@ -315,12 +318,6 @@ def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
     scale = 1.0 / np.sqrt(np.diag(block))
     border, block = border * scale, block * np.outer(scale, scale)
     return total[:count, :count] - border @ np.linalg.solve(block, border.T)
-
-
-def _with(covariance: np.ndarray, added: np.ndarray) -> np.ndarray:
-    """The covariance with further information, by a root of it, as its inverse may be out of reach of rounding."""
-    root = covariance_root(covariance)
-    return root @ np.linalg.solve(np.eye(root.shape[1]) + root.T @ added @ root, root.T)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -230,7 +230,7 @@ def refresh(
     ------
     CalibrationError
         The calibration is not joint or has no window; a capture is of another sensor, in air, without the window, or
-        was calibrated from already; no image shows both treads; the images contradict what is known.
+        was calibrated from already; no image shows both faces; the images contradict what is known.
     DescriptionError
         A capture does not describe its step.
     RangeError
