@@ -372,7 +372,7 @@ def test_an_alarm_silence_and_a_firmware_that_cannot_switch_the_laser_are_missin
     with unmoved(options="") as controller:
         assert "without V" in devices.try_stage(controller.port)[0].found
     with unmoved() as controller:
-        controller.mute()
+        controller.inject("mute")
         (silent,) = devices.try_stage(controller.port)
     assert silent.status == "missing" and "nothing answers" in silent.found
     assert "docs/how-to/hardware-stage.md" in silent.advice
