@@ -453,17 +453,18 @@ def load_scene(
 ) -> Scene:
     """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
     path = find(name_or_path)
-    table = read_table(path)
+    table: dict[str, object] = dict(read_table(path))
     motion = motion.model_dump() if isinstance(motion, Motion) else motion
     given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
     table |= {key: value for key, value in given.items() if value is not None}
     objects = table.get("objects", [])
     if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
-    # Relative paths of meshes and textures start at the scene's folder.
-    files = [{key: thing[key] for key in ("path", "texture") if isinstance(thing.get(key), str)} for thing in objects]
-    table["objects"] = [
-        thing | {key: str(path.parent / name) for key, name in named.items()}
-        for thing, named in zip(objects, files, strict=True)
-    ]
+    table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
     return validated(Scene, table, path)
+
+
+def _with_paths_from(folder: Path, thing: Table) -> Table:
+    """An object's table with relative paths of mesh and texture starting at a folder."""
+    paths = {key: thing.get(key) for key in ("path", "texture")}
+    return thing | {key: str(folder / path) for key, path in paths.items() if isinstance(path, str)}
