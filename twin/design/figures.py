@@ -456,7 +456,7 @@ def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[
             fan > one(p.laser_window_aperture_mm)
         ),
         "camera and laser reach no point of the measuring volume": ~(figures.coverage > 0),
-        "the stripe saturates: at the given exposure it has {full:.1f} times the full well": fullest > 1,
+        "the stripe saturates: at the given exposure it has {fullest:.1f} times the full well": fullest > 1,
         "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser": (
             ~(flat < 0.5 * figures.standoff_mm)
         ),
