@@ -18,7 +18,7 @@ from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.errors import CalibrationError
 from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parameter_of
-from uwlts.model.sensor import Medium, Sensor, Uncertainty
+from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty
 
 
 def calibration_of(
@@ -86,13 +86,13 @@ def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame
     )
 
 
-def _lens_and_window(result: Estimate) -> dict[str, JsonValue]:
+def _lens_and_window(result: Estimate) -> dict[str, Table]:
     """Standard uncertainties of lens and window, by the names that sequential calibrations give them in files."""
     std = result.std()
-    camera: dict[str, JsonValue] = {"std": {key.text: std[key] for key in std if isinstance(key, LensParameter)}}
+    camera: Table = {"std": {key.text: std[key] for key in std if isinstance(key, LensParameter)}}
     if TARGET in result.noise:
         camera["sigma_px"] = result.noise[TARGET].sigma_px
-    figures: dict[str, JsonValue] = {"camera": camera}
+    figures: dict[str, Table] = {"camera": camera}
     if WindowParameter.DISTANCE in std:
         figures["window"] = {"std_mm": std[WindowParameter.DISTANCE]}
     return figures
