@@ -1,4 +1,4 @@
-"""The rules of who may import whom: import-linter's contracts hold and notice what they forbid."""
+"""The rules of the packages: who may import whom (import-linter's contracts), and one name for one class."""
 
 import ast
 import shutil
@@ -71,6 +71,17 @@ def test_no_module_is_imported_by_a_name_in_quotes():
                     if name in ("import_module", "__import__") and not _external(node):
                         found.add(str(path.relative_to(ROOT)))
     assert found <= allowed
+
+
+def test_no_two_public_classes_have_one_name():
+    places: dict[str, list[str]] = {}
+    for package in ("uwlts", "twin"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                    places.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert len(places) > 300
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
 
 
 def _external(call: ast.Call) -> bool:

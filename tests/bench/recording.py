@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.devices.gige_camera import GigeCamera
-from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.live_view import images_of
 from uwlts.hardware.replay import ReplayCamera
@@ -88,7 +88,7 @@ def _header(sensor: Sensor) -> CaptureHeader:
     )
 
 
-def _record(camera: Camera, sensor: Sensor, out: Path, count: int) -> Recorded:
+def _record(camera: CameraDevice, sensor: Sensor, out: Path, count: int) -> Recorded:
     with CaptureWriter(out, _header(sensor), dtype=np.uint8) as writer:
         camera.configure(frame_rate_hz=RATE_HZ)
         camera.start(faults="skip")

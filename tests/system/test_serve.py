@@ -17,7 +17,7 @@ from twin.devices.serve import NAMES, Fault, ServedTwin, Track, parse_fault, ser
 from twin.options import Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene, load_scene
-from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.errors import DescriptionError, DesignError, HardwareError, ImageError
@@ -47,18 +47,18 @@ def stage(served: ServedTwin) -> Iterator[GrblStage]:
 
 
 @pytest.fixture
-def camera(served: ServedTwin) -> Iterator[Camera]:
+def camera(served: ServedTwin) -> Iterator[CameraDevice]:
     with open_camera(served.camera.address) as opened:
         yield opened
 
 
-def start(camera: Camera, exposure_ms: float) -> None:
+def start(camera: CameraDevice, exposure_ms: float) -> None:
     camera.stop()
     camera.configure(exposure_ms=exposure_ms, trigger="software")
     camera.start()
 
 
-def grab(camera: Camera) -> np.ndarray:
+def grab(camera: CameraDevice) -> np.ndarray:
     camera.trigger()
     return camera.grab(WAIT_S).image
 

@@ -8,7 +8,7 @@ from tests.oracles.fermat import Face, directions_seen, plate, points_seen_on_pl
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lattice, lens_of, nine_steps, through_window, turn
 from uwlts.calibration.evidence import AirEvidence, StepEvidence
 from uwlts.calibration.joint.gathering import Gathered, Series
-from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -80,7 +80,7 @@ def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise
         pixels = pixels[inside(pixels, sensor)]
         stripes.append(pixels + np.column_stack([np.zeros(len(pixels)), noise.draw(noise.stripe_px, len(pixels))]))
     evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
-    return Series(View(window, medium), evidence, None if tilts is not None else True, ["target"])
+    return Series(ViewMedium(window, medium), evidence, None if tilts is not None else True, ["target"])
 
 
 def step_views(sensor: Sensor, *, noise=Noise()):
@@ -89,7 +89,7 @@ def step_views(sensor: Sensor, *, noise=Noise()):
     found = []
     for profile in nine_steps(count=400):
         pixels = through_window(sensor, profile, noise_px=noise.stripe_px, rng=noise.rng)
-        found.append((StepEvidence(pixels, standard, WATER, "step"), View(True, 0)))
+        found.append((StepEvidence(pixels, standard, WATER, "step"), ViewMedium(True, 0)))
     return found
 
 

@@ -7,11 +7,11 @@ import numpy as np
 from tests.uwlts.calibration_views import WATER, built_sensor, inside
 from tests.uwlts.joint_views import Noise, seen
 from uwlts.calibration.joint.gathering import ScanStripes
-from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
 
-VIEW = View(True, 0)
+VIEW = ViewMedium(True, 0)
 SLOPE = np.array([0.004, -0.003])
 """How far the stage really leans from the OCS's X, towards Y and Z."""
 NONE = Noise()

@@ -9,7 +9,7 @@ from tests.uwlts.calibration_views import STEP_MM, built_sensor, inside, lattice
 from tests.uwlts.joint_views import TARGET, gathered, lit_points, seen
 from uwlts.calibration.evidence import AirEvidence, StepEvidence
 from uwlts.calibration.joint.gathering import Gathered, Series
-from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.artefacts import SphereStandard, StepStandard
 from uwlts.model.placement import camera_from_object
@@ -155,7 +155,7 @@ def stripe_noise(real: Reality, pixels: np.ndarray) -> np.ndarray:
 
 
 def target_series(
-    real: Reality, *, view: View, index: float, positions: np.ndarray, spacings: int, rays: int
+    real: Reality, *, view: ViewMedium, index: float, positions: np.ndarray, spacings: int, rays: int
 ) -> Series:
     """The bent target on the stage with the stripe on it; every so many circles of it, for speed."""
     sensor = real.sensor
@@ -192,7 +192,7 @@ def target_series(
     return Series(view, evidence, True, ["target"])
 
 
-def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -> list[tuple[StepEvidence, View]]:
+def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -> list[tuple[StepEvidence, ViewMedium]]:
     """The stripe over a block on a plate, one image at each depth of the OCS."""
     frame, fan = camera_from_object(real.sensor), FanRays.of(real, index, rays)
     found = []
@@ -209,7 +209,9 @@ def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -
         lit = lit[on_top | ((along > 34.0) & (along < 75.0))]
         pixels = seen(real.sensor, lit, index=index, window=True)
         pixels = stripe_noise(real, pixels[inside(pixels, real.sensor)])
-        found.append((StepEvidence(pixels, StepStandard(kind="step", height_mm=STEP_MM), index, "step"), View(True, 0)))
+        found.append(
+            (StepEvidence(pixels, StepStandard(kind="step", height_mm=STEP_MM), index, "step"), ViewMedium(True, 0))
+        )
     return found
 
 
@@ -221,9 +223,13 @@ def evidence(
     index = real.index(water) if wet else 1.0
     size = {"spacings": spacings, "rays": rays}
     series = [
-        target_series(real, view=View(False, None), index=1.0, positions=np.linspace(-180, 60, images), **size),
+        target_series(real, view=ViewMedium(False, None), index=1.0, positions=np.linspace(-180, 60, images), **size),
         target_series(
-            real, view=View(True, 0 if wet else None), index=index, positions=np.linspace(-120, 60, images), **size
+            real,
+            view=ViewMedium(True, 0 if wet else None),
+            index=index,
+            positions=np.linspace(-120, 60, images),
+            **size,
         ),
     ]
     steps = step_images(real, index=index, depths=np.array([-45.0, 5.0, 75.0]), rays=rays) if wet else []

@@ -16,7 +16,7 @@ from twin.design.description import Study
 from twin.design.designs import Columns, Design, Marked, built, described, judged, row_of, sensor_of
 from twin.design.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
 from twin.design.geometry import Array, standoff_mm
-from twin.design.parameters import Parameters, followed, numbers_of
+from twin.design.parameters import SensorArrays, followed, numbers_of
 from twin.options import use_variant
 from uwlts.model.errors import DesignError, Error, EvaluationError, RangeError
 
@@ -208,7 +208,7 @@ _STEPS, _TOLERANCE = 40, 1e-7
 _HALVINGS = 12
 
 Mean = Callable[..., Array]
-Smooth = Callable[[ModuleType, Parameters, Field, Mean], Array]
+Smooth = Callable[[ModuleType, SensorArrays, Field, Mean], Array]
 
 
 def _rms(name: str, depth: int | None = None) -> Smooth:
@@ -221,7 +221,7 @@ def _largest(xp: ModuleType, values: Array) -> Array:
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
 
 
-def _coverage(xp: ModuleType, p: Parameters, f: Field, mean: Mean) -> Array:
+def _coverage(xp: ModuleType, p: SensorArrays, f: Field, mean: Mean) -> Array:
     near, far = depths_in_view(xp, p)
     return (far - near) / (p.far_mm - p.near_mm)
 

@@ -214,8 +214,9 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
         beside = path.parent / str(table.get("sensor", ""))
         if beside.suffix == ".toml" and beside.is_file():
             table["sensor"] = str(beside)
-    if designs is not None and isinstance(table.get("sampling", {}), dict):
-        table["sampling"] = table.get("sampling", {}) | {"designs": designs}
+    sampling = table.get("sampling", {})
+    if designs is not None and isinstance(sampling, dict):
+        table["sampling"] = sampling | {"designs": designs}
     if verify is not None:
         table["verify"] = verify
     found = validated(Study, table, path)

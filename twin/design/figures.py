@@ -13,10 +13,10 @@ import numpy as np
 
 from twin.design.geometry import (
     Array,
-    FlatWindow,
-    Pose,
-    Seen,
+    ImagePoints,
+    LaserFan,
     Vector,
+    WindowGeometry,
     across_mm,
     added,
     direction_outside,
@@ -30,7 +30,7 @@ from twin.design.geometry import (
     snell_root,
     standoff_mm,
 )
-from twin.design.parameters import Follow, Parameters, followed
+from twin.design.parameters import Follow, SensorArrays, followed
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.model.errors import RangeError
 
@@ -54,7 +54,7 @@ _DIFFRACTION = 0.42
 
 
 @dataclass(frozen=True)
-class Stripe:
+class StripeModel:
     """The stripe on a diffuse plate square to the laser's axis.
 
     ``sigma_px`` is the image's standard deviation across, ``blur_px`` the lens's part of it; ``rate_e_per_ms`` is the
@@ -68,8 +68,15 @@ class Stripe:
 
 
 def stripe_at(
-    xp: ModuleType, p: Parameters, pose: Pose, window: FlatWindow, point: Vector, view: Seen, *, reflectance: float
-) -> Stripe:
+    xp: ModuleType,
+    p: SensorArrays,
+    pose: LaserFan,
+    window: WindowGeometry,
+    point: Vector,
+    view: ImagePoints,
+    *,
+    reflectance: float,
+) -> StripeModel:
     """The stripe at points of the sheet.
 
     Across the sheet the light is a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
@@ -116,10 +123,10 @@ def stripe_at(
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
     ambient = p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons
     ambient = ambient * xp.exp(-p.extinction_per_mm * back)
-    return Stripe(sigma, blur, rate, ambient)
+    return StripeModel(sigma, blur, rate, ambient)
 
 
-def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: Array) -> Array:
+def centre_noise_px(xp: ModuleType, p: SensorArrays, stripe: StripeModel, exposure_ms: Array) -> Array:
     """Standard uncertainty of the stripe's centre in px, found by a fit that weighs pixels by their noise.
 
     With the mean signal m = A exp(-x^2 / 2 s^2), its derivative m' and weights m' / W the fit's variance is
@@ -144,7 +151,7 @@ def centre_noise_px(xp: ModuleType, p: Parameters, stripe: Stripe, exposure_ms: 
     return xp.sqrt(stripe.sigma_px * noise / (2 * width * information * information + 1e-30))
 
 
-def exposure_ms(xp: ModuleType, p: Parameters, brightest_e_per_ms: Array) -> tuple[Array, Array]:
+def exposure_ms(xp: ModuleType, p: SensorArrays, brightest_e_per_ms: Array) -> tuple[Array, Array]:
     """Exposure that brings the brightest light to the wanted level, and the exposure that the sensor then uses."""
     level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * p.pixel_contrast(xp))
     required = level / brightest_e_per_ms
@@ -154,7 +161,7 @@ def exposure_ms(xp: ModuleType, p: Parameters, brightest_e_per_ms: Array) -> tup
     return required, automatic if math.isnan(p.exposure_ms) else p.exposure_ms
 
 
-def _lit(xp: ModuleType, p: Parameters, angle: Array) -> Array:
+def _lit(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
     """Power per angle over the mean one; 0 outside the fan where that is not needed smooth."""
     gauss = xp.exp(-2 * (angle / p.fan_half_rad) ** 2) * 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
     lit = p.gaussian_fan * gauss + (1 - p.gaussian_fan) * (1 - p.tabulated_fan)
@@ -200,7 +207,7 @@ class Field:
     required_ms: Array
 
 
-def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
+def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
     """Where the part of the measuring volume begins and ends that the camera sees, in the middle of the line.
 
     Depths from the window's outer face. Where the sheet leaves the image follows from Newton's method in the inverse of
@@ -224,7 +231,7 @@ def depths_in_view(xp: ModuleType, p: Parameters) -> tuple[Array, Array]:
     return xp.maximum(p.near_mm, near), xp.minimum(p.far_mm, far)
 
 
-def field_of(xp: ModuleType, p: Parameters, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
+def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
     """Designs' sheets at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
 
     A stripe's centre that is off by d px on its profile line is a point of the sheet that is off by (dY, dZ) =
@@ -345,7 +352,7 @@ FIGURES: dict[str, tuple[str, str]] = {
 """Words and unit of every figure of merit, by its name."""
 
 
-def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
+def scatter_at(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
     """Root mean square of sigma Z (K,) along the stripe of one design, where Z is ``z_mm`` (K,), from the stand-off on.
     The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view."""
     with np.errstate(all="ignore"):
@@ -359,7 +366,7 @@ def scatter_at(p: Parameters, z_mm: np.ndarray, half_line_mm: np.ndarray, *, ref
 
 
 def figures_of(
-    p: Parameters, *, reflectance: float, water_depth_m: float, follow: Sequence[Follow] = ()
+    p: SensorArrays, *, reflectance: float, water_depth_m: float, follow: Sequence[Follow] = ()
 ) -> tuple[Figures, list[str]]:
     """Figures of N designs, and why each of those fails that cannot work ("" for the others, whose figures hold)."""
     if not 0 < reflectance <= 1:
@@ -382,7 +389,7 @@ def _each(values: Array, designs: int) -> np.ndarray:
     return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (designs,)).copy()
 
 
-def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
+def _reduced(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
     """Figures of N designs from their fields (N, DEPTHS, PLACES) and the share of the volume's depth in view."""
     n, middle, inside = len(f["z_mm"]), DEPTHS // 2, f["lit"] > 0
     one = partial(_each, designs=n)
@@ -424,7 +431,7 @@ def _reduced(p: Parameters, f: dict[str, np.ndarray], share: np.ndarray, *, wate
     )
 
 
-def _reasons(p: Parameters, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
+def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
     """The first reason why each of N designs cannot work, "" for those that can."""
     n = len(figures.coverage)
     one = partial(_each, designs=n)
@@ -476,7 +483,7 @@ _GRAVITY, _WATER_KG_PER_M3 = 9.81, 1030.0
 _SILICA_STRENGTH_MPA, _CLAMPED, _SAFETY = 60.0, 0.75, 4.0
 
 
-def laser_class(p: Parameters) -> np.ndarray:
+def laser_class(p: SensorArrays) -> np.ndarray:
     """Class after IEC 60825-1:2014 as a number, see `CLASS_NAMES`: an estimate for a design, not a classification.
 
     Limits for continuous visible light from a point source (Tables 3 to 8): class 1 up to 0.39 mW above 500 nm,
@@ -495,7 +502,7 @@ def laser_class(p: Parameters) -> np.ndarray:
     return np.sum([power > limit for limit in limits], axis=0) + 1
 
 
-def window_needed_mm(p: Parameters, *, water_depth_m: float) -> np.ndarray:
+def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
     """Thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S) (Harris 1999, thesis Eq. 3.2)."""
     pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
     opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)

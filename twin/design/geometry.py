@@ -43,7 +43,7 @@ def added(a: Vector, b: Vector) -> Vector:
 
 
 @dataclass(frozen=True)
-class Pose:
+class LaserFan:
     """The laser's fan: its origin, and unit vectors along its axis, along the stripe and across the sheet."""
 
     origin: Vector
@@ -52,8 +52,8 @@ class Pose:
     normal: Vector
 
 
-def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> Pose:
-    """Pose of a laser placed by baseline and triangulation angle; ``towards`` is the baseline's direction, (x, y, 0).
+def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
+    """Fan of a laser placed by baseline and triangulation angle; ``towards`` is the baseline's direction, (x, y, 0).
     As `uwlts.model.placement.laser_pose`, in a form that can be derived."""
     sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
     axis = (-sine * towards[0], -sine * towards[1], cosine)
@@ -62,16 +62,16 @@ def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: A
     turn, keep = xp.sin(roll_rad), xp.cos(roll_rad)
     normal = added(scaled(across, keep), scaled(along, turn))
     fan = added(scaled(along, keep), scaled(across, -turn))
-    return Pose(scaled(towards, baseline_mm), axis, fan, normal)
+    return LaserFan(scaled(towards, baseline_mm), axis, fan, normal)
 
 
-def standoff_mm(pose: Pose) -> Array:
+def standoff_mm(pose: LaserFan) -> Array:
     """Depth at which the sheet crosses the camera's axis, from the entrance pupil."""
     return dot(pose.normal, pose.origin) / pose.normal[2]
 
 
 @dataclass(frozen=True)
-class FlatWindow:
+class WindowGeometry:
     """A window: unit normal away from the module, distance to its inner face along the normal, thickness, indices."""
 
     normal: Vector
@@ -81,7 +81,7 @@ class FlatWindow:
     medium_index: Array
 
     @classmethod
-    def of(cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray) -> FlatWindow:
+    def of(cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray) -> WindowGeometry:
         """A mounted window before a medium; ``rotation`` (3, 3) leads from its module's frame to the one wanted."""
         normal = rotation @ window.normal()
         distance = window.distance_mm * float(rotation[:, 2] @ normal)
@@ -127,12 +127,12 @@ def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:
     return xp.sqrt(index * index + (index * index - 1) * slope * slope)
 
 
-def across_mm(xp: ModuleType, window: FlatWindow, height_mm: Array, slope: Array) -> Array:
+def across_mm(xp: ModuleType, window: WindowGeometry, height_mm: Array, slope: Array) -> Array:
     """Distance from the normal through the origin that a ray of some slope in air has at a height along the normal."""
     return sum(extent * slope / snell_root(xp, n, slope) for extent, n in window.layers(height_mm))
 
 
-def traced(window: FlatWindow, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def traced(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3, 3) where rays (N, 3) start and meet both faces of a window, and their directions behind it; NaN for
     rays that lead away from the window."""
     normal = np.array(window.normal)
@@ -148,7 +148,7 @@ def traced(window: FlatWindow, origin: np.ndarray, directions: np.ndarray) -> tu
     return np.stack([np.broadcast_to(origin, directions.shape), *points], axis=1), normal + outside[:, None] * leaning
 
 
-def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
+def path_to(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
     """The ray to points beyond a window, by Snell's law, with the module's origin at 0.
 
     A ray of slope p in air has in a layer of index n the slope p S(n), S(n) = 1 / sqrt(n^2 + (n^2 - 1) p^2), so that it
@@ -175,13 +175,13 @@ def path_to(xp: ModuleType, window: FlatWindow, point: Vector) -> Path:
     return Path(p, p * last, scaled(sideways, 1 / rho), height, total, growth)
 
 
-def direction_outside(xp: ModuleType, window: FlatWindow, path: Path) -> Vector:
+def direction_outside(xp: ModuleType, window: WindowGeometry, path: Path) -> Vector:
     """Unit vectors of rays in the medium, away from the module."""
     p = path.slope_outside
     return scaled(added(window.normal, scaled(path.across, p)), 1 / xp.sqrt(1 + p * p))
 
 
-def length_outside_mm(xp: ModuleType, window: FlatWindow, path: Path) -> Array:
+def length_outside_mm(xp: ModuleType, window: WindowGeometry, path: Path) -> Array:
     """Path length of rays through the medium."""
     return (path.height_mm - window.outer_mm) * xp.sqrt(1 + path.slope_outside * path.slope_outside)
 
@@ -207,7 +207,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Seen:
+class ImagePoints:
     """Points as the camera sees them: pixels x, y, the ray there and its slopes (a, b) in air, before distortion; in
     ``jacobian`` how these change the pixels: dx/da, dx/db, dy/da, dy/db in px."""
 
@@ -242,7 +242,7 @@ def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     return np.column_stack([found, np.ones(len(found))])
 
 
-def seen(xp: ModuleType, lens: Lens, window: FlatWindow, point: Vector) -> Seen:
+def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
     """Pixels at which points beyond the window appear."""
     path = path_to(xp, window, point)
     ray = added(window.normal, scaled(path.across, path.slope))
@@ -257,10 +257,10 @@ def seen(xp: ModuleType, lens: Lens, window: FlatWindow, point: Vector) -> Seen:
         lens.focal_px * mixed,
         lens.focal_px * (radial + slope * b * b + 2 * lens.p2 * a + 6 * lens.p1 * b),
     )
-    return Seen(lens.focal_px * x + lens.cx, lens.focal_px * y + lens.cy, path, (a, b), jacobian)
+    return ImagePoints(lens.focal_px * x + lens.cx, lens.focal_px * y + lens.cy, path, (a, b), jacobian)
 
 
-def slopes_per_mm(view: Seen, window: FlatWindow, along: Vector) -> tuple[Array, Array]:
+def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
     """How the image point's slopes (a, b) change per mm that a point moves along a direction.
 
     From p M(p, h) = rho: the slope p changes by (d rho - p S dh) / growth, h being the point's height; and what goes
@@ -278,7 +278,7 @@ def slopes_per_mm(view: Seen, window: FlatWindow, along: Vector) -> tuple[Array,
     return (change[0] - a * change[2]) / ray_z, (change[1] - b * change[2]) / ray_z
 
 
-def pixels_per_mm(view: Seen, window: FlatWindow, along: Vector) -> tuple[Array, Array]:
+def pixels_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
     """How the pixels (x, y) change per mm that a point moves along a direction."""
     da, db = slopes_per_mm(view, window, along)
     xa, xb, ya, yb = view.jacobian

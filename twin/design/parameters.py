@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.design.geometry import Array, FlatWindow, Lens, Pose, Vector, dot, path_to, pose_at, standoff_mm
+from twin.design.geometry import Array, LaserFan, Lens, Vector, WindowGeometry, dot, path_to, pose_at, standoff_mm
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.model.errors import DescriptionError
 from uwlts.model.placement import laser_pose
@@ -27,7 +27,7 @@ _GRAINS_PX = (0.02, 64.0)
 
 
 @dataclass(frozen=True)
-class Parameters:
+class SensorArrays:
     """One array of numbers per quantity, all of the same shape or 1; units are part of the names.
 
     ``placed`` is the pose (origin, axis, fan, normal) of lasers that are placed by their axis, NaN for those placed by
@@ -91,18 +91,18 @@ class Parameters:
     near_mm: Array
     far_mm: Array
 
-    def pose(self, xp: ModuleType) -> Pose:
-        """Pose of the laser in the camera frame."""
+    def pose(self, xp: ModuleType) -> LaserFan:
+        """Fan of the laser in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
         baseline, angle, roll = self.baseline_mm, self.angle_rad, self.roll_rad
         by_angle = pose_at(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
         if not np.isfinite(self.placed[0][0]).any():
             return by_angle
         if xp is not np:
-            return Pose(*self.placed)
+            return LaserFan(*self.placed)
         vectors = by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal
         pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
-        return Pose(*(tuple(np.where(np.isfinite(own), own, other) for own, other in pair) for pair in pairs))
+        return LaserFan(*(tuple(np.where(np.isfinite(own), own, other) for own, other in pair) for pair in pairs))
 
     def along(self, pixels: tuple[Array, Array]) -> Array:
         """The one of a pair for x and y that belongs to the pixel along the stripe."""
@@ -121,20 +121,20 @@ class Parameters:
         x, y = self.window_tilt_x_rad, self.window_tilt_y_rad
         return xp.cos(x) * xp.sin(y), -xp.sin(x), xp.cos(x) * xp.cos(y)
 
-    def window(self, xp: ModuleType) -> FlatWindow:
+    def window(self, xp: ModuleType) -> WindowGeometry:
         """The camera's window; unmounted one of no thickness in the pupil, with nothing but air behind it."""
         normal, mounted = self._normal(xp), self.window_mounted
         distance, thickness = mounted * self.window_distance_mm * normal[2], mounted * self.window_thickness_mm
-        return FlatWindow(normal, distance, thickness, self.window_index, self.medium_index)
+        return WindowGeometry(normal, distance, thickness, self.window_index, self.medium_index)
 
     def outer_mm(self, xp: ModuleType) -> Array:
         """Depth on the camera's axis from which the volume counts: of the window's outer face, mounted or not."""
         return self.window_distance_mm + self.window_thickness_mm / self._normal(xp)[2]
 
-    def laser_window(self, axis: Vector) -> FlatWindow:
+    def laser_window(self, axis: Vector) -> WindowGeometry:
         """The laser's window, taken as square to its axis."""
         distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
-        return FlatWindow(axis, distance, thickness, self.laser_window_index, self.medium_index)
+        return WindowGeometry(axis, distance, thickness, self.laser_window_index, self.medium_index)
 
     def pixel_contrast(self, xp: ModuleType) -> Array:
         """Speckle contrast of a pixel, averaged over its area and two polarisations that do not interfere."""
@@ -174,12 +174,12 @@ class Parameters:
         return self.f_number * (1 + self.focal_mm / (self.focus_mm - self.focal_mm))
 
 
-def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> Parameters:
+def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> SensorArrays:
     """Parameters of N sensors, each in its medium, as float64 arrays (N, 1, 1); errors as `numbers_of`."""
     return stacked([numbers_of(sensor, medium) for sensor, medium in zip(sensors, media, strict=True)])
 
 
-def stacked(rows: Sequence[Parameters]) -> Parameters:
+def stacked(rows: Sequence[SensorArrays]) -> SensorArrays:
     """Parameters of N sensors, each of plain numbers, as arrays (N, 1, 1)."""
     nodes = max(len(row.fan_nodes_rad) for row in rows)
 
@@ -188,7 +188,9 @@ def stacked(rows: Sequence[Parameters]) -> Parameters:
         return (*table, *table[-1:] * (nodes - len(table)))
 
     full = [replace(row, fan_nodes_rad=filled(row.fan_nodes_rad), fan_powers=filled(row.fan_powers)) for row in rows]
-    return Parameters(**{one.name: _columns([getattr(row, one.name) for row in full]) for one in fields(Parameters)})
+    return SensorArrays(
+        **{one.name: _columns([getattr(row, one.name) for row in full]) for one in fields(SensorArrays)}
+    )
 
 
 def _columns(values: Sequence[Array]) -> Array:
@@ -198,7 +200,7 @@ def _columns(values: Sequence[Array]) -> Array:
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
-def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
+def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
     """Parameters of one sensor in a medium, as plain numbers.
 
     DescriptionError where a window is left out although the medium is not air, RangeError for a wavelength outside the
@@ -280,7 +282,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> Parameters:
         np.array([p for _, p in table or ((0.0, 0.0),)]),
     )
     powers = powers / np.trapezoid(powers, angles) if table else powers
-    return Parameters(
+    return SensorArrays(
         **{name: float(value) for name, value in numbers.items()},
         placed=placed,
         principal_px=camera.principal_point(),
@@ -317,7 +319,7 @@ def _line_series() -> Chebyshev:
     return Chebyshev.fit(np.log(grains), 0.5 * np.log(sums), 12)
 
 
-def followed(xp: ModuleType, parameters: Parameters, follow: Sequence[Follow]) -> Parameters:
+def followed(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> SensorArrays:
     """Parameters with what is adjusted on the bench set to the stand-off.
 
     "focus" focuses the lens where the stand-off appears to be through window and medium; "waist" focuses the laser on

@@ -28,7 +28,7 @@ from twin.design.designs import Marked
 from twin.design.figures import figures_of, scatter_at
 from twin.design.parameters import parameters_of
 from twin.design.screening import made_folder
-from twin.design.verification_scenes import Recording, recordings
+from twin.design.verification_scenes import PlannedRecording, recordings
 from twin.options import CPU, Options, use_variant
 from uwlts.model import errors
 from uwlts.model.errors import Error
@@ -128,11 +128,13 @@ def verify(
     return replace(profiles, exposure_ms=exposure, seconds=seconds)
 
 
-def _capture(folder: Path, recording: Recording) -> Path:
+def _capture(folder: Path, recording: PlannedRecording) -> Path:
     return folder / f"{recording.name}.h5"
 
 
-def _record(folder: Path, variant: str, job: tuple[Recording, Options], report: Callable[[object], None]) -> None:
+def _record(
+    folder: Path, variant: str, job: tuple[PlannedRecording, Options], report: Callable[[object], None]
+) -> None:
     """Render a recording into its file, one of several rendered at the same time."""
     use_variant(variant)
     import drjit as dr

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.design.geometry import Array, FlatWindow, Lens, dot, seen
+from twin.design.geometry import Array, Lens, WindowGeometry, dot, seen
 from twin.scene.description import Scene
 from uwlts.model.errors import DesignError
 from uwlts.model.library import validated
@@ -24,7 +24,7 @@ class LineOfSight:
 
     camera: Camera
     index: float
-    window: FlatWindow
+    window: WindowGeometry
     pose: np.ndarray
     laser_mm: np.ndarray
     fan_slope: float
@@ -36,9 +36,9 @@ class LineOfSight:
         index, pose = medium.refractive_index(wavelength), camera_from_object(sensor)
         sine = math.sin(math.radians(sensor.laser.fan_angle_deg / 2)) / index
         laser_mm = (laser_pose(sensor).origin_mm - pose[:3, 3]) @ pose[:3, :3]
-        window = FlatWindow((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
+        window = WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
         if sensor.camera.window.mounted:
-            window = FlatWindow.of(sensor.camera.window, medium, wavelength, np.eye(3))
+            window = WindowGeometry.of(sensor.camera.window, medium, wavelength, np.eye(3))
         return cls(sensor.camera, index, window, pose, laser_mm, sine / math.sqrt(1 - sine**2))
 
     def depth_mm(self, z: Array) -> Array:
@@ -125,7 +125,7 @@ _BORDER_PX = 4.0
 
 
 @dataclass(frozen=True)
-class Recording:
+class PlannedRecording:
     """A scene and the sensor that records it into a file of this name."""
 
     name: str
@@ -137,11 +137,11 @@ class Recording:
 class Recordings:
     """What is recorded for a verification; a sensor without refraction to calibrate needs no step standard."""
 
-    target: Recording
-    step: Recording | None
-    standard: Recording
+    target: PlannedRecording
+    step: PlannedRecording | None
+    standard: PlannedRecording
 
-    def all(self) -> list[Recording]:
+    def all(self) -> list[PlannedRecording]:
         """The one with most images first."""
         return [recording for recording in (self.target, self.standard, self.step) if recording is not None]
 
@@ -166,12 +166,12 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
     plane |= {"width_mm": length, "height_mm": length}
     motion = _travel(near, far, STANDARD_DEPTHS)
     scene = _scene("Plane standard", medium, motion=motion, objects=[plane], artefact={"kind": "plane"})
-    standard = Recording("standard", sensor, scene)
+    standard = PlannedRecording("standard", sensor, scene)
     exposed = Exposure.model_validate(sensor.exposure.model_dump() | {"laser_ms": "auto", "lamp_ms": "auto"})
     calibrated = sensor.model_copy(update={"exposure": exposed})
     if not (sensor.camera.window.mounted and sight.index > 1 + 1e-6):
         return Recordings(_target(calibrated, medium, sight, near, far, y), None, standard)
-    step = Recording("step", calibrated, _step(medium, near, far, y, length))
+    step = PlannedRecording("step", calibrated, _step(medium, near, far, y, length))
     wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
     air = next(
         (name for name, one in media.items() if one.kind == "air" and one.refractive_index(wavelength) == 1), None
@@ -243,7 +243,7 @@ def _scene(title: str, medium: str, **rest: object) -> Scene:
     return validated(Scene, {"title": title, "medium": medium} | rest, title)
 
 
-def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: float, y: float) -> Recording:
+def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: float, y: float) -> PlannedRecording:
     """A plate of circles square to Z, moved through the depths about a range at which its three marks are well seen.
 
     The marks stand about X = 0 and Y = ``y``; the stripe runs midway between two columns, over a plain ground.
@@ -293,7 +293,7 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: f
     window = sensor.camera.window
     near, far = sight.depth_mm(z[[0, -1]]) - window.distance_mm - window.thickness_mm
     volume = Volume(near_mm=max(0.9 * near, 1e-3 * far), far_mm=1.1 * far)
-    return Recording("target", sensor.model_copy(update={"volume": volume}), scene)
+    return PlannedRecording("target", sensor.model_copy(update={"volume": volume}), scene)
 
 
 def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: float) -> np.ndarray:

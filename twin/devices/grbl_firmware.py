@@ -36,7 +36,7 @@ class GrblError(Exception):
 
 
 @dataclass(frozen=True)
-class Block:
+class CommandBlock:
     """The commands of a line by modal group, its values by letter, and whether G53 is among them."""
 
     commands: dict[str, str]
@@ -44,7 +44,7 @@ class Block:
     machine_coordinates: bool
 
 
-def parse_block(line: str) -> Block:
+def parse_block(line: str) -> CommandBlock:
     """Words of a line without spaces and comments, in capitals; GrblError with Grbl's number."""
     commands: dict[str, str] = {}
     values: dict[str, float] = {}
@@ -71,7 +71,7 @@ def parse_block(line: str) -> Block:
         else:
             values[letter] = number
     _refuse_incomplete(commands, values, machine_coordinates)
-    return Block(commands, values, machine_coordinates)
+    return CommandBlock(commands, values, machine_coordinates)
 
 
 def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machine_coordinates: bool) -> None:
@@ -356,7 +356,7 @@ class GrblFirmware:
         self.axis.place(counted)
         self.shift_mm, self._mode = clear - counted, "Idle"
 
-    def _execute(self, block: Block) -> Generator[None, None, None]:
+    def _execute(self, block: CommandBlock) -> Generator[None, None, None]:
         values, modal = block.values, {**self._modal, **block.commands}
         moves = "X" in values and block.commands.get("once") != "G92"
         if moves and modal["motion"] == "G80":

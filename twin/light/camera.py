@@ -165,7 +165,7 @@ class WindowFaces:
         return Rays(ray.o, ray.d, dr.select(valid & (weight > 0), weight, 0.0))
 
 
-class View:
+class CameraView:
     """Lens and window of a sensor in a medium."""
 
     def __init__(self, sensor: Sensor, medium: Medium):

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, to_jit
-from twin.light.camera import RaySegment, View, ray_segments
+from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
 from twin.light.pose import Rays, SensorPose, Travel
@@ -85,7 +85,7 @@ class Renderer:
         self.objects = build_objects(
             scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
         )
-        self.view = View(sensor, medium)
+        self.view = CameraView(sensor, medium)
         self.scattering = Scattering(medium, wavelength)
         self.sheet = Sheet(sensor, medium)
         self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]

@@ -42,7 +42,7 @@ class Imperfections(Description):
     step_height_half_width_mm: NotNegative = 0.0
 
 
-class Recording(Description):
+class CampaignRecording(Description):
     """A scene to record in each of some media and at each of some placements.
 
     ``scene`` is a name, or a path that starts at the campaign's folder if it is relative. Files are called ``name``, or
@@ -69,7 +69,7 @@ class Campaign(Description):
     sensor: str
     as_built: str
     imperfections: Imperfections = Imperfections()
-    recordings: Annotated[tuple[Recording, ...], Field(min_length=1)]
+    recordings: Annotated[tuple[CampaignRecording, ...], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     return found
 
 
-def _take(recording: Recording, place: str | None, medium: str | None, drawn: "_Drawn", *, every: int) -> Take:
+def _take(recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_Drawn", *, every: int) -> Take:
     motion = load_scene(recording.scene, placement=place, medium=medium).motion.model_dump() | recording.motion
     scene = load_scene(recording.scene, placement=place, medium=medium, motion=motion)
     name = recording.name or f"{Path(recording.scene).stem}-{scene.placement}-{scene.medium}"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, MONO_BITS, Camera, CameraInfo, CameraSettings, Delivered, Region
+from uwlts.hardware.camera import BUFFERS, MONO_BITS, CameraDevice, CameraInfo, CameraSettings, Delivered, Region
 from uwlts.model.errors import HardwareError
 from uwlts.runtime.shared_library import load_aravis
 
@@ -140,7 +140,7 @@ def _served_on_loopback() -> list[FoundCamera]:
     return [FoundCamera(f"{maker}-{model}-{serial}", serial, _LOOPBACK, "GigEVision")]
 
 
-class AravisCamera(Camera):
+class AravisCamera(CameraDevice):
     """A camera by its identifier, serial number or IP address; the only one there is if the name is empty."""
 
     def __init__(self, name: str, *, address: str | None = None):

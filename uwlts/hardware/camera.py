@@ -1,6 +1,6 @@
 """Interface of all cameras: settings, frames, and the check of every frame, whatever the camera is connected by.
 
-A driver implements the methods with an underscore; `Camera` keeps the order of the calls, checks every frame and
+A driver implements the methods with an underscore; `CameraDevice` keeps the order of the calls, checks every frame and
 reports what went wrong. `uwlts.hardware.camera_addresses.open_camera` opens a camera by its address. One thread uses a
 camera.
 
@@ -185,7 +185,7 @@ class GrabbedFrame:
     status: FrameStatus
 
 
-class Camera(ABC):
+class CameraDevice(ABC):
     """A camera: ``open``, ``configure``, ``start``, then ``grab``, with ``trigger`` before it where that is wanted.
 
     A context manager, which opens the camera if it is not open and closes it whatever happens. All methods raise

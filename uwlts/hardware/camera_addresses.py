@@ -1,7 +1,7 @@
 """Opens a camera by its address; apart from the interface, because it knows all drivers."""
 
 from uwlts.hardware.aravis import AravisCamera
-from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.genicam import GenicamCamera
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.errors import HardwareError
@@ -13,7 +13,7 @@ ADDRESSES = """\
   replay:PATH                    a folder of images, or a capture"""
 
 
-def open_camera(address: str) -> Camera:
+def open_camera(address: str) -> CameraDevice:
     """Open the camera at an address, `ADDRESSES`, such as "gige:127.0.0.1"; a context manager that closes it.
 
     The camera is open, not configured.
@@ -26,7 +26,7 @@ def open_camera(address: str) -> Camera:
         A library is missing; the message says how to install it.
     """
     kind, colon, rest = address.partition(":")
-    camera: Camera
+    camera: CameraDevice
     if kind in ("gige", "aravis") and colon:
         camera = AravisCamera(rest, address=address)
     elif kind == "genicam" and rest:

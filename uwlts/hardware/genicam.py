@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, MONO_BITS, Camera, CameraInfo, CameraSettings, Delivered, Region
+from uwlts.hardware.camera import BUFFERS, MONO_BITS, CameraDevice, CameraInfo, CameraSettings, Delivered, Region
 from uwlts.model.errors import HardwareError, SetupError
 
 # GenApi's access modes count: not implemented, not available, write only, read only, both.
@@ -22,7 +22,7 @@ _EXPOSURE_US, _FRAME_RATE = ("ExposureTime", "ExposureTimeAbs"), ("AcquisitionFr
 _GAIN = ("Gain",)
 
 
-class GenicamCamera(Camera):
+class GenicamCamera(CameraDevice):
     """The camera of a serial number at a GenTL producer; the only one there is without a serial number."""
 
     def __init__(self, producer: str | Path, *, serial: str | None = None, address: str | None = None):

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, Camera, CameraInfo, CameraSettings, Delivered
+from uwlts.hardware.camera import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
 from uwlts.model.errors import HardwareError, ImageError
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_.images import SUFFIXES, read_image
 
 
-class ReplayCamera(Camera):
+class ReplayCamera(CameraDevice):
     """Images in the order of their names, numbers in them counting as numbers, or of a capture.
 
     A free-running replay without a frame rate shows an image whenever one is asked for. With one it does not wait for a

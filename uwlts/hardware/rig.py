@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import JsonValue
 
 import uwlts
-from uwlts.hardware.camera import Camera, GrabbedFrame
+from uwlts.hardware.camera import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings
 from uwlts.model.errors import HardwareError
@@ -131,7 +131,7 @@ _RUN_UP_MM = 1.0
 
 
 def with_provenance(
-    header: CaptureHeader, plan: RigPlan, camera: Camera, *, source: str, stage: str, **more: JsonValue
+    header: CaptureHeader, plan: RigPlan, camera: CameraDevice, *, source: str, stage: str, **more: JsonValue
 ) -> CaptureHeader:
     """The header of a capture, with where its images come from."""
     provenance = {
@@ -180,7 +180,14 @@ class Rig:
     """
 
     def __init__(
-        self, plan: RigPlan, settings: StageSettings, sensor: Sensor, camera: Camera, stage: LaserStage, *, ahead: float
+        self,
+        plan: RigPlan,
+        settings: StageSettings,
+        sensor: Sensor,
+        camera: CameraDevice,
+        stage: LaserStage,
+        *,
+        ahead: float,
     ):
         self._plan, self._sensor, self._camera, self._stage = plan, sensor, camera, stage
         self._feed_mm_per_min, self._ahead = settings.feed_mm_per_min, math.copysign(1.0, ahead)

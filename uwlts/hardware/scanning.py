@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import Camera
+from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
@@ -36,7 +36,7 @@ _EXPOSED_AT = 5
 
 
 @dataclass
-class Seen:
+class ScanProgress:
     """Summary of the images of a scan so far.
 
     ``lines`` and ``found`` count the profile lines of laser images and those with a stripe, ``saturated`` and ``faint``
@@ -83,7 +83,7 @@ def scan(
     progress: Callable[[int, int], None] = lambda done, total: None,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
-) -> Seen:
+) -> ScanProgress:
     """Connect camera and stage and record a scan into a capture.
 
     The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends. An
@@ -164,7 +164,7 @@ def scan(
             background=plan.background,
         )
         known_ms, before_s = left_over(out) if resume else ({}, 0.0)
-        seen = Seen(exposure_ms=known_ms)
+        seen = ScanProgress(exposure_ms=known_ms)
         writer = stack.enter_context(CaptureWriter(out, header, dtype=dtype, overwrite=overwrite, resume=resume))
         begun = len(writer)
         if begun == len(shots):
@@ -196,7 +196,7 @@ def left_over(path: Path) -> tuple[dict[Light, float], float]:
         return known, float(capture.time_s[-1]) if len(capture) else 0.0
 
 
-def check_camera(camera: Camera, sensor: Sensor) -> None:
+def check_camera(camera: CameraDevice, sensor: Sensor) -> None:
     """Refuse a camera that is not the sensor's: another image size, or fewer bits; HardwareError."""
     described, found = sensor.camera, camera.info
     if (found.width_px, found.height_px) != (described.width_px, described.height_px):
@@ -213,7 +213,7 @@ def check_camera(camera: Camera, sensor: Sensor) -> None:
 class _Taking:
     """Takes the images of a scan, with exposures settled before the first one of each light."""
 
-    def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: Seen, warn: Callable[[str], None]):
+    def __init__(self, plan: ScanPlan, sensor: Sensor, rig: Rig, seen: ScanProgress, warn: Callable[[str], None]):
         self._plan, self._sensor, self._rig, self._seen, self._warn = plan, sensor, rig, seen, warn
         self._positions_mm = plan.stage.positions_mm()
         self._watch = LaserWatch(rig, sensor, self._positions_mm, difference=plan.background)

@@ -12,7 +12,7 @@ from uwlts.metrology.fits import CylinderFit, FlatFit, fit_cylinder, fit_plane
 from uwlts.metrology.least_squares import RobustFit, fit_robustly
 from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
-from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
+from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
 
@@ -38,7 +38,7 @@ def evaluate_cloud(cloud: PointCloud, artefact: Artefact) -> ArtefactEvaluation:
             return evaluate_plane(cloud.points_mm, artefact)
         case StepStandard():
             return evaluate_step(cloud.points_mm, cloud.frame, artefact)
-        case Pipe():
+        case PipeStandard():
             return evaluate_pipe(cloud.points_mm, artefact)
         case _:
             assert_never(artefact)
@@ -106,7 +106,7 @@ def evaluate_plane(points: np.ndarray, artefact: PlaneStandard) -> PlaneEvaluati
     )
 
 
-def evaluate_pipe(points: np.ndarray, artefact: Pipe) -> PipeEvaluation:
+def evaluate_pipe(points: np.ndarray, artefact: PipeStandard) -> PipeEvaluation:
     """Diameter and form of the best cylinder of points (N, 3), mm, OCS.
 
     EvaluationError for too few points, a tenth of them away from the cylinder, a patch that leaves the cylinder open,

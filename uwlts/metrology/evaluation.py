@@ -9,7 +9,7 @@ from typing import Any, ClassVar, assert_never
 import numpy as np
 
 from uwlts.metrology.least_squares import VDI_OUTLIER_SHARE
-from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
+from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 
 TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
 """Direction from a surface to the sensor in the object coordinate system."""
@@ -118,7 +118,7 @@ def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
         case StepStandard():
             height = CalibratedQuantity("step height", artefact.height_mm, artefact.height_uncertainty_mm)
             errors, plain = [(Quantity.HEIGHT_ERROR, height)], (Quantity.STD, Quantity.PROFILE_HEIGHT_ERROR)
-        case Pipe():
+        case PipeStandard():
             diameter = CalibratedQuantity("pipe diameter", artefact.diameter_mm, artefact.diameter_uncertainty_mm)
             errors, plain = [(Quantity.DIAMETER_ERROR, diameter)], (Quantity.RANGE, Quantity.STD, Quantity.OVALITY)
         case _:

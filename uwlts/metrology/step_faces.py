@@ -35,7 +35,7 @@ class StepFace(IntEnum):
 
 
 @dataclass(frozen=True)
-class StepHeight:
+class StepMeasurement:
     """Height of a step and its standard uncertainty from the scatter of the points alone, mm."""
 
     height_mm: float
@@ -84,7 +84,7 @@ def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1
 
 def step_height(
     points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
-) -> StepHeight:
+) -> StepMeasurement:
     """Mean distance of one face's points to the line (profile) or plane (scan) through the other's.
 
     Thesis, section 3.2.2. In a profile whose sheet does not cut the step along its normal this is the height over the
@@ -99,7 +99,7 @@ def step_height(
     distances = surface.distances_mm(across)
     lever = np.array([1.0, *(surface.axes @ (across.mean(axis=0) - surface.point_mm))])
     variance = lever @ surface.covariance @ lever + distances.var(ddof=1) / len(distances)
-    return StepHeight(abs(float(distances.mean())), float(np.sqrt(variance)))
+    return StepMeasurement(abs(float(distances.mean())), float(np.sqrt(variance)))
 
 
 def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:

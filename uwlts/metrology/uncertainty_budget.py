@@ -14,7 +14,7 @@ _DIVISORS = {"normal": 1.0, "uniform": math.sqrt(3.0), "triangular": math.sqrt(6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
+class UncertaintySource:
     """A source of uncertainty, in a unit of its own.
 
     Attributes
@@ -81,7 +81,7 @@ class Budget:
     section 4.8.5; the GUM would correct).
     """
 
-    sources: tuple[Source, ...]
+    sources: tuple[UncertaintySource, ...]
     standard_uncertainty: float
     shares_percent: tuple[float, ...]
     degrees_of_freedom: float
@@ -92,7 +92,7 @@ class Budget:
     largest_error: float
 
 
-def combine(sources: Iterable[Source], *, coverage_probability: float = 0.95) -> Budget:
+def combine(sources: Iterable[UncertaintySource], *, coverage_probability: float = 0.95) -> Budget:
     """Combine sources that are not correlated.
 
     The thesis's U of 0.37 mm (Table 9) has 95.45 %, the probability of two normal standard deviations; 95 % give 0.36.

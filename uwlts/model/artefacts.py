@@ -56,7 +56,7 @@ class StepStandard(Description):
     edge_mm: NotNegative = 1.0
 
 
-class Pipe(Description):
+class PipeStandard(Description):
     """A cylinder seen from outside or inside."""
 
     kind: Literal["pipe"] = "pipe"
@@ -64,7 +64,7 @@ class Pipe(Description):
     diameter_uncertainty_mm: NotNegative | None = None
 
 
-Artefact = Annotated[SphereStandard | PlaneStandard | StepStandard | Pipe, Field(discriminator="kind")]
+Artefact = Annotated[SphereStandard | PlaneStandard | StepStandard | PipeStandard, Field(discriminator="kind")]
 
 
 def parse_artefact(table: object) -> Artefact:

@@ -11,7 +11,7 @@ _DEG = float(np.degrees(1.0))
 
 
 @dataclass(frozen=True)
-class Quantity:
+class ParameterLabel:
     """A parameter in words, its unit as shown, and the factor from the estimate's unit to that one.
 
     Slopes are shown as angles: at 1 deg that is right to a part in 10 000.
@@ -35,11 +35,11 @@ class _SingleParameter(Enum):
     """Base of the kinds of which an estimate has at most one of each."""
 
     text: str
-    quantity: Quantity
+    quantity: ParameterLabel
 
     def __init__(self, text: str, words: str, unit: str = "", factor: float = 1.0):
         self.text = text
-        self.quantity = Quantity(words, unit, factor)
+        self.quantity = ParameterLabel(words, unit, factor)
 
 
 class LensParameter(_SingleParameter):
@@ -106,9 +106,9 @@ class MediumIndex:
         return f"{_INDEX_OF}{self.medium}"
 
     @property
-    def quantity(self) -> Quantity:
+    def quantity(self) -> ParameterLabel:
         """The parameter as it is shown."""
-        return Quantity(self.text)
+        return ParameterLabel(self.text)
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,9 @@ class StepHeight:
         return f"{_HEIGHT_OF}{self.nominal_mm:g}{_STEP}"
 
     @property
-    def quantity(self) -> Quantity:
+    def quantity(self) -> ParameterLabel:
         """How the parameter is shown."""
-        return Quantity(self.text, "mm")
+        return ParameterLabel(self.text, "mm")
 
 
 SingleParameter = LensParameter | WindowParameter | SheetParameter | StageParameter | TargetParameter

@@ -69,7 +69,7 @@ def camera_from_object(sensor: Sensor) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class View:
+class SheetView:
     """View of the sheet by the camera: line length at the stand-off and the depth range outside the window, mm."""
 
     standoff_mm: float
@@ -88,7 +88,7 @@ def _half_width_mm(
     return slopes[0] * window.distance_mm + slopes[1] * window.thickness_mm + slopes[2] * depth_mm
 
 
-def view_of_sheet(sensor: Sensor, medium: Medium) -> View:
+def view_of_sheet(sensor: Sensor, medium: Medium) -> SheetView:
     """Line length and depth range of the nominal sensor in a medium, with lens distortion and tilts left out.
 
     DesignError where the sheet does not cross the view within ten stand-offs.
@@ -106,10 +106,10 @@ def view_of_sheet(sensor: Sensor, medium: Medium) -> View:
     if not seen.any():
         raise DesignError("the sheet never crosses the camera's view: change baseline, angle or focal length")
     length = 2 * _half_width_mm(camera, index, wavelength, along, np.array([standoff]))[0]
-    return View(float(standoff), float(length), float(depth[seen][0]), float(depth[seen][-1]))
+    return SheetView(float(standoff), float(length), float(depth[seen][0]), float(depth[seen][-1]))
 
 
-def check_design(sensor: Sensor, medium: Medium) -> View:
+def check_design(sensor: Sensor, medium: Medium) -> SheetView:
     """View of a sensor in the medium; DesignError with the reason and numbers where it cannot work there.
 
     That is with a window smaller than the cone or fan that passes it, or a sheet that misses the measuring volume.

@@ -15,9 +15,24 @@ import uwlts
 from uwlts.measurement.evaluation import TruthComparisons
 from uwlts.model.errors import OutputError
 from uwlts.report import plot
-from uwlts.report.gather import Campaign, GatheredCapture, Measurement, Reference, gather_campaign, load_reference
+from uwlts.report.gather import (
+    GatheredCampaign,
+    GatheredCapture,
+    GatheredMeasurement,
+    Reference,
+    gather_campaign,
+    load_reference,
+)
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
-from uwlts.report.page_toolkit import Comparison, FigureCollector, Tile, png_data_uri, render_page, svg_of, write_page
+from uwlts.report.page_toolkit import (
+    ComparisonTable,
+    FigureCollector,
+    Tile,
+    png_data_uri,
+    render_page,
+    svg_of,
+    write_page,
+)
 from uwlts.report.pictures import MeasurementPictures, draw_pictures, write_pictures
 from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table
@@ -38,7 +53,7 @@ class Report:
 
     page: Path
     summary: Path
-    campaign: Campaign
+    campaign: GatheredCampaign
     reference: Reference | None
 
     def rows(self) -> list[Row]:
@@ -96,7 +111,10 @@ def write_report(
 
 
 def report_page(
-    campaign: Campaign, reference: Reference | None = None, *, pictures: Sequence[MeasurementPictures] | None = None
+    campaign: GatheredCampaign,
+    reference: Reference | None = None,
+    *,
+    pictures: Sequence[MeasurementPictures] | None = None,
 ) -> str:
     """The page as text; ``pictures`` are those of `draw_pictures`, drawn unless given."""
     collected, rows = FigureCollector(), summary_table(campaign, reference)
@@ -128,7 +146,9 @@ def _drawn(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup |
         return None
 
 
-def _measurement(measurement: Measurement, pictures: MeasurementPictures, collected: FigureCollector) -> dict[str, Any]:
+def _measurement(
+    measurement: GatheredMeasurement, pictures: MeasurementPictures, collected: FigureCollector
+) -> dict[str, Any]:
     """Parts of a measurement's section; what it lacks is None."""
     cloud, evaluation = measurement.cloud, None if measurement.judged is None else measurement.judged.evaluation
     truth = None if measurement.judged is None else measurement.judged.truth
@@ -141,7 +161,7 @@ def _measurement(measurement: Measurement, pictures: MeasurementPictures, collec
             (name, "", (small_length(value, signed="error" in name or "SSE" in name),))
             for name, value in evaluation.figures_mm.items()
         ]
-        figures = Comparison(("value",), tuple(rows))
+        figures = ComparisonTable(("value",), tuple(rows))
     recorded = measurement.capture is not None
     no_stripe = "no image of its capture shows a stripe" if recorded else "its capture is not in the folder"
     return {
@@ -158,7 +178,7 @@ def _measurement(measurement: Measurement, pictures: MeasurementPictures, collec
     }
 
 
-def _facts(measurement: Measurement) -> list[tuple[str, str]]:
+def _facts(measurement: GatheredMeasurement) -> list[tuple[str, str]]:
     judged, capture, cloud = measurement.judged, measurement.capture, measurement.cloud
     facts = []
     if judged is not None and judged.artefact is not None:
@@ -182,7 +202,7 @@ def _facts(measurement: Measurement) -> list[tuple[str, str]]:
     return facts
 
 
-def _truth_table(compared: TruthComparisons) -> Comparison:
+def _truth_table(compared: TruthComparisons) -> ComparisonTable:
     """Distances to the true surface as measured, and after the best fit if there is one."""
     columns = {"as measured": compared, "after best fit": compared.after_best_fit}
     shown = {heading: truth for heading, truth in columns.items() if truth is not None}
@@ -202,10 +222,10 @@ def _truth_table(compared: TruthComparisons) -> Comparison:
         for truth in shown.values()
     ]
     rows = zip(texts[0], zip(*(column.values() for column in texts), strict=True), strict=True)
-    return Comparison(tuple(shown), tuple((words, "", values) for words, values in rows))
+    return ComparisonTable(tuple(shown), tuple((words, "", values) for words, values in rows))
 
 
-def _calibrations(campaign: Campaign) -> dict[str, Any]:
+def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
     """Parts of the section about all calibrations."""
     by_name = {found.name: found.calibration for found in campaign.calibrations}
     warnings, groups = [], []
@@ -239,7 +259,7 @@ def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
     return list(groups.items())
 
 
-def _provenance(campaign: Campaign) -> list[tuple[str, str]]:
+def _provenance(campaign: GatheredCampaign) -> list[tuple[str, str]]:
     libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
     entries = [("report", f"uwlts {uwlts.__version__}, Python {platform.python_version()}, {libraries}")]
     for found in campaign.calibrations:
@@ -294,7 +314,7 @@ _PUBLISHED = (
 )
 
 
-def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile]:
+def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> list[Tile]:
     """The key figures that the campaign has."""
     content = summary(campaign, reference)
     published, truth, window = content.published, content.truth, content.window_distance_mm
@@ -333,7 +353,7 @@ def headline_tiles(campaign: Campaign, reference: Reference | None) -> list[Tile
     return tiles
 
 
-def introduction(campaign: Campaign) -> list[tuple[str, str]]:
+def introduction(campaign: GatheredCampaign) -> list[tuple[str, str]]:
     """Sensor, medium, calibration and origin of the images, each in a sentence."""
     recorded = [m.capture for m in campaign.measurements if m.capture is not None] or list(campaign.captures)
     judged = [m.judged for m in campaign.measurements if m.judged is not None]
@@ -382,7 +402,7 @@ def _medium(capture: GatheredCapture) -> str:
     return ", ".join([name if name == medium.kind else f"{name} ({medium.kind})", *parts])
 
 
-def _index(measurement: Measurement) -> str | None:
+def _index(measurement: GatheredMeasurement) -> str | None:
     """The index that the points were calculated with, which need not be the description's."""
     recorded = {} if measurement.cloud is None else measurement.cloud.metadata
     index = measurement.judged.medium_index if measurement.judged is not None else recorded.get("medium_index")

@@ -5,7 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.evidence import STEP, STRIPE
-from uwlts.calibration.joint.observability import Lengths, Region, estimate_in, lengths_between, pixels_at, points_at
+from uwlts.calibration.joint.observability import (
+    Lengths,
+    SheetRegion,
+    estimate_in,
+    lengths_between,
+    pixels_at,
+    points_at,
+)
 from uwlts.calibration.joint.scanned_surfaces import SCANNED
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint
 from uwlts.model.calibration import Calibration
@@ -46,14 +53,14 @@ class InUse:
     """
 
     calibration: Calibration
-    region: Region
+    region: SheetRegion
     known: StoredEstimate
     covariance: np.ndarray
     uncertainty: Uncertainty
     noise_px: float
 
 
-def in_use(calibration: Calibration, region: Region) -> InUse:
+def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
     """A joint calibration in one of its regions; CalibrationError where it is damaged."""
     known = estimate_in(calibration, region)
     uncertainty = calibration.origin().known_before
@@ -93,7 +100,7 @@ def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
     return lengths_between(points, first, first + 1)
 
 
-def ends_over(region: Region, axis: str, length_mm: float) -> np.ndarray:
+def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
     """Ends (M, 2, 2) of lengths along an axis all over a region; none where it does not fit."""
     depths = region.mesh(_PLACES, 2)[:, 0, 1]
     found = []
@@ -186,7 +193,7 @@ def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
             )
 
 
-def change_from(calibration: Calibration, other: Calibration, region: Region) -> Change:
+def change_from(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
     """Change of a calibration against another one, in its region.
 
     Raises CalibrationError: the other one is of another sensor, or sees no sheet somewhere in the region.

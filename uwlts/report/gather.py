@@ -54,7 +54,7 @@ class GatheredCalibration:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class GatheredMeasurement:
     """A cloud with everything that belongs to it; what the folder lacks is None, never all of it."""
 
     name: str
@@ -78,11 +78,11 @@ class Measurement:
 
 
 @dataclass(frozen=True, eq=False)
-class Campaign:
+class GatheredCampaign:
     """All files of a folder. ``true_sensors`` are those of the truth files, ``seconds`` the time of each stage."""
 
     folder: Path
-    measurements: tuple[Measurement, ...]
+    measurements: tuple[GatheredMeasurement, ...]
     calibrations: tuple[GatheredCalibration, ...]
     captures: tuple[GatheredCapture, ...]
     true_sensors: tuple[Sensor, ...]
@@ -100,7 +100,7 @@ class Campaign:
         return next((c for c in self.calibrations if c.digest == self.main_digest), None)
 
     @property
-    def main_measurements(self) -> tuple[Measurement, ...]:
+    def main_measurements(self) -> tuple[GatheredMeasurement, ...]:
         """Measurements made with the main calibration, or with an unknown one."""
         return tuple(m for m in self.measurements if m.digest in (None, self.main_digest))
 
@@ -117,7 +117,7 @@ class Campaign:
         return None if self.true_sensor is None else self.true_sensor.camera.window.distance_mm
 
 
-def gather_campaign(folder: str | Path) -> Campaign:
+def gather_campaign(folder: str | Path) -> GatheredCampaign:
     """Read a campaign's folder.
 
     Captures are ``NAME.h5`` with their truth ``NAME.truth.h5``, clouds ``NAME.ply`` or ``.h5``, evaluations
@@ -146,9 +146,9 @@ def gather_campaign(folder: str | Path) -> Campaign:
     for name, cloud in sorted(_paired(clouds, judged).items()):
         recorded = None if cloud is None else cloud.metadata.get("capture")
         capture = captures.get(recorded) if isinstance(recorded, str) else None
-        found = Measurement(name, cloud, judged.get(name), capture or captures.get(f"{name}.h5"), None)
+        found = GatheredMeasurement(name, cloud, judged.get(name), capture or captures.get(f"{name}.h5"), None)
         measurements.append(replace(found, calibration=by_digest.get(found.digest or "")))
-    return Campaign(
+    return GatheredCampaign(
         folder=folder,
         measurements=tuple(measurements),
         calibrations=tuple(calibrations),

@@ -25,7 +25,7 @@ from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
-class Quantity(NamedTuple):
+class DesignRow(NamedTuple):
     """A row of the design table."""
 
     name: str
@@ -34,7 +34,7 @@ class Quantity(NamedTuple):
     source: str
 
 
-def design(sensor: str | Path | Sensor, *, medium: str) -> list[Quantity]:
+def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
     """Resolution, line length, depth range and speckle limit of a sensor in one of its media by the design formulas.
 
     Depths and ranges run along the camera's axis unless named otherwise.
@@ -79,27 +79,27 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[Quantity]:
     needed = formulas.line_needed_mm(pipe_diameter_mm=300.0, passes=5)
     snell = "with Snell's law"
     return [
-        Quantity("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),
-        Quantity("stand-off from the window", standoff - outer, "mm", f"Eq. 2.8 {snell}"),
-        Quantity("sheet in view, nearest to the window", near - outer, "mm", f"Eq. 2.8 {snell}"),
-        Quantity("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
-        Quantity("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
-        Quantity("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
-        Quantity("depth per pixel at the stand-off", per_pixel, "mm/px", f"Eq. 2.9 {snell}"),
-        Quantity("depth per pixel along the laser's axis", per_pixel * leaning, "mm/px", "over cos theta_t"),
-        Quantity("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
-        Quantity("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
-        Quantity("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),
-        Quantity("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
-        Quantity("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
-        Quantity("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
-        Quantity("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994"),
-        Quantity("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
-        Quantity("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
+        DesignRow("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("stand-off from the window", standoff - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("sheet in view, nearest to the window", near - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
+        DesignRow("depth per pixel at the stand-off", per_pixel, "mm/px", f"Eq. 2.9 {snell}"),
+        DesignRow("depth per pixel along the laser's axis", per_pixel * leaning, "mm/px", "over cos theta_t"),
+        DesignRow("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
+        DesignRow("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
+        DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
+        DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994"),
+        DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
+        DesignRow("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
     ]
 
 
-def table_lines(rows: list[Quantity]) -> list[str]:
+def table_lines(rows: list[DesignRow]) -> list[str]:
     """The table as text."""
     width = max(len(row.name) for row in rows)
     return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]

@@ -15,7 +15,7 @@ from uwlts.calibration.model_comparison.comparison import (
     STRIPES,
     Choice,
     Comparison,
-    Judged,
+    JudgedModel,
     PolynomialScore,
     Score,
 )
@@ -98,7 +98,7 @@ def content_of(comparison: Comparison) -> ModelComparisonContent:
     )
 
 
-def _row(choice: Choice, judged: Judged) -> ModelRow:
+def _row(choice: Choice, judged: JudgedModel) -> ModelRow:
     row = ModelRow(model=judged.candidate.words(), parameters=judged.parameters)
     if judged.reason:
         return row.model_copy(update={"reason": judged.reason})
@@ -219,7 +219,7 @@ def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
     return said
 
 
-def _costs(choice: Choice, without: Judged, usual: Candidate) -> str:
+def _costs(choice: Choice, without: JudgedModel, usual: Candidate) -> str:
     """Ways of holding out in which a model is worse, and by how much; empty where it is as good."""
     found = {where: adds(choice, without.candidate, usual, where) for where in without.scores}
     parts = [

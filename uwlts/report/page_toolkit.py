@@ -166,7 +166,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparisonTable:
     """A table of the ``comparison`` component: columns of values, and rows of words, unit and one value per column."""
 
     columns: tuple[str, ...]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from uwlts.report import plot
-from uwlts.report.gather import Campaign
+from uwlts.report.gather import GatheredCampaign
 from uwlts.report.page_toolkit import new_figure, png_of
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import written_aside
@@ -72,7 +72,7 @@ class MeasurementPictures:
     cloud: bytes | None
 
 
-def draw_pictures(campaign: Campaign) -> list[MeasurementPictures]:
+def draw_pictures(campaign: GatheredCampaign) -> list[MeasurementPictures]:
     """Pictures of a campaign's measurements, in order; CaptureError where an image of a capture is damaged."""
     drawn = []
     for measurement in campaign.measurements:

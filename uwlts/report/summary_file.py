@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from uwlts.measurement.evaluation import TruthComparisons, TruthFigures
 from uwlts.metrology.evaluation import Quantity
-from uwlts.report.gather import CALIBRATION, Campaign, Measurement, Reference
+from uwlts.report.gather import CALIBRATION, GatheredCampaign, GatheredMeasurement, Reference
 from uwlts.storage.files import written_aside
 
 KEY_FIGURES = {
@@ -117,10 +117,10 @@ class Summary(_KeyFigures, _Names):
     published: PublishedSummary | None
 
 
-def summary(campaign: Campaign, reference: Reference | None = None) -> Summary:
+def summary(campaign: GatheredCampaign, reference: Reference | None = None) -> Summary:
     """Key figures of a campaign, with published ones if a reference is given."""
     main = campaign.main_measurements
-    others: dict[str, list[Measurement]] = {}
+    others: dict[str, list[GatheredMeasurement]] = {}
     for measurement in campaign.measurements:
         if measurement not in main:
             known = measurement.calibration
@@ -146,7 +146,7 @@ def summary(campaign: Campaign, reference: Reference | None = None) -> Summary:
 
 
 def write_summary(
-    path: str | Path, campaign: Campaign, reference: Reference | None = None, *, overwrite: bool = False
+    path: str | Path, campaign: GatheredCampaign, reference: Reference | None = None, *, overwrite: bool = False
 ) -> None:
     """Write the summary as indented JSON, whole or not at all; OutputError where that fails."""
     text = json.dumps(summary(campaign, reference).model_dump(), indent=2, allow_nan=False)
@@ -154,7 +154,7 @@ def write_summary(
         aside.write_text(text + "\n", encoding="utf-8")
 
 
-def _key_figures(measurements: Iterable[Measurement]) -> dict[str, KeyFigure]:
+def _key_figures(measurements: Iterable[GatheredMeasurement]) -> dict[str, KeyFigure]:
     found = {}
     for name, (_, kind, quantity) in KEY_FIGURES.items():
         largest = {}
@@ -175,14 +175,14 @@ def _mean_abs(values: Iterable[float]) -> float | None:
     return float(sizes.mean()) if len(sizes) else None
 
 
-def _window(campaign: Campaign) -> WindowDistance:
+def _window(campaign: GatheredCampaign) -> WindowDistance:
     found = campaign.main_calibration
     window = None if found is None else found.calibration.window
     true = None if window is not None and window.refractions == 1 else campaign.true_window_mm
     return WindowDistance(estimated=None if window is None else window.distance_mm, true=true)
 
 
-def _truth(measurements: Iterable[Measurement]) -> TruthSummary:
+def _truth(measurements: Iterable[GatheredMeasurement]) -> TruthSummary:
     compared = {m.name: m.judged.truth for m in measurements if m.judged is not None and m.judged.truth is not None}
     fitted = [truth.after_best_fit for truth in compared.values() if truth.after_best_fit is not None]
     return TruthSummary(
@@ -203,7 +203,7 @@ def _pooled(compared: Sequence[TruthFigures]) -> PooledTruth:
     )
 
 
-def _published(measurements: Sequence[Measurement], reference: Reference) -> PublishedSummary:
+def _published(measurements: Sequence[GatheredMeasurement], reference: Reference) -> PublishedSummary:
     figures = {}
     for key, (_, _, figure) in KEY_FIGURES.items():
         values = {m.name: found for m in measurements if (found := reference.values(m.known_as, figure))}

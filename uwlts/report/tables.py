@@ -13,9 +13,9 @@ from rich.text import Text
 
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.report.gather import CALIBRATION, Campaign, GatheredCalibration, Measurement, Reference
+from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
 from uwlts.report.numbers import as_fine_as, entries_of, fixed, is_number, numbers_in, plain, unit_of, words_of
-from uwlts.report.page_toolkit import MISSING, Comparison
+from uwlts.report.page_toolkit import MISSING, ComparisonTable
 from uwlts.report.plot import SHORT_LIST
 
 _QUANTITIES = {"PE": "probing error PE", "RE": "range error RE", "STD": "deviations STD", "range": "deviations range"}
@@ -52,7 +52,7 @@ class Row:
         return self.measurement, self.quantity, fixed(self.true), measured, error, ", ".join(published) or MISSING
 
 
-def summary_table(campaign: Campaign, reference: Reference | None = None) -> list[Row]:
+def summary_table(campaign: GatheredCampaign, reference: Reference | None = None) -> list[Row]:
     """Rows of all measurements, then the window's distance of every calibration."""
     rows = [row for measurement in campaign.measurements for row in _measurement_rows(measurement, reference)]
     return rows + _window_rows(campaign, reference)
@@ -77,7 +77,7 @@ def print_table(rows: list[Row], *, published: str = "thesis", console: Console 
     console.print(table)
 
 
-def _measurement_rows(measurement: Measurement, reference: Reference | None) -> list[Row]:
+def _measurement_rows(measurement: GatheredMeasurement, reference: Reference | None) -> list[Row]:
     judged = measurement.judged
     if judged is None:
         return []
@@ -105,7 +105,7 @@ def _measurement_rows(measurement: Measurement, reference: Reference | None) -> 
     return rows
 
 
-def _window_rows(campaign: Campaign, reference: Reference | None) -> list[Row]:
+def _window_rows(campaign: GatheredCampaign, reference: Reference | None) -> list[Row]:
     rows = []
     for found in campaign.calibrations:
         window = found.calibration.window
@@ -121,7 +121,7 @@ def _window_rows(campaign: Campaign, reference: Reference | None) -> list[Row]:
     return rows
 
 
-def parameter_table(campaign: Campaign) -> Comparison:
+def parameter_table(campaign: GatheredCampaign) -> ComparisonTable:
     """All parameters with their units and, where known, standard deviations; a last column of a twin's true values."""
     columns = [(found.name, _parameters(found.calibration)) for found in campaign.calibrations]
     if campaign.true_sensor is not None:
@@ -129,15 +129,15 @@ def parameter_table(campaign: Campaign) -> Comparison:
     return _side_by_side(columns)
 
 
-def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> Comparison:
+def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> ComparisonTable:
     """Every single figure that the residuals of the calibrations hold, by its name."""
     return _side_by_side([(found.name, dict(_figures(found.calibration))) for found in calibrations])
 
 
-def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> Comparison:
+def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> ComparisonTable:
     """Columns by their headings, each of texts by words and unit."""
     rows = dict.fromkeys(row for _, table in columns for row in table)
-    return Comparison(
+    return ComparisonTable(
         tuple(heading for heading, _ in columns),
         tuple((*row, tuple(table.get(row, MISSING) for _, table in columns)) for row in rows),
     )

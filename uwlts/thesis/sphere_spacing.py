@@ -10,7 +10,7 @@ from uwlts.calibration.window import StepImage, label_step, solve_window, step_p
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import evaluate_spheres
-from uwlts.metrology.uncertainty_budget import Source, combine, thermal_expansion_mm
+from uwlts.metrology.uncertainty_budget import UncertaintySource, combine, thermal_expansion_mm
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import SphereStandard
 from uwlts.model.calibration import Calibration, WindowModel
@@ -167,10 +167,15 @@ def spacing_budget(
     scatter, correction = float(np.std(errors, ddof=1)), float(np.mean(np.abs(errors)))
     budget = combine(
         [
-            *(Source(name=name, half_width=half, distribution="uniform") for name, half in half_widths.items()),
-            Source(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),
-            Source(name="SSE", half_width=scatter, degrees_of_freedom=len(errors) - 1, correction=correction),
-            Source(name="PE", half_width=deviation_mm),
+            *(
+                UncertaintySource(name=name, half_width=half, distribution="uniform")
+                for name, half in half_widths.items()
+            ),
+            UncertaintySource(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),
+            UncertaintySource(
+                name="SSE", half_width=scatter, degrees_of_freedom=len(errors) - 1, correction=correction
+            ),
+            UncertaintySource(name="PE", half_width=deviation_mm),
         ]
     )
     return {source.name: source.standard_uncertainty for source in budget.sources} | {

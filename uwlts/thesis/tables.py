@@ -42,7 +42,8 @@ def load_published(name_or_path: str | Path = "thesis-tables") -> Published:
     """Published tables by name or path; DescriptionError where the file holds none."""
     path = find(name_or_path, "references")
     table = read_table(path, "references")
-    if not isinstance(table.get("positions"), dict) or not {"spheres", "plane"} <= table["positions"].keys():
+    positions = table.get("positions")
+    if not isinstance(positions, dict) or not {"spheres", "plane"} <= positions.keys():
         raise DescriptionError(f"{path} holds no published tables: it needs [positions] with spheres and plane")
     return Published(str(table.pop("title", path.stem)), table)
 

@@ -14,7 +14,7 @@ import genicam
 import numpy as np
 import pytest
 
-from uwlts.hardware.camera import Camera, FrameCheck, FrameCounts, FrameStatus, Region
+from uwlts.hardware.camera import CameraDevice, FrameCheck, FrameCounts, FrameStatus, Region
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.errors import HardwareError, ImageError, SetupError
@@ -85,7 +85,7 @@ def pictures(folder: Path, count: int, *, suffix: str = ".png", kind: type = np.
     return folder
 
 
-def first_pixels(camera: Camera, count: int) -> list[int]:
+def first_pixels(camera: CameraDevice, count: int) -> list[int]:
     return [int(camera.grab(1.0).image[0, 0]) for _ in range(count)]
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
 from uwlts.metrology.truth_comparison import compare_with_truth
-from uwlts.model.artefacts import Artefact, Pipe, PlaneStandard, SphereStandard, StepStandard
+from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
 
@@ -206,7 +206,7 @@ def tube(rng, count: int, *, arc: float, oval: float = 0.0) -> tuple[np.ndarray,
 
 def test_a_pipe_seen_over_a_fifth_of_its_circumference():
     points, noise = tube(np.random.default_rng(1), 8000, arc=2 * np.pi / 5)
-    result = evaluate_cloud(cloud_of(points), Pipe(diameter_mm=300.0))
+    result = evaluate_cloud(cloud_of(points), PipeStandard(diameter_mm=300.0))
     assert abs(result.diameter_error_mm) < 5 * result.diameter_std_mm < 0.5
     assert result.std_mm == pytest.approx(noise.std(), rel=0.01)
     assert result.range_mm == pytest.approx(np.ptp(noise), abs=0.05)
@@ -214,12 +214,12 @@ def test_a_pipe_seen_over_a_fifth_of_its_circumference():
     # As in the plane, the fitted surface moves by a few sigma / sqrt(8000).
     np.testing.assert_allclose(result.deviation_mm, noise, atol=0.02)
     with pytest.raises(EvaluationError, match=r"cylinder of (299|300)\.\d mm"):
-        evaluate_cloud(cloud_of(points), Pipe(diameter_mm=200.0))
+        evaluate_cloud(cloud_of(points), PipeStandard(diameter_mm=200.0))
 
 
 def test_a_pipe_seen_over_most_of_its_circumference_shows_its_ovality():
     points, _ = tube(np.random.default_rng(2), 8000, arc=5.0, oval=1.2)
-    result = evaluate_cloud(cloud_of(points), Pipe(diameter_mm=300.0))
+    result = evaluate_cloud(cloud_of(points), PipeStandard(diameter_mm=300.0))
     # 4 times the amplitude, whose standard deviation is about sqrt(2 / 8000) sigma, twice that on 80 % of a turn; the
     # fitted circle differs from the mean one to first order in the oval over 150, so some 0.01 mm remain.
     assert result.ovality_mm == pytest.approx(1.2, abs=0.05)
@@ -398,7 +398,7 @@ def test_a_scan_without_a_step_is_refused():
         ({"kind": "spheres", "diameters_mm": [50.12, 50.14], "spacings_mm": [99.18]}, SphereStandard),
         ({"kind": "plane"}, PlaneStandard),
         ({"kind": "step", "height_mm": 23.17, "height_uncertainty_mm": 0.02}, StepStandard),
-        ({"kind": "pipe", "diameter_mm": 300.0}, Pipe),
+        ({"kind": "pipe", "diameter_mm": 300.0}, PipeStandard),
     ],
 )
 def test_descriptions_are_distinguished_by_kind(table, kind):
@@ -429,7 +429,7 @@ def test_results_are_plain_json():
     evaluations = [
         evaluate_cloud(cloud_of(dumbbell(rng, count=1000)), DUMBBELL),
         evaluate_cloud(cloud_of(flat(rng, 1000)[0]), PlaneStandard()),
-        evaluate_cloud(cloud_of(tube(rng, 1000, arc=1.2)[0]), Pipe(diameter_mm=300.0)),
+        evaluate_cloud(cloud_of(tube(rng, 1000, arc=1.2)[0]), PipeStandard(diameter_mm=300.0)),
         evaluate_cloud(step_scan(0), StepStandard(height_mm=HEIGHT)),
     ]
     for evaluation in evaluations:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
-from uwlts.calibration.joint.observability import Region, estimate_in, pixels_at, regions
+from uwlts.calibration.joint.observability import SheetRegion, estimate_in, pixels_at, regions
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.calibration import KnownMedium
@@ -212,7 +212,7 @@ def test_lengths_shown_where_they_are_measured_stay_in_the_volume(use):
     mesh = region.mesh(5, 7)
     low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
     assert ((mesh >= low - 1e-9) & (mesh <= high + 1e-9)).all()
-    corner = Region("water", MEDIUM, region.view, np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]), np.zeros(2), 3)
+    corner = SheetRegion("water", MEDIUM, region.view, np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]), np.zeros(2), 3)
     assert corner.width_at(5.0) == pytest.approx((0.0, 5.0))
     assert corner.has_area()
     assert not replace(corner, outline_mm=corner.outline_mm[:2]).has_area()

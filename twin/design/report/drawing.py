@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from twin.design.figures import depths_in_view, field_of
-from twin.design.geometry import FlatWindow, Lens, directions_of, traced
-from twin.design.parameters import Parameters, parameters_of
+from twin.design.geometry import Lens, WindowGeometry, directions_of, traced
+from twin.design.parameters import SensorArrays, parameters_of
 from twin.design.report.tables import number_text
 from uwlts.model.errors import DesignError
 from uwlts.model.placement import LaserPose, laser_pose
@@ -168,7 +168,7 @@ def _crossing_mm(pose: LaserPose, outer: float) -> float:
     return depth
 
 
-def _reach(sensor: Sensor, p: Parameters, aside: float) -> tuple[np.ndarray, ...]:
+def _reach(sensor: Sensor, p: SensorArrays, aside: float) -> tuple[np.ndarray, ...]:
     """N depths of the volume from the window, and from where to where (N,) camera and laser reach there, in mm from the
     laser's axis, NaN where they reach nothing; three depths to show, and the ends (3, 2) of the line there.
 
@@ -199,12 +199,12 @@ class _Mounted:
     origin: np.ndarray
     axis: np.ndarray
     described: Window
-    window: FlatWindow | None
+    window: WindowGeometry | None
 
     @classmethod
     def of(cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
         """A module whose frame, with z along its axis, ``rotation`` (3, 3) turns into the camera frame."""
-        flat = FlatWindow.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
+        flat = WindowGeometry.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
         return cls(origin, rotation[:, 2], window, flat)
 
     def rays(self, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -167,7 +167,7 @@ _SAMPLE = 100  # points of a candidate that stand for all: more repeat what thes
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class CandidatePose:
     """A pose ``T_camera_target`` (4, 4) with the pixels (N, 2) and the information (P, P) that its image would give.
 
     The information is for points that are found to 1 px.
@@ -195,7 +195,7 @@ def information_of(
     return left.T @ left
 
 
-def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[Candidate]:
+def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[CandidatePose]:
     """Poses at three distances in the working range, nine places, nine tilts, in which the target could be found.
 
     Tilts are none and those that make one of eight sides of the image farther. ``spin_rad`` is how the target is turned
@@ -224,7 +224,7 @@ def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) 
         if target.findable(inside):
             sample = np.flatnonzero(inside)[::step]
             added = information_of(points[sample], pixels[sample], pose, camera, setting)
-            found.append(Candidate(pose, pixels[inside], added * inside.sum() / len(sample)))
+            found.append(CandidatePose(pose, pixels[inside], added * inside.sum() / len(sample)))
     return found
 
 
@@ -326,7 +326,7 @@ class PoseAdvice:
     the camera's axis.
     """
 
-    candidate: Candidate
+    candidate: CandidatePose
     gain: float
     place: tuple[float, float]
     distance_mm: float

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwlts.calibration.camera import centre_offsets
 from uwlts.calibration.joint.derivatives import COLUMNS, PointDerivatives
-from uwlts.calibration.joint.parameters import Parameters, View
+from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.target_images import Placement
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
@@ -58,7 +58,7 @@ class StripeEvidence(ABC):
     of the images by their numbers. Rays are taken at the pixels, or at ``predicted`` ones (N, 2) near them.
     """
 
-    view: View
+    view: ViewMedium
     pixels: np.ndarray
     across: int
     sources: Mapping[int, str] = field(default_factory=dict)

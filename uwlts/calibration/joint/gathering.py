@@ -8,11 +8,11 @@ from pydantic import JsonValue
 
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.parameters import Prior, View, window_values
+from uwlts.calibration.joint.parameters import Prior, ViewMedium, window_values
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sources_of
 from uwlts.calibration.target_images import Placement, placements
-from uwlts.model.artefacts import Pipe, PlaneStandard, SphereStandard, parse_artefact
+from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.joint_estimate import Origin
@@ -29,7 +29,7 @@ from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeOptions, find_stripes
 
-Scanned = SphereStandard | PlaneStandard | Pipe
+Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Series:
     ``approaching`` says whether the stage moves the sensor towards the target; None where it moves otherwise.
     """
 
-    view: View
+    view: ViewMedium
     found: AirEvidence
     approaching: bool | None
     names: list[str]
@@ -70,7 +70,7 @@ class ScanStripes:
     stage_mm: np.ndarray
     stage_direction: np.ndarray
     artefact: Scanned
-    view: View
+    view: ViewMedium
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +84,12 @@ class Gathered:
     sensor: Sensor
     media: dict[str, Medium]
     series: list[Series]
-    steps: list[tuple[StepEvidence, View]]
+    steps: list[tuple[StepEvidence, ViewMedium]]
     scans: list[ScanStripes]
     provenance: dict[str, JsonValue]
     warnings: list[str]
 
-    def views(self) -> list[View]:
+    def views(self) -> list[ViewMedium]:
         """Through what each series of target images, each step image and each scan was seen."""
         return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
@@ -121,7 +121,7 @@ def gather_jointly(
             raise CalibrationError(f"{names[source.sha256]} and {source.file} are the same capture: give it once")
         names[source.sha256] = source.file
     media: dict[str, Medium] = {}
-    views: dict[View, list[Capture]] = {}
+    views: dict[ViewMedium, list[Capture]] = {}
     for capture in targets:
         views.setdefault(_view(capture, media), []).append(capture)
     series, on_steps, on_scans, warnings = [], [], [], []
@@ -144,7 +144,7 @@ def gather_jointly(
     return Gathered(sensor, media, series, on_steps, on_scans, provenance, warnings)
 
 
-def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> ScanStripes:
+def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeOptions) -> ScanStripes:
     """Find the stripes of a scan.
 
     Raises DescriptionError: the capture does not describe spheres, a plane or a pipe. CaptureError: no image shows a
@@ -181,16 +181,16 @@ def scan_stripes(capture: Capture, view: View, *, stripe: StripeOptions) -> Scan
     )
 
 
-def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> View:
+def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> ViewMedium:
     """Through what a capture was taken; ``name`` is the medium's own unless given."""
     header = capture.header
     window = header.sensor.camera.window.mounted
     if header.medium.kind == "air":
-        return View(window, None)
+        return ViewMedium(window, None)
     name = name or header.medium_name
     if media.setdefault(name, header.medium) != header.medium:
         raise CalibrationError(f"the captures mean different media by '{name}': {media[name]} and {header.medium}")
-    return View(window, list(media).index(name))
+    return ViewMedium(window, list(media).index(name))
 
 
 def _approaching(captures: Sequence[Capture]) -> bool | None:

@@ -13,7 +13,7 @@ from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series
-from uwlts.calibration.joint.parameters import Parameters, Prior, View
+from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.scanned_surfaces import Cylinder, Plane, Spheres, Surface, SurfaceScanEvidence, across_of
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.calibration.sheet import fit_sheet, object_frame
@@ -22,7 +22,7 @@ from uwlts.calibration.window import label_step
 from uwlts.metrology.artefacts import evaluate_pipe, evaluate_plane
 from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace
-from uwlts.model.artefacts import Pipe, PlaneStandard, SphereStandard
+from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.parameter_keys import StepHeight
@@ -127,7 +127,7 @@ def series_start(
     )
     rms = seen.image_rms_px()
     explained = np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px)
-    if base.view == View(False, None) and not explained:
+    if base.view == ViewMedium(False, None) and not explained:
         image = int(np.argmax(rms))
         raise CalibrationError(
             f"no camera explains the target images in air: {np.median(rms):.1f} px (rms) are left in most of them, and "
@@ -150,7 +150,7 @@ def series_start(
     return start
 
 
-def _index(view: View, indices: Sequence[float]) -> float:
+def _index(view: ViewMedium, indices: Sequence[float]) -> float:
     """Index behind the window; without one the lens itself looks into the medium, whatever it is."""
     return indices[view.medium] if view.window and view.medium is not None else 1.0
 
@@ -158,7 +158,7 @@ def _index(view: View, indices: Sequence[float]) -> float:
 class _Viewpoint:
     """A camera with the window in its view and the index behind it."""
 
-    def __init__(self, camera: CameraModel, window: WindowModel | None, indices: Sequence[float], view: View):
+    def __init__(self, camera: CameraModel, window: WindowModel | None, indices: Sequence[float], view: ViewMedium):
         self._camera, self._window, self._index = camera, window if view.window else None, _index(view, indices)
 
     def pose(self, placement: Placement) -> np.ndarray:
@@ -366,7 +366,7 @@ def _surface(
             normal = np.array(plane.normal)
             surface = Plane(in_camera(plane.point_mm), rotation @ normal, across_of(normal) @ rotation.T)
             return np.isfinite(plane.deviation_mm), surface, np.zeros(3)
-        case Pipe():
+        case PipeStandard():
             pipe = evaluate_pipe(points, artefact)
             axis = np.array(pipe.axis)
             surface = Cylinder(

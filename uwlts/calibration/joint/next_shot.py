@@ -17,7 +17,7 @@ from uwlts.calibration.joint.observability import (
     regions,
     weaknesses,
 )
-from uwlts.calibration.joint.parameters import Prior, View
+from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, with_independent
 from uwlts.calibration.target_images import Placement, pose_values
@@ -61,7 +61,7 @@ class Outlook:
     before_mm: float
     after_mm: float
     covariance: np.ndarray
-    view: View
+    view: ViewMedium
     pose: np.ndarray | None = None
 
     def advice(self) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwlts.calibration.joint.derivatives import COLUMNS
-from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, found_estimate, require_joint
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
@@ -19,7 +19,7 @@ _LEAST_MM = 1.0  # extent of a region over which lengths mean something
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
+class SheetRegion:
     """A region of the sheet that evidence covers, in the medium of a name, and through what it was seen.
 
     ``outline_mm`` (K, 2) is convex, Y and Z in the OCS; ``camera_depth_mm`` (2,) are the nearest and farthest depths
@@ -28,7 +28,7 @@ class Region:
 
     name: str
     medium: Medium
-    view: View
+    view: ViewMedium
     outline_mm: np.ndarray
     camera_depth_mm: np.ndarray
     points: int
@@ -57,7 +57,7 @@ class Region:
 
 
 @dataclass(frozen=True, eq=False)
-class SheetPoints:
+class SheetSamples:
     """Points of the sheet at Y and Z (N, 2) of the OCS, and how they move, mm.
 
     The derivatives are ``by_parameters`` (N, 3, P), and ``by_px`` (N, 3) for one pixel across the stripe.
@@ -87,7 +87,7 @@ class Lengths:
         return np.sqrt(np.maximum(variance, 0.0) + (noise_px * self.by_px) ** 2)
 
 
-def regions(calibration: Calibration) -> list[Region]:
+def regions(calibration: Calibration) -> list[SheetRegion]:
     """The regions that a joint calibration's evidence covers, that of its use first; CalibrationError if damaged."""
     found = []
     for covered in require_joint(calibration).covered:
@@ -96,16 +96,18 @@ def regions(calibration: Calibration) -> list[Region]:
             raise CalibrationError(f"the calibration's covered volume is damaged: it has no medium number {number}")
         medium = Medium(kind="air") if number is None else calibration.media[number].medium
         outline, depth = np.array(covered.outline_mm).reshape(-1, 2), np.array(covered.camera_depth_mm)
-        found.append(Region(covered.name, medium, View(covered.window, number), outline, depth, covered.point_count))
+        found.append(
+            SheetRegion(covered.name, medium, ViewMedium(covered.window, number), outline, depth, covered.point_count)
+        )
     return sorted(found, key=lambda region: (region.view.medium is None, -region.points))
 
 
-def estimate_in(calibration: Calibration, region: Region) -> StoredEstimate:
+def estimate_in(calibration: Calibration, region: SheetRegion) -> StoredEstimate:
     """The joint estimate as found, for what is seen as a region was; CalibrationError as `found_estimate`."""
     return replace(found_estimate(calibration, region.medium), view=region.view)
 
 
-def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetPoints:
+def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
     """Points of the sheet at Y and Z (N, 2) of the OCS; CalibrationError where the camera does not see one of them."""
     pixels = pixels_at(known, at_mm)
     points = known.parameters.on_sheet(known.values, known.view, pixels) if np.isfinite(pixels).all() else None
@@ -114,7 +116,7 @@ def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetPoints:
     into_object = known.calibration.object_transform()[:3, :3].T
     by = [known.parameters.by_global(points.by_rays[:, i], known.view, points.by_sheet[:, i]) for i in range(3)]
     by_px = points.by_rays[COLUMNS.index("uv"[known.across()])].T @ into_object.T
-    return SheetPoints(at_mm, np.einsum("ij,jnp->nip", into_object, np.stack(by)), by_px)
+    return SheetSamples(at_mm, np.einsum("ij,jnp->nip", into_object, np.stack(by)), by_px)
 
 
 def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
@@ -123,7 +125,7 @@ def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
     return known.project(at_mm @ transform[:3, 1:3].T + transform[:3, 3])
 
 
-def lengths_between(points: SheetPoints, start: np.ndarray, end: np.ndarray) -> Lengths:
+def lengths_between(points: SheetSamples, start: np.ndarray, end: np.ndarray) -> Lengths:
     """Lengths from points to others by their numbers (M,)."""
     apart = points.at_mm[end] - points.at_mm[start]
     length = np.linalg.norm(apart, axis=1)
@@ -134,7 +136,7 @@ def lengths_between(points: SheetPoints, start: np.ndarray, end: np.ndarray) -> 
     return Lengths(ends, length, np.einsum("mi,mip->mp", unit, moved), np.hypot(*by_px))
 
 
-def lengths_over(known: StoredEstimate, region: Region) -> Lengths:
+def lengths_over(known: StoredEstimate, region: SheetRegion) -> Lengths:
     """Lengths between all pairs of points of a region's mesh."""
     at = region.mesh().reshape(-1, 2)
     return lengths_between(points_at(known, at), *np.triu_indices(len(at), k=1))

@@ -61,7 +61,7 @@ class EarlierEstimate:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewMedium:
     """Through what the camera looks: its window or none, and a medium by its number; None is air."""
 
     window: bool
@@ -136,28 +136,28 @@ class Parameters:
         """The sheet of a vector."""
         return self.sheet.model(self._sheet_values(values))
 
-    def medium_index(self, values: np.ndarray, view: View) -> float:
+    def medium_index(self, values: np.ndarray, view: ViewMedium) -> float:
         """Index of a view's medium relative to air."""
         return 1.0 if view.medium is None else self.value(values, self.index_key(view.medium))
 
-    def rays(self, values: np.ndarray, view: View, pixels: np.ndarray) -> RayDerivatives | None:
+    def rays(self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray) -> RayDerivatives | None:
         """Rays of pixels (N, 2) in the medium of a view."""
         window = self.window_model(values) if view.window else None
         return ray_derivatives(self.camera(values), window, pixels, medium_index=self.medium_index(values, view))
 
-    def on_sheet(self, values: np.ndarray, view: View, pixels: np.ndarray) -> PointDerivatives | None:
+    def on_sheet(self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray) -> PointDerivatives | None:
         """Points of the sheet in the medium of a view that pixels (N, 2) show."""
         rays = self.rays(values, view, pixels)
         if rays is None:
             return None
         return points_on_sheet(self.sheet, self._sheet_values(values), rays, self.medium_index(values, view))
 
-    def project(self, values: np.ndarray, view: View, points: np.ndarray) -> np.ndarray:
+    def project(self, values: np.ndarray, view: ViewMedium, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of points (N, 3) in the camera frame, seen through a view; NaN where there is none."""
         window = self.window_model(values) if view.window else None
         return project_through_window(self.camera(values), window, points, medium_index=self.medium_index(values, view))
 
-    def by_global(self, by_rays: np.ndarray, view: View, by_sheet: np.ndarray | None = None) -> np.ndarray:
+    def by_global(self, by_rays: np.ndarray, view: ViewMedium, by_sheet: np.ndarray | None = None) -> np.ndarray:
         """Derivatives (N, P) by the global parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
         result = np.zeros((by_rays.shape[1], len(self.keys)))
         result[:, : len(self.intrinsics.names)] = by_rays[2 : 2 + len(LENS)].T @ self.intrinsics.map

@@ -14,7 +14,7 @@ from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, step_profiles
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
-from uwlts.calibration.joint.parameters import EarlierEstimate, View
+from uwlts.calibration.joint.parameters import EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
     StoredEstimate,
@@ -345,7 +345,7 @@ def _after(gathered: Gathered, media: Sequence[str]) -> Gathered:
         names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))
         renamed[next(other for other in names if other not in {*media, *renamed})] = medium
     steps = [
-        (step, view if view.medium is None else View(view.window, len(media) + view.medium))
+        (step, view if view.medium is None else ViewMedium(view.window, len(media) + view.medium))
         for step, view in gathered.steps
     ]
     return replace(gathered, media=renamed, steps=steps)

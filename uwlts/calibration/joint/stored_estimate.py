@@ -12,7 +12,7 @@ from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.evidence import TARGET
 from uwlts.calibration.joint.noise import outliers
-from uwlts.calibration.joint.parameters import Parameters, Prior, View, window_values
+from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.sheet import object_frame
 from uwlts.model.calibration import Calibration, KnownMedium
 from uwlts.model.errors import CalibrationError
@@ -32,7 +32,7 @@ def calibration_of(
     parameters, values = result.parameters, result.values
     sheet = parameters.sheet_model(values)
     frame = object_frame(sheet, laser_axis=parameters.sheet.axis)
-    indices = [parameters.medium_index(values, View(True, number)) for number in range(len(media))]
+    indices = [parameters.medium_index(values, ViewMedium(True, number)) for number in range(len(media))]
     return Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -52,7 +52,7 @@ def calibration_of(
 def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame: np.ndarray) -> JointEstimate:
     """The estimate with the fit of each image and the covered regions in the OCS, at ``T_camera_object`` (4, 4)."""
     images = []
-    lit: dict[View, list[np.ndarray]] = {}
+    lit: dict[ViewMedium, list[np.ndarray]] = {}
     for piece, parts in zip(evidence, result.residuals, strict=True):
         for part in parts:
             left_out = outliers(part, result.noise[part.kind])
@@ -98,7 +98,7 @@ def _lens_and_window(result: Estimate) -> dict[str, Table]:
     return figures
 
 
-def _covered(result: Estimate, view: View, pixels: np.ndarray, object_frame: np.ndarray) -> CoveredRegion:
+def _covered(result: Estimate, view: ViewMedium, pixels: np.ndarray, object_frame: np.ndarray) -> CoveredRegion:
     seen = result.parameters.on_sheet(result.values, view, pixels)
     if seen is None:
         raise CalibrationError("a stripe that was used meets no sheet by the joint estimate")
@@ -131,7 +131,7 @@ class StoredEstimate:
     parameters: Parameters
     values: np.ndarray
     covariance: np.ndarray
-    view: View
+    view: ViewMedium
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where there is none."""
@@ -216,7 +216,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     priors |= {key: Prior(value, 0.0) for key, value in held.items() if key not in priors}
     sheet = DescribedSheet.of(joint.nominal_sheet)
     parameters = Parameters(intrinsics, sheet, calibration.window, tuple(media), priors)
-    view = View(mounted and calibration.window is not None, seen_in)
+    view = ViewMedium(mounted and calibration.window is not None, seen_in)
     return StoredEstimate(calibration, parameters, values, covariance, view)
 
 

@@ -192,7 +192,7 @@ def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class JudgedModel:
     """A model with its score for each way of holding out, or the reason why it has none."""
 
     candidate: Candidate
@@ -209,7 +209,7 @@ class Choice:
     the way; ``tallies`` belong to each way, of those models in their order.
     """
 
-    judged: list[Judged]
+    judged: list[JudgedModel]
     ways: dict[str, frozenset[Image]]
     predictions: dict[Candidate, dict[str, Prediction]]
     tallies: dict[str, Tally]
@@ -244,7 +244,7 @@ class Choice:
         separate = self.predictions[other][INSIDE].separates_from(self.predictions[candidate][INSIDE])
         return not separate or self.tallies[where].as_good(self.number(candidate), self.number(other))
 
-    def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[Judged, list[Judged]]:
+    def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[JudgedModel, list[JudgedModel]]:
         """Of all models or some the best, and those that are as good in both ways."""
         able = [each for each in self.judged if each.scores and (among is None or each.candidate in among)]
         best = min(able, key=lambda each: sum(score.all_mm**2 for score in each.scores.values()))
@@ -306,11 +306,11 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]]) -> Choice:
     judged, number = [], count()
     for candidate, result in found.items():
         if isinstance(result, str):
-            judged.append(Judged(candidate, None, {}, result))
+            judged.append(JudgedModel(candidate, None, {}, result))
         else:
             place = next(number)
             scores = {where: each.score(place) for where, each in tallies.items()}
-            judged.append(Judged(candidate, len(result[INSIDE].parameters.keys), scores))
+            judged.append(JudgedModel(candidate, len(result[INSIDE].parameters.keys), scores))
     return Choice(judged, ways, predictions, tallies)
 
 

@@ -13,7 +13,7 @@ from uwlts.calibration.joint.consistency import much_left_out
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.evidence import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.noise import outlier_limit
-from uwlts.calibration.joint.parameters import Parameters, View
+from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.target_images import pose_values
@@ -144,9 +144,9 @@ def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
     return {INSIDE: frozenset(inside), OUTSIDE: frozenset(outside)}
 
 
-def _by_depth(problem: JointProblem) -> dict[View, list[tuple[float, Image]]]:
+def _by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image]]]:
     """Images that show a stripe, by what they were seen through, in the order of where it lies across its lines."""
-    found: dict[View, list[tuple[float, Image]]] = {}
+    found: dict[ViewMedium, list[tuple[float, Image]]] = {}
     for number, piece in enumerate(problem.evidence):
         if isinstance(piece, TargetEvidence):
             places = {int(image): piece.pixels[piece.image == image, piece.across] for image in np.unique(piece.image)}

@@ -20,7 +20,7 @@ from uwlts.storage.import_.description import (
     read_description,
 )
 from uwlts.storage.import_.images import bits_of, grey_values, one_channel, read_image, without_background
-from uwlts.storage.import_.matching import Row, match, planned_frames, read_rows, stage_remark
+from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe.recording import BLACK, WHITE, is_black, shown_stripe, white_share
 
 _SIZE_ADVICE = {
@@ -195,7 +195,7 @@ def import_images(
     return Imported(len(matched.laser), len(matched.lamp), tuple(warnings))
 
 
-def _zero_dn(given: ImportDescription, frames: list[Row], bits: int) -> int:
+def _zero_dn(given: ImportDescription, frames: list[ImageRow], bits: int) -> int:
     """Grey value that stands for no difference; 0 where no background is subtracted."""
     if all(row.background is None for row in frames):
         return 0
@@ -242,7 +242,7 @@ class _Reader:
         return self._kept[1]
 
 
-def _remarks(given: ImportDescription, frames: list[Row], folder: Path, *, bits: int, zero_dn: int) -> Table:
+def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, bits: int, zero_dn: int) -> Table:
     """Provenance of the capture."""
     remarks: Table = {"source": "imported images", "uwlts": uwlts.__version__, "folder": folder.resolve().name}
     remarks |= {"bits": bits, "stage": stage_remark(given)}

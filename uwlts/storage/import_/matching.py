@@ -23,7 +23,7 @@ _LIGHTS = ("laser", "lamp", "ignore")
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class ImageRow:
     """What is known of one image: paths below the folder, NaN and None where it is not; ``number`` gives the order."""
 
     file: str
@@ -40,8 +40,8 @@ class Row:
 class Matched:
     """Images in order by what they are; ``unmatched`` are images of the folder that nothing describes."""
 
-    laser: list[Row]
-    lamp: list[Row]
+    laser: list[ImageRow]
+    lamp: list[ImageRow]
     unmatched: list[str]
 
 
@@ -50,7 +50,7 @@ def natural_key(name: str) -> list[str | int]:
     return [int(part) if part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
 
 
-def read_rows(path: Path) -> list[Row]:
+def read_rows(path: Path) -> list[ImageRow]:
     """Rows of a CSV table with the column ``file`` and any of light, background, stage_mm, exposure_ms, time_s, pose_00
     to pose_33; separated by commas or semicolons.
 
@@ -77,7 +77,7 @@ def read_rows(path: Path) -> list[Row]:
     return rows
 
 
-def _row(number: int, cells: dict[str, str], place: str) -> Row:
+def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     if None in cells or None in cells.values():
         raise DescriptionError(f"{place}: there are more or fewer cells than columns")
     texts = dict.fromkeys(_COLUMNS, "") | {name: cell.strip() for name, cell in cells.items()}
@@ -94,7 +94,7 @@ def _row(number: int, cells: dict[str, str], place: str) -> Row:
     given = np.count_nonzero(np.isfinite(pose))
     if given not in (0, 16):
         raise DescriptionError(f"{place}: only {given} of the 16 elements of the pose are given")
-    return Row(texts["file"], number, light, texts["background"] or None, **numbers, pose=pose if given else None)
+    return ImageRow(texts["file"], number, light, texts["background"] or None, **numbers, pose=pose if given else None)
 
 
 def _number(text: str, place: str) -> float:
@@ -114,7 +114,7 @@ def _refuse_any(names: list[str], before: str, after: str) -> None:
         raise DescriptionError(f"{before}{', '.join(names[:3])}{after}")
 
 
-def match(folder: Path, given: ImportDescription, rows: list[Row] | None) -> Matched:
+def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -> Matched:
     """Sort a folder's images by what they are; ``rows`` are those of a table.
 
     ImageError where the folder holds no image. DescriptionError where no image is known to be anything, one is two
@@ -125,7 +125,7 @@ def match(folder: Path, given: ImportDescription, rows: list[Row] | None) -> Mat
     files.sort(key=natural_key)
     if not files:
         raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(SUFFIXES)}")
-    known = [Row(name) for name in files] if rows is None else rows
+    known = [ImageRow(name) for name in files] if rows is None else rows
     missing = [row.file for row in known if not (folder / row.file).is_file()]
     _refuse_any(missing, "the table names ", f", which {folder} does not hold")
     if any(row.light is not None for row in known):
@@ -163,7 +163,9 @@ def _matches(name: str, patterns: Patterns) -> bool:
     return any(fnmatch(name, pattern) or fnmatch(PurePosixPath(name).name, pattern) for pattern in wanted)
 
 
-def _with_backgrounds(folder: Path, found: list[str], given: ImportDescription, laser: list[Row]) -> list[Row]:
+def _with_backgrounds(
+    folder: Path, found: list[str], given: ImportDescription, laser: list[ImageRow]
+) -> list[ImageRow]:
     """The laser images, all with a background or none; ``found`` are the images that its pattern names."""
     named = [row.background for row in laser if row.background is not None]
     if named and (given.background or len(named) < len(laser)):
@@ -184,7 +186,7 @@ def _with_backgrounds(folder: Path, found: list[str], given: ImportDescription, 
     return [replace(row, background=name) for row, name in zip(laser, names, strict=True)]
 
 
-def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool) -> list[Row]:
+def planned_frames(given: ImportDescription, matched: Matched, *, in_table: bool) -> list[ImageRow]:
     """All images in the order of the table, or of their positions, at each the lamp image before the laser image.
 
     Each has its position and its light, laser or lamp. DescriptionError where positions are missing, given twice, or
@@ -249,9 +251,9 @@ def _positions(given: ImportDescription, matched: Matched) -> list[float] | None
     return [start_mm + place * step_mm for place in range(count)]
 
 
-def _refuse_repeated(frames: Iterable[Row]) -> None:
+def _refuse_repeated(frames: Iterable[ImageRow]) -> None:
     """DescriptionError for two images of one light at one place, as from a step of zero or a line given twice."""
-    seen: dict[tuple[str | None, float], Row] = {}
+    seen: dict[tuple[str | None, float], ImageRow] = {}
     for row in frames:
         other = seen.setdefault((row.light, row.stage_mm), row)
         if other is not row:

@@ -8,7 +8,7 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.consistency import format_deviation
-from uwlts.calibration.joint.parameters import View
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError
@@ -95,7 +95,7 @@ def test_a_lens_other_than_in_water_is_refused(views, thesis):
 
 
 def test_a_water_image_said_to_be_in_air_shows_in_the_focal_length(views, thesis):
-    said = refusal(gathered(thesis, [replace(views[1], view=View(True, None))]))
+    said = refusal(gathered(thesis, [replace(views[1], view=ViewMedium(True, None))]))
     assert "the focal length is 32" in said
     assert "the medium in the captures" in said
 
@@ -155,14 +155,14 @@ def test_reflections_on_a_third_of_the_lines_are_left_out_with_a_word(views, the
 
 
 def test_a_lens_in_the_water_is_not_mixed_with_one_behind_a_window(views, thesis):
-    bare = replace(views[1], view=View(False, 0))
+    bare = replace(views[1], view=ViewMedium(False, 0))
     assert "taken without a window and others were not" in refusal(gathered(thesis, [bare, views[1]]))
 
 
 def test_a_lens_that_looks_straight_into_water_is_calibrated_for_it(thesis):
     noise = Noise(circles_px=0.03, stripe_px=0.1, rng=np.random.default_rng(1))
     series = target_series(BUILT, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
-    result = solve_jointly(gathered(thesis, [replace(series, view=View(False, 0))]), options=OPTIONS)
+    result = solve_jointly(gathered(thesis, [replace(series, view=ViewMedium(False, 0))]), options=OPTIONS)
     assert result.calibration.window is None
     assert result.calibration.medium_kind == "custom"
     focal = result.estimate.values[0] - BUILT.camera.focal_length_px()

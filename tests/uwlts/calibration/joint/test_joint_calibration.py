@@ -10,7 +10,7 @@ from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_poi
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.initial import series_start
-from uwlts.calibration.joint.parameters import Parameters, Prior, View
+from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.calibration import FanModel, SheetModel
@@ -128,7 +128,7 @@ def at_truth(view):
     return parameters, parameters.start(start.intrinsics.from_model(nominal.camera)), start
 
 
-@pytest.mark.parametrize("view", [View(False, None), View(True, None), View(True, 0)], ids=str)
+@pytest.mark.parametrize("view", [ViewMedium(False, None), ViewMedium(True, None), ViewMedium(True, 0)], ids=str)
 @pytest.mark.parametrize("kind", [TargetEvidence, StepProfileEvidence])
 def test_every_derivative_is_what_differences_say(view, kind):
     """By differences of the residuals' numerators: a residual is scaled by a derivative that is taken as constant.

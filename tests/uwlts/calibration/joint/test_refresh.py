@@ -15,7 +15,7 @@ from uwlts.calibration.evidence import StepEvidence
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.evidence import StepProfileEvidence
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
-from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, View
+from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.refresh import refresh, solve_refreshed
 from uwlts.calibration.joint.stored_estimate import found_estimate, stored_estimate
@@ -77,7 +77,7 @@ def steps(thesis, *, index=INDEX, depths_mm=(15.0,), medium=WARM, height_mm=STEP
         pixels = np.vstack(pieces)
         pixels = pixels[np.argsort(pixels[:, 0])]
         pixels[:, 1] += rng.normal(0, 0.1, len(pixels))
-        found.append((StepEvidence(pixels, standard, medium.refractive_index(WAVELENGTH), "step"), View(True, 0)))
+        found.append((StepEvidence(pixels, standard, medium.refractive_index(WAVELENGTH), "step"), ViewMedium(True, 0)))
     evidence = gathered(thesis, [], found)
     evidence.media["water"] = medium
     return evidence
@@ -119,7 +119,9 @@ def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thes
     """Two waters, in one of which the stripe lies on the lower tread alone."""
     evidence = steps(thesis)
     flat = replace(evidence.steps[0][0], pixels=tread(15.0, index=INDEX, beyond=31.0))
-    evidence = replace(evidence, media=evidence.media | {"pool": COLD}, steps=[*evidence.steps, (flat, View(True, 1))])
+    evidence = replace(
+        evidence, media=evidence.media | {"pool": COLD}, steps=[*evidence.steps, (flat, ViewMedium(True, 1))]
+    )
     result = refreshed(earlier, evidence, index_std=POORLY_KNOWN)
     assert [change.name for change in result.changes] == ["water 2"]
     assert "step: left out" in result.warnings[0]
@@ -179,7 +181,7 @@ def test_evidence_without_information_leaves_everything_as_it_was(earlier, thesi
     priors = known.parameters.priors | {StepHeight(20.0): Prior(20.0, 1e4)}
     parameters = replace(known.parameters, priors=priors, earlier=EarlierEstimate(known.values, known.covariance))
     evidence = StepProfileEvidence(
-        view=View(True, 0),
+        view=ViewMedium(True, 0),
         pixels=np.array([[300.0, 505.0], [900.0, 505.0], [600.0, 480.0]]),
         upper=np.array([False, False, True]),
         upward=-frame[:3, 2],
@@ -230,7 +232,7 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     assert region.has_area()
     known = estimate_in(calibration, region)
     assert known.parameters.medium_index(known.values, known.view) == calibration.media[1].index
-    assert stored_estimate(calibration, thesis, WARM).view == View(True, 1)
+    assert stored_estimate(calibration, thesis, WARM).view == ViewMedium(True, 1)
     std = lengths_over(known, region).std_mm(known.covariance)
     assert std.max() == pytest.approx(result.changes[0].length.after_mm, rel=0.1)
     assert certificate_of(calibration, path, issued="2026-01-01").validity[0].name == "water 2"

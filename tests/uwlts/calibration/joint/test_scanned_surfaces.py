@@ -18,7 +18,7 @@ from uwlts.calibration.joint.parameters import Parameters, Prior
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
 from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.model.artefacts import Pipe, PlaneStandard, SphereStandard
+from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.model.parameter_keys import parameter_of
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -36,8 +36,8 @@ LEANING = Body((0.0, 0.0, 20.0), None, (0.6, 0.1, 1.0))
 KINDS = {
     "spheres": (SPHERES, STANDARD),
     "plane": ((LEANING,), PlaneStandard()),
-    "pipe along": ((ALONG,), Pipe(diameter_mm=220.0)),
-    "pipe across": ((ACROSS,), Pipe(diameter_mm=60.0)),
+    "pipe along": ((ALONG,), PipeStandard(diameter_mm=220.0)),
+    "pipe across": ((ACROSS,), PipeStandard(diameter_mm=60.0)),
 }
 
 SLOPE_NAMES = [key.text for key in SLOPES]
@@ -284,7 +284,7 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
 def test_scans_that_do_not_show_what_they_say_are_left_out():
     bodies, plane = KINDS["plane"]
     stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3], count=300)
-    wrong = replace(stripes, artefact=Pipe(diameter_mm=220.0), source="pipe.h5")
+    wrong = replace(stripes, artefact=PipeStandard(diameter_mm=220.0), source="pipe.h5")
     few = replace(
         stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
     )
