@@ -162,7 +162,8 @@ class GrblController:
                 time.sleep(_BUSY_MS / 1000)
 
     def _say(self, data: bytes) -> None:
-        if self._muted or not self._powered:
+        # A closed port's bytes are lost; the pseudo terminal would keep them for the next program.
+        if self._muted or not (self._powered and self._port_open):
             return
         try:
             os.write(self._master, data)
