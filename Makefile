@@ -11,11 +11,12 @@ export PIP_NO_INPUT := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check bench docs setup clean
+.PHONY: help demo test test-full check bench docs setup clean
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
-	@echo "make test    check the code and run the tests"
+	@echo "make test    check the code and run the tests, without the slow ones"
+	@echo "make test-full   check the code and run all tests, slow studies of statistics and campaigns included"
 	@echo "make check   only check the code: format, lint, layers of imports, types"
 	@echo "make bench   measure speed"
 	@echo "make docs    build the documentation site in docs/_build/html"
@@ -25,9 +26,10 @@ help:
 demo: setup
 	@$(PYTHON) -m twin.cli demo
 
-test: check
+test: PYTEST_OPTIONS := -m "not slow"
+test test-full: check
 	@$(PYTHON) -m twin.devices.aravis_install
-	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --durations=10
+	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --durations=10 $(PYTEST_OPTIONS)
 
 check: setup
 	@$(PYTHON) -m ruff format --check --quiet .

@@ -437,7 +437,7 @@ def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(cont
         (lambda c: c.inject("restart"), "restarted by itself", True),
         (lambda c: c.inject("mute"), "silence: 3 status queries", False),
         (lambda c: c.inject("hold"), "feed hold", True),
-        (lambda c: c.inject("lose-steps", -80 * 400), "missed steps: the limit switch at 0 mm is pressed", True),
+        (lambda c: c.inject("lose-steps", -80 * 700), "missed steps: the limit switch at 0 mm is pressed", True),
     ],
 )
 def test_a_fault_while_moving_is_named_and_the_laser_is_off(controller, stage, fault, message, recovers):
