@@ -114,7 +114,7 @@ class _Job:
 
     take: Take
     path: Path
-    spp: int
+    options: Options
     variant: str
 
     @property
@@ -147,7 +147,7 @@ def record_campaigns(
     """
     folders = [folder / f"campaign-{seed}" for seed in seeds]
     jobs = [
-        _Job(take, place / f"{take.name}.h5", spp, variant)
+        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed), variant)
         for seed, place in zip(seeds, folders, strict=True)
         for take in takes(campaign, seed=seed, every=every)
     ]
@@ -216,7 +216,7 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
             take.sensor,
             job.path,
             as_built=take.built,
-            options=Options(spp=job.spp, seed=take.seed),
+            options=job.options,
             overwrite=True,
             # What is there of an incomplete recording is a part to go on with, or lacks its truth.
             resume=part_path(job.path).exists(),

@@ -13,10 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, JsonValue, ValidationError
 
 from uwlts.model.errors import CaptureError, OutputError, problems_of
-from uwlts.model.sensor import Table
 
 
 @contextmanager
@@ -92,7 +91,7 @@ def sha256_of(path: str | Path) -> str:
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
 
-def read_json(path: str | Path, *, called: str) -> Table:
+def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
     """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))

@@ -170,7 +170,7 @@ def test_in_air_a_single_interface_and_no_window_change_nothing():
 def test_the_sense_and_length_of_the_windows_normal_do_not_matter():
     normal = tilted(10.0, -5.0)
     forth = trace_window(cone(6), plate(normal=tuple(normal)), medium_index=1.33)
-    back = trace_window(cone(6), plate(normal=tuple(-2.0 * normal)), medium_index=1.33)
+    back = trace_window(cone(6), plate().model_copy(update={"normal": tuple(-2.0 * normal)}), medium_index=1.33)
     np.testing.assert_allclose(back.origins, forth.origins, rtol=0, atol=1e-13)
     np.testing.assert_allclose(back.directions, forth.directions, rtol=0, atol=1e-15)
 
