@@ -1,9 +1,10 @@
 """The ``uwlts`` command line itself, and what its commands share."""
 
+import pkgutil
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -21,8 +22,12 @@ Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative=""
 Coefficients = Annotated[
     tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
 ]
-# The names of uwlts.stripe.methods, which is not imported for a command's help.
-MethodName = Literal["centre-of-mass", "profile-fit", "quadratic", "zero-crossing"]
+if TYPE_CHECKING:
+    MethodName = str
+else:
+    # The names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
+    _METHODS = Path(uwlts.__file__).parent / "stripe" / "methods"
+    MethodName = Literal[tuple(sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)])))]
 Method = Annotated[MethodName | None, Parameter(help="How the stripe's centre is found.")]
 Index = Annotated[
     float | None, Parameter(help="Refractive index of the medium, in place of the one that follows from the captures.")

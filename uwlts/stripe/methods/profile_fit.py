@@ -36,7 +36,7 @@ _MEDIAN_MEAN_SQUARE = 0.934
 """Median of the mean square of 2 x 5 unit Gaussian numbers (chi-square of 10 degrees)."""
 
 
-def profile_fit(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Centre (M,) float32 of the best-fitting Gaussian profile, px from the window's first pixel.
 
     The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. A pixel's variance

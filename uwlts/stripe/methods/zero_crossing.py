@@ -1,0 +1,31 @@
+"""The stripe's centre where the smoothed profile's derivative crosses zero."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
+
+
+def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe, and M0 there.
+
+    With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative, at c, of the
+    profile f smoothed with g. As wide as the stripe, the kernel is the matched filter: the zero is the least-squares
+    position of a Gaussian, of least variance in white noise. The kernel is evaluated at a real-valued c0, the midpoint
+    of the half-height crossings, instead of interpolating between pixels. With Mk = sum f t^k g the slope of F by c / s
+    is M2 - M0, so that Newton's step is r = M1 / (M0 - M2). For a Gaussian f of sigma s, F(c) is proportional to
+    d exp(-d^2 / 4), d being the step that is sought, and r = d / (1 - d^2 / 2): d is r - r^3 / 2 to fourth order.
+
+    A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
+    """
+    zeroth, first, second = gaussian_moments(peak, peak.middle, kernel, 2)
+    first -= peak.slope * math.sqrt(2.0 * math.pi) * kernel * kernel
+    step = first / np.maximum(zeroth - second, 0.1 * np.abs(zeroth))
+    step = np.minimum(np.maximum(step, -0.5), 0.5)
+    step -= 0.5 * step * step * step
+    # The sum under the Gaussian at its top, from its value a step away.
+    top = zeroth * (1.0 + 0.25 * step**2)
+    return peak.middle + kernel * step, top
