@@ -29,7 +29,7 @@ demo: setup
 test: PYTEST_OPTIONS := -m "not slow"
 test test-full: check
 	@$(PYTHON) -m twin.devices.aravis_install
-	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --durations=10 $(PYTEST_OPTIONS)
+	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS)
 
 check: setup
 	@$(PYTHON) -m ruff format --check --quiet .

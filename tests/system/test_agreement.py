@@ -15,6 +15,8 @@ from twin.options import CPU
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import open_workers
 
+pytestmark = pytest.mark.slow
+
 
 def candidate(label: str, number: int, sensor: Sensor) -> Marked:
     return Marked(label, sensor, EvaluatedDesign(number, {}, {}, 0.0, ""))

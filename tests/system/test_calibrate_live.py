@@ -28,6 +28,8 @@ from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, part_path
 from uwlts.targets import CircleTarget
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 COUNT = 5
 SENSOR = """

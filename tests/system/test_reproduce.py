@@ -26,6 +26,8 @@ from uwlts.model.errors import DescriptionError
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.truth import read_truth, truth_path
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 SENSOR = """
 base = "thesis"

@@ -13,6 +13,8 @@ from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene, load_scene
 from uwlts.storage.capture import Capture, part_path
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 SENSOR = """
 base = "thesis"

@@ -17,6 +17,8 @@ from twin.scene.description import Scene, load_scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 
+pytestmark = pytest.mark.slow
+
 STEP_MM = 2.0
 MOTION = ("start_mm = -20.0", "step_mm = 2.0", "count = 21")
 DESCRIPTIONS = {

@@ -25,6 +25,8 @@ from uwlts.thesis.joint_comparison import compare_campaigns, joint_summary, summ
 from uwlts.thesis.measurements import TWO, calibrations, measure_scan
 from uwlts.thesis.results import CampaignResults, Measurement
 
+pytestmark = pytest.mark.slow
+
 SPHERES, PLANE = ("spheres", "standoff"), ("plane", "standoff")
 GATES_MM = {
     (*SPHERES, "two refractions", "ours", "SSE"): (0.0014, 0.0214),

@@ -14,6 +14,8 @@ from uwlts.model.errors import CalibrationError, DescriptionError, DesignError, 
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 
+pytestmark = pytest.mark.slow
+
 CLOSE = {
     "camera": {"focal_length_mm": 8.0, "focus_distance_mm": 220.0, "window": {"aperture_diameter_mm": 80.0}},
     "laser": {"baseline_mm": 154.0, "waist_distance_mm": 268.0},

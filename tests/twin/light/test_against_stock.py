@@ -185,6 +185,7 @@ def test_light_scattered_once_is_stocks(broad, medium):
     assert (stock[:, off_stripe(direct) & (twin[0] == 0)] == 0).all(), "there is no haze behind the plate"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asymmetry", "names"),
     [(0.0, ("stripe", "before", "behind")), (0.5, ("stripe", "behind")), (0.9, ("stripe",))],

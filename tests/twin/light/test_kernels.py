@@ -30,6 +30,7 @@ def sphere() -> dict[str, object]:
     return {"kind": "sphere", "diameter_mm": 50.0, "position_mm": (0.0, 10.0, 0.0)}
 
 
+@pytest.mark.slow
 def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels):
     # A focal length of its own makes sure that no other test has left these kernels in memory.
     sensor = altered(

@@ -280,6 +280,7 @@ NOISY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NOISY)
 def test_no_walk_outshines_the_stripe(tiny, name):
     medium, scene = NOISY[name]
@@ -309,6 +310,7 @@ def test_seeds_choose_the_walks_and_nothing_else(tiny):
     assert (first.scattered != other.scattered).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_the_mean_does_not_depend_on_the_number_of_walks(coarse):
     renderer = Renderer(
         coarse,
@@ -340,6 +342,7 @@ def test_images_hold_what_the_walks_find(tiny):
     assert np.mean(sums) == pytest.approx(found.sum(), abs=5 * scatter)
 
 
+@pytest.mark.slow
 def test_light_on_longer_ways_moves_with_the_sensor(coarse):
     """Sensor and scene moved together show the same image: nothing may depend on where the scene's origin lies."""
     shift = np.array([7.0, -5.0, 60.0])

@@ -27,6 +27,8 @@ from uwlts.model.errors import CalibrationError
 from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
 from uwlts.storage.files import json_text
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 AIR, IN_WATER = np.arange(8) * 35.0 - 200.0, np.arange(11) * 18.0 - 120.0
 

@@ -9,6 +9,8 @@ from scipy.stats import binom, chi2
 
 from tests.bench.coverage import Campaign, judged, run_campaign, within
 
+pytestmark = pytest.mark.slow
+
 WET, DRY = 16, 8
 BY_CHANCE = 1e-4
 """How often a test of a correct uncertainty fails; where all campaigns are drawn by the same seeds, never again."""

@@ -209,6 +209,7 @@ def test_air_and_water_together_are_better_than_either(in_air, in_water, thesis)
     assert std["laser_window_turn"] < 0.1 * alone["laser_window_turn"]
 
 
+@pytest.mark.slow
 def test_stated_uncertainties_hold_over_many_calibrations(thesis):
     found = []
     for seed in range(6):
