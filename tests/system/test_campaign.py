@@ -119,6 +119,7 @@ def test_a_hundredth_of_a_millimetre_is_noticed(tmp_path: Path):
     assert truth.share_within_tolerance < 0.99
 
 
+@pytest.mark.slow
 def test_pipe_and_step_in_water(tmp_path: Path, campaign: tuple[Path, CalibrationResult]):
     calibration = campaign[1].calibration
     few = {"start_mm": -20.0, "step_mm": 5.0, "count": 9}

@@ -15,6 +15,8 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.storage.calibration_file import write_calibration
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -677,6 +677,7 @@ def test_left_over_part_and_truth_are_refused(fails, folder: Path, tmp_path: Pat
 FRAMES = 60
 
 
+@pytest.mark.slow
 def test_interrupted_simulation_is_kept_and_resumed(command, folder: Path, tmp_path: Path):
     scene = tmp_path / "scene.toml"
     scene.write_text(f'base = "plane"\n[motion]\nstart_mm = -30.0\nstep_mm = 0.2\ncount = {FRAMES}\n', encoding="utf-8")

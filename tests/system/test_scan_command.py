@@ -103,6 +103,7 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
     assert spreads[0] == pytest.approx(spreads[1], rel=0.25)
 
 
+@pytest.mark.slow
 def test_automatic_exposure_comes_near_that_of_the_twin(served, folder, tmp_path):
     done = run(written(folder, served, count=2), tmp_path / "scan.h5")
     assert done.returncode == 0, done.stderr
@@ -126,6 +127,7 @@ def test_background_is_subtracted_and_lamp_images_are_kept(served, folder, tmp_p
         assert np.median(laser) == pytest.approx(256, abs=1) and laser.max() > 300
 
 
+@pytest.mark.slow
 def test_an_interrupted_scan_is_dark_keeps_its_images_and_goes_on(served, folder, tmp_path):
     out = tmp_path / "scan.h5"
     plan = written(folder, served, top="laser_ms = 0.3", settle_s=0.4)

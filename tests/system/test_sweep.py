@@ -20,6 +20,8 @@ from twin.design.screening import parts, read_parts, screen
 from uwlts.model.library import load_sensor
 from uwlts.runtime.workers import open_workers
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 SWEEP = [sys.executable, "-m", "twin.cli", "sweep"]
 STUDY = """
@@ -96,7 +98,6 @@ def same(out: Path, expected: dict[str, np.ndarray]) -> None:
     assert found["failure"].tolist() == expected["failure"].tolist()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
 def test_a_stopped_sweep_goes_on_without_repeating_or_losing(study, tmp_path, expected, sent):
     out = tmp_path / "out"
@@ -168,7 +169,6 @@ def _scene(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
 def test_two_machines_share_a_study(study, tmp_path, expected):
     out = tmp_path / "out"
     first = begun(study, out, "--workers", "1")
@@ -179,7 +179,6 @@ def test_two_machines_share_a_study(study, tmp_path, expected):
     same(out, expected)
 
 
-@pytest.mark.slow
 def test_a_study_is_not_mixed_with_another(study, tmp_path):
     out = tmp_path / "out"
     assert run(study, out, "--designs", "300").returncode == 0
@@ -191,7 +190,6 @@ def test_a_study_is_not_mixed_with_another(study, tmp_path):
     assert read_parts(out / "screen")["laser.baseline_mm"].min() >= 70.0
 
 
-@pytest.mark.slow
 def test_more_designs_may_be_asked_for(study, tmp_path, expected):
     out = tmp_path / "out"
     for count in (400, 900):
@@ -202,7 +200,6 @@ def test_more_designs_may_be_asked_for(study, tmp_path, expected):
         np.testing.assert_array_equal(found["sigma_z_rms_mm"], expected["sigma_z_rms_mm"][:count])
 
 
-@pytest.mark.slow
 def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):
     study.write_text(STUDY.replace('"sobol"', '"optimise"').replace("batch = 250", "batch = 64"), encoding="utf-8")
     out = tmp_path / "out"
@@ -278,7 +275,6 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
             process.wait()
 
 
-@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_loses_nothing(study, tmp_path, expected):
     from distributed import Client
 

@@ -21,6 +21,8 @@ from twin.options import ALL
 from twin.scene.description import Scene
 from uwlts.model.sensor import Medium, Sensor
 
+pytestmark = pytest.mark.slow
+
 BLOCK_PX = WALK_CELL_PX
 """The twin's own cells of smooth light away from the stripe: blocks of this size are what it computes there."""
 SIGMA_DEG, FAN_DEG = 0.5, 35.0
@@ -185,7 +187,6 @@ def test_light_scattered_once_is_stocks(broad, medium):
     assert (stock[:, off_stripe(direct) & (twin[0] == 0)] == 0).all(), "there is no haze behind the plate"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asymmetry", "names"),
     [(0.0, ("stripe", "before", "behind")), (0.5, ("stripe", "behind")), (0.9, ("stripe",))],

@@ -18,6 +18,8 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, truth_path
 from uwlts.targets.detection import find_circles
 
+pytestmark = pytest.mark.slow
+
 COLUMNS, ROWS, ORIGIN = 7, 5, (2, 3)
 PLATE = {
     "kind": "circle_plate",

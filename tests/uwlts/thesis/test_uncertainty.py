@@ -33,6 +33,8 @@ from uwlts.thesis import monte_carlo
 from uwlts.thesis.monte_carlo import Propagated, propagate
 from uwlts.thesis.sphere_spacing import SphereScan, mm_per_px, spacing_budget, spacing_error
 
+pytestmark = pytest.mark.slow
+
 SENSOR = built_sensor()
 LENS = lens_of(SENSOR)
 WATER = Medium(kind="fresh", temperature_c=25.0)

@@ -15,6 +15,8 @@ from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter, parameter_of
 from uwlts.model.sensor import Medium, Uncertainty
 
+pytestmark = pytest.mark.slow
+
 BUILT = built_sensor()
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 

@@ -24,6 +24,8 @@ from uwlts.calibration.target_images import TargetImage
 from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
 from uwlts.targets import parse_target
 
+pytestmark = pytest.mark.slow
+
 BUILT = built_sensor()
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 

@@ -134,6 +134,7 @@ def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
     assert length_error(result.calibration) < 0.4 * length_error(earlier)
 
 
+@pytest.mark.slow
 def test_stated_uncertainties_of_the_index_hold(thesis):
     """Pulls of independent calibrations and steps: the mean square of 5 lies within 0.04 and 4.1 (chi2, 99.8 %)."""
     pulls = []
