@@ -113,3 +113,22 @@ def test_commands_take_what_their_functions_take(line: str):
     assert of_command <= set(given) and of_function <= set(taken)
     for shared in set(given) - of_command:
         assert given[shared].default == taken[shared].default, shared
+
+
+@pytest.mark.parametrize("line", ["serve plane", "reproduce", "demo", "sweep baseline-angle"])
+def test_commands_run_with_their_defaults(line: str, monkeypatch: pytest.MonkeyPatch):
+    """Parsing accepts each default as the function has it, and hands over nothing else."""
+    name, *words = line.split()
+    function, taken = getattr(twin, name), []
+
+    def recorded(*positional: object, **named: object) -> None:
+        taken.append(inspect.signature(function).bind(*positional, **named))
+        raise uwlts.Error("as far as the test goes")
+
+    monkeypatch.setattr(twin, name, recorded)
+    with pytest.raises(uwlts.Error, match="as far as"):
+        twin.cli.app([name, *words])
+    taken[0].apply_defaults()
+    given = {key: value for key, value in taken[0].arguments.items() if key not in ("show_progress", "report")}
+    defaults = {key: one.default for key, one in inspect.signature(function).parameters.items() if key in given}
+    assert given == defaults | dict(zip(defaults, words, strict=False))

@@ -9,8 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 
-FOLDER = Path("runs/demo")
-"""Where the results lie unless another folder is given."""
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
 """Commands of one stage run at a time: no single one keeps all processors busy."""
@@ -50,7 +48,7 @@ def commands(out: Path) -> list[tuple[str, str]]:
     return rows
 
 
-def demo(out: str | Path = FOLDER) -> Path:
+def demo(out: str | Path = "runs/demo") -> Path:
     """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
 
     Runs exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html,
