@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uwlts.model.errors import Error
+from uwlts.runtime.workers import interrupts_kept
 
 USER_ERROR, INTERRUPTED = 2, 130
 
@@ -33,7 +34,8 @@ def run(app: App) -> int:
     # Ctrl-C would end the program before anything can be said.
     app.suppress_keyboard_interrupt = False
     try:
-        app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_value")
+        with interrupts_kept():
+            app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_value")
         sys.stdout.flush()
     except CycloptsError:
         return USER_ERROR

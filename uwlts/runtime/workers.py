@@ -6,9 +6,11 @@ ends, however that happens: `concurrent.futures` finishes what it has begun and 
 and leaves its processes behind where the command is killed.
 """
 
+import _thread
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -35,6 +37,9 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEX
 
 _GRACE_S = 5.0
 """Time in which a process may leave its files in order before it is killed."""
+
+_AGAIN_S = 0.01
+"""Callbacks of weak references take microseconds."""
 
 _AHEAD = 2
 """Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
@@ -272,6 +277,25 @@ def _start(process: BaseProcess, threads: int) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Deliver an interrupt again that fell into the callback of a weak reference, where Python reports and drops it."""
+    plain = sys.unraisablehook
+
+    def report(dropped: Any) -> None:
+        if isinstance(dropped.exc_value, KeyboardInterrupt):
+            # Not from here, where it would be dropped too.
+            threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
+        else:
+            plain(dropped)
+
+    sys.unraisablehook = report
+    try:
+        yield
+    finally:
+        sys.unraisablehook = plain
+
+
 def _serve(connection: Connection) -> None:
     """Do one job after the other in a process, until there are no more or it is stopped."""
     stopped = threading.Event()
@@ -291,18 +315,19 @@ def _serve(connection: Connection) -> None:
     try:
         signal.signal(signal.SIGTERM, stop)
         threading.Thread(target=_end_with_parent, daemon=True).start()
-        while (given := connection.recv()) is not None:
-            kind, content = given
-            if kind == "work":
-                work = content
-                continue
-            assert work is not None
-            try:
-                result = work(content, partial(send, "message"))
-            except (Error, OSError) as error:
-                send("raised", error)
-            else:
-                send("done", result)
+        with interrupts_kept():
+            while (given := connection.recv()) is not None:
+                kind, content = given
+                if kind == "work":
+                    work = content
+                    continue
+                assert work is not None
+                try:
+                    result = work(content, partial(send, "message"))
+                except (Error, OSError) as error:
+                    send("raised", error)
+                else:
+                    send("done", result)
     finally:
         # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
         if stopped.is_set():
