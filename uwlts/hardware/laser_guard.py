@@ -21,8 +21,9 @@ def wait_for_the_end_of(parent: int) -> None:
 
     The second way is for a pipe that a forked child of the program keeps open.
     """
-    while os.getppid() == parent and not select.select([0], [], [], _WATCH_S)[0]:
-        pass
+    while os.getppid() == parent:
+        if select.select([sys.stdin], [], [], _WATCH_S)[0]:
+            return
 
 
 def switch_off(port: int) -> None:

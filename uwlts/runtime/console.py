@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uwlts.model.errors import Error
-from uwlts.runtime.workers import interrupts_kept
+from uwlts.runtime.interrupts import interrupts_kept
 
 USER_ERROR, INTERRUPTED = 2, 130
 

@@ -6,11 +6,9 @@ ends, however that happens: `concurrent.futures` finishes what it has begun and 
 and leaves its processes behind where the command is killed.
 """
 
-import _thread
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -28,6 +26,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.model.errors import Error, SetupError
+from uwlts.runtime.interrupts import interrupts_kept
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -37,9 +36,6 @@ _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEX
 
 _GRACE_S = 5.0
 """Time in which a process may leave its files in order before it is killed."""
-
-_AGAIN_S = 0.01
-"""Callbacks of weak references take microseconds."""
 
 _AHEAD = 2
 """Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
@@ -275,25 +271,6 @@ def _start(process: BaseProcess, threads: int) -> None:
         for name in set(_THREADS) - set(given):
             del os.environ[name]
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def interrupts_kept() -> Iterator[None]:
-    """Deliver an interrupt again that fell into the callback of a weak reference, where Python reports and drops it."""
-    plain = sys.unraisablehook
-
-    def report(dropped: Any) -> None:
-        if isinstance(dropped.exc_value, KeyboardInterrupt):
-            # Not from here, where it would be dropped too.
-            threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
-        else:
-            plain(dropped)
-
-    sys.unraisablehook = report
-    try:
-        yield
-    finally:
-        sys.unraisablehook = plain
 
 
 def _serve(connection: Connection) -> None:

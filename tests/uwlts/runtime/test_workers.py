@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-import weakref
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import pytest
 
 from uwlts.model.errors import CaptureError, SetupError
 from uwlts.runtime import workers
-from uwlts.runtime.workers import interrupts_kept, work_through
+from uwlts.runtime.workers import work_through
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -167,21 +166,3 @@ def test_workers_do_linear_algebra_in_one_thread_unless_set_otherwise(monkeypatc
     assert work_through(threads, [0, 1], workers=2) == [("1", "3")] * 2
     assert "OPENBLAS_NUM_THREADS" not in os.environ
     assert os.environ["OMP_NUM_THREADS"] == "3"
-
-
-def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixture):
-    """Python reports and drops what a weak reference's callback raises; Ctrl-C may fall into one at any time."""
-
-    class Thing:
-        pass
-
-    def callback(_: object) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), interrupts_kept():
-        thing = Thing()
-        reference = weakref.ref(thing, callback)
-        del thing
-        time.sleep(1)
-    assert reference() is None
-    assert capsys.readouterr().err == ""
