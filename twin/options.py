@@ -60,7 +60,7 @@ NONE = ALL.without(*ALL.names())
 
 @dataclass(frozen=True)
 class Options:
-    """How to render: samples per lit pixel, seed of all that is random, and what the images show."""
+    """Rendering options: samples per lit pixel, seed of all that is random, and what the images show."""
 
     spp: int = 16
     seed: int = 0

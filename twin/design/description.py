@@ -18,7 +18,7 @@ FOLDER = "studies"
 OTHER_COLUMNS = ("design", "violation", "failure")
 """Columns of results besides values and figures."""
 FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
-"""What follows the stand-off and could be free as well."""
+"""Parameters that follow the stand-off and could be free as well."""
 MOST_DESIGNS = 10**8
 Value = float | int | str | bool
 
@@ -104,7 +104,7 @@ class Constraint(Description):
 
 
 class Sampling(Description):
-    """How designs are chosen: all of a grid, at random, by a Sobol sequence, or by an optimiser (NSGA-II).
+    """Choice of designs: all of a grid, at random, by a Sobol sequence, or by an optimiser (NSGA-II).
 
     ``designs`` is their number where it is not the grid's; ``batch`` designs are judged at a time.
     """

@@ -102,7 +102,7 @@ def _changed(sensor: Sensor, changes: Mapping[str, Value], source: str) -> Senso
 
 
 def judged(study: Study, designs: Sequence[Design]) -> Columns:
-    """What the formulas say of N designs, as columns (N,).
+    """Results of the formulas for N designs, as columns (N,).
 
     "design" is the number; the values of what is free and all `Figures` follow by their names, then "violation" and
     "failure", see `EvaluatedDesign`. A design that fails has figures NaN and an infinite violation.
@@ -166,7 +166,7 @@ def violations(study: Study, figures: Figures) -> np.ndarray:
 
 
 def number_of_designs(study: Study) -> int:
-    """How many designs a study judges."""
+    """Number of designs that a study judges."""
     if study.sampling.kind != "grid":
         return study.sampling.designs
     return math.prod(len(variable.grid()) for variable in study.free().values())

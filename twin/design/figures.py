@@ -39,7 +39,7 @@ DEPTHS, PLACES = 5, 7
 places along the stripe at each."""
 _EDGE_STEPS = 5
 _NEAREST_MM, _FARTHEST_MM = 1.0, 1e6
-"""Where the sheet is taken to leave the image at most: so far from the window's outer face, and from the pupil."""
+"""Largest distances at which the sheet leaves the image: from the window's outer face, and from the pupil."""
 _BRIGHT_LINES = 2.05
 """Automatic exposure lets 2 % of the profile lines be brighter: standard deviations of speckle above the mean."""
 _UNMODELLED = 0.02
@@ -182,7 +182,7 @@ def _lit(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
 
 @dataclass(frozen=True)
 class Field:
-    """What is where in the measuring volume, arrays that go with (N, DEPTHS, PLACES).
+    """Quantities over the measuring volume, arrays that go with (N, DEPTHS, PLACES).
 
     ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties by the
     stripe's noise. ``lit`` is where the fan has a line in view of the image's other sides, ``in_view`` where the
@@ -208,7 +208,7 @@ class Field:
 
 
 def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
-    """Where the part of the measuring volume begins and ends that the camera sees, in the middle of the line.
+    """Beginning and end of the part of the measuring volume that the camera sees, in the middle of the line.
 
     Depths from the window's outer face. Where the sheet leaves the image follows from Newton's method in the inverse of
     the depth, in which the pixel is nearly linear (exactly so without a window).

@@ -261,7 +261,7 @@ def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> I
 
 
 def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
-    """How the image point's slopes (a, b) change per mm that a point moves along a direction.
+    """Change of the image point's slopes (a, b) per mm that a point moves along a direction.
 
     From p M(p, h) = rho: the slope p changes by (d rho - p S dh) / growth, h being the point's height; and what goes
     square to the plane of incidence is seen from the apparent distance M.
@@ -279,7 +279,7 @@ def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> t
 
 
 def pixels_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
-    """How the pixels (x, y) change per mm that a point moves along a direction."""
+    """Change of the pixels (x, y) per mm that a point moves along a direction."""
     da, db = slopes_per_mm(view, window, along)
     xa, xb, ya, yb = view.jacobian
     return xa * da + xb * db, ya * da + yb * db

@@ -141,7 +141,7 @@ class SensorArrays:
         return self._averaged(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
 
     def centre_contrast(self, xp: ModuleType, sigma_px: Array) -> Array:
-        """What that contrast would be if neighbours across a stripe erred independently, to the same effect.
+        """Contrast with the same effect if neighbours across a stripe erred independently.
 
         Speckle is alike in neighbours where grains are as large as pixels. A stripe of standard deviation s is shifted
         by what changes across it at the frequency f = 1 / (2 pi s). Of the squared contrast, summed over all

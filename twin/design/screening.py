@@ -58,7 +58,7 @@ def parts(folder: Path) -> list[Path]:
 
 
 def rows_in(path: Path) -> int:
-    """How many designs a part holds, 0 if there is none or it is damaged."""
+    """Number of designs in a part, 0 if there is none or it is damaged."""
     try:
         return pq.read_metadata(path).num_rows if path.is_file() else 0
     except (pa.ArrowInvalid, OSError):
@@ -145,7 +145,7 @@ def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
 Progress = Callable[[int, int], None]  # called with the number of designs that are done, and of how many
 PLAN, PARTS = "plan.json", "screen"
 _FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
-"""What may be different when a sweep is gone on with, besides the number of random, Sobol or optimised designs."""
+"""Settings that may differ when a sweep is resumed, besides the number of random, Sobol or optimised designs."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Batch:
 
 
 def judged_part(batch: Batch) -> bytes:
-    """What the formulas say of a batch, as the content of its part."""
+    """Results of the formulas for a batch, as the content of its part."""
     return as_part(judged(batch.study, batch.all()))
 
 

@@ -95,7 +95,7 @@ class LineOfSight:
 
 
 def longest_run(flags: np.ndarray | list[bool]) -> slice:
-    """Where the longest row of true flags lies; empty where there is none."""
+    """Slice of the longest row of true flags; empty if there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     start, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
     return slice(start, end)
@@ -135,7 +135,7 @@ class PlannedRecording:
 
 @dataclass(frozen=True)
 class Recordings:
-    """What is recorded for a verification; a sensor without refraction to calibrate needs no step standard."""
+    """Captures recorded for a verification; a sensor without refraction to calibrate needs no step standard."""
 
     target: PlannedRecording
     step: PlannedRecording | None

@@ -122,7 +122,7 @@ class GrblFirmware:
 
     @property
     def stage_mm(self) -> float:
-        """Where the stage stands."""
+        """Position of the stage."""
         return self.axis.at(self._now())[0] + self.shift_mm
 
     @property

@@ -89,7 +89,7 @@ class Axis:
 
     @property
     def planned_mm(self) -> float:
-        """Where the last queued movement ends."""
+        """End of the last queued movement."""
         return self._moves[-1].end_mm if self._moves else self.rest_mm
 
     @property

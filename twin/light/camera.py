@@ -29,7 +29,7 @@ from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
 _STEP_MM = 1e-3
-"""How far along its direction a refracted ray starts; far above the spacing of 32-bit floats at 1 m (6e-5 mm)."""
+"""Offset of a refracted ray's start along its direction; far above the spacing of 32-bit floats at 1 m (6e-5 mm)."""
 _NEWTON_STEPS = 6
 """Lead to the rounding of 32 bits for the distortion of real lenses."""
 _FIELD = 0.96
@@ -253,7 +253,7 @@ class RaySegment:
     valid: Bool
 
     def end(self) -> Point3f:
-        """Where the segment ends, in the OCS."""
+        """End of the segment, in the OCS."""
         return mi.Point3f(self.origin + self.direction * dr.select(self.valid, self.si.t, 1.0))
 
 

@@ -68,7 +68,7 @@ class Light:
         return mi.Point3f(p if travel_mm is None else p + self._pose.object_travel(travel_mm))
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
-        """Where the sheet may shine: everywhere, but by way of a mirror only where that sends it."""
+        """Region the sheet may light: everywhere, but by way of a mirror only where that sends it."""
         everywhere = dr.full(mi.Bool, True, dr.width(p))
         return everywhere if self._mirror is None else self._on_mirror(p, -light.direction)[1]
 
@@ -86,7 +86,7 @@ class Light:
         return active & ~self._blocked(objects, turn, onward, light.exit_mm - t, travel_mm, active)
 
     def _on_mirror(self, p: Point3f, direction: Vector3f) -> tuple[Float, Bool]:
-        """How far rays run to the mirror's face, and whether they meet its front."""
+        """Distances that rays run to the mirror's face, and whether they meet its front."""
         start, along = self._to_face @ mi.Point3f(p), self._to_face @ direction
         t = -start.z / along.z
         inside = (dr.abs(start.x + t * along.x) <= self._half.x) & (dr.abs(start.y + t * along.y) <= self._half.y)
@@ -107,7 +107,7 @@ class Light:
         return Rays(self._from_own @ mi.Point3f(rays.origin), self._from_own @ rays.direction, rays.weight)
 
     def crossing(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
-        """Where rays of the sheet's own OCS cross its middle: how far along, and the light there in its own OCS."""
+        """Crossings of rays with the middle of the sheet, in its own OCS: distances along them, and the light there."""
         t = -origin.x / direction.x
         light = self.sheet.at(mi.Point3f(origin + direction * t))
         t -= light.distance_mm / dr.dot(direction, light.normal)

@@ -17,7 +17,7 @@ NODE_SPACING_PX = 2
 LIT_SIGMAS = 4.5
 """The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
 _CANDIDATES = 64
-"""How many generators are tried for every further axis; more improve the lattice by a few percent."""
+"""Number of generators tried for every further axis; more improve the lattice by a few percent."""
 
 
 def golden_step(count: int) -> int:

@@ -43,7 +43,7 @@ WALKS_AT_ONCE = 2**21
 CHANGE_SHARE = 2e-3
 """Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
 _MIRRORS = 2
-"""How many mirrors the camera looks into one after the other."""
+"""Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
 _TRAVEL_STEP_MM = 0.2

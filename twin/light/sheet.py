@@ -39,7 +39,7 @@ _LARGEST_MISS_MM = 1e-3
 """By how much the series may miss a traced ray 1 m behind the window."""
 _SERIES_MM = 5e-5
 _SERIES_SLOPE = 1e-7
-"""What the terms left out of a series may sum up to: about the roundings of the traced rays."""
+"""Largest sum of the terms left out of a series: about the rounding errors of the traced rays."""
 _SMALLEST_SPREAD_MM = 1e-3
 """Rays closer to where the fan begins are taken as if so far from it."""
 

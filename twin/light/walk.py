@@ -151,7 +151,7 @@ class Walker:
         lobes = _TOWARDS_LASER / len(self.lights) if self._scatters else 0.0
 
         def scattered(onward: Vector3f) -> tuple[Float, Float]:
-            """What the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
+            """Light that the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
             reflectance, density = bsdf.eval_pdf(context, si, si.to_local(self.pose.direction(onward)), hit & ~in_water)
             value = dr.select(in_water, self.scattering.phase(_one_minus_cosine(d, onward)), reflectance[0])
             density = dr.select(in_water, value, density * (1 - mirror))

@@ -111,7 +111,7 @@ class Studio:
         return transform
 
     def travel(self, light: Light) -> Travel | None:
-        """How the sensor travels during an exposure; None where it stands still."""
+        """Movement of the sensor during an exposure; None if it stands still."""
         motion, detector = self.scene.motion, self.sensor.detector
         if motion.speed_mm_per_s == 0 or not self.options.effects.motion:
             return None
@@ -175,7 +175,7 @@ class Studio:
         return grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
 
     def truth(self, shot: Shot) -> "FrameTruth":
-        """What every profile line of a shot truly shows."""
+        """Ground truth of every profile line of a shot."""
         if shot.light != "laser":
             return no_stripe(self.sensor.camera.lines())
         return true_stripe(self.renderer, self.pose(shot), travel=self.travel("laser"))

@@ -44,7 +44,7 @@ def altered(described: Kind, **changes: object) -> Kind:
 
 
 class Pose(Description):
-    """Where something stands: rotated about the scene's X, then Y, then Z axis, then moved."""
+    """Placement of an object: rotated about the scene's X, then Y, then Z axis, then moved."""
 
     position_mm: Vector = (0.0, 0.0, 0.0)
     rotation_deg: Vector = (0.0, 0.0, 0.0)
@@ -198,7 +198,7 @@ class Weld(FreeForm):
     seed: Annotated[int, Field(ge=0)] = 0
 
     def bead_reach_mm(self) -> float:
-        """How far a bead reaches sideways from its straight middle line, however irregular."""
+        """Largest distance that a bead reaches sideways from its straight middle line, irregularities included."""
         return self.width_mm * (0.5 + 1.5 * self.irregularity)
 
     @model_validator(mode="after")

@@ -43,14 +43,14 @@ _FEATURES = np.array(
 _ROWS, _COLUMNS, _FINER_IN_FRONT = 900, 640, 0.45
 """Facets of a head: rows from crown to neck, columns round it, and how much finer than even these are on the face."""
 _TRAIL = 1 / 3
-"""How far ripples trail at a bead's toes, in its widths."""
+"""Distance that ripples trail at a bead's toes, in its widths."""
 _SAG_MM = 0.004
-"""How far a weld's facets may cut corners."""
+"""Largest distance of a weld's facets from its surface."""
 _MOST_VERTICES = 4_000_000
 
 
 def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
-    """Where a head's front lies along z at places ``x``, ``y`` (N,), all in mm; NaN beside its outline."""
+    """Position of a head's front along z at places ``x``, ``y`` (N,), all in mm; NaN beside its outline."""
     x, y = x / height_mm, y / height_mm
     half_width, front, _ = _outline(y)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -109,7 +109,7 @@ def _front(x: np.ndarray, y: np.ndarray, front: np.ndarray, facing: np.ndarray) 
 
 
 def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """How far the beads of a weld stand out of its plate, towards -z, at places ``x``, ``y`` (N,), all in mm.
+    """Height of the beads of a weld above its plate, towards -z, at places ``x``, ``y`` (N,), all in mm.
 
     A bead is `height_mm` (1 - t^2)^2, with t from 0 in its middle to 1 at its toes and round ends, and cosine ripples
     on it: crescents that trail at the sides.

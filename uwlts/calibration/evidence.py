@@ -134,7 +134,7 @@ def step_evidence(
 
 
 def no_stripe_in(captures: Sequence[Capture]) -> str:
-    """Why no stripe was found in captures, in words; of a target, none where it was found."""
+    """Reasons why no stripe was found in captures, in words; of a target, none where it was found."""
     header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
     if not count:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
@@ -151,7 +151,7 @@ def _names(captures: Sequence[Capture]) -> str:
 
 
 def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
-    """Why none of the images shows the target; ``reasons`` count what was wrong with those with the laser off."""
+    """Reason why none of the images shows the target; ``reasons`` count the faults of those with the laser off."""
     if not any(map(len, captures)):
         return "there are no images in it"
     for image in [image for capture in captures for image in _lit(capture, 3)]:

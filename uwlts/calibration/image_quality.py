@@ -121,7 +121,7 @@ def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> fl
 
 
 def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
-    """Why no target was found: the light if that is it, else what the search for it said."""
+    """Reason why no target was found: the light, if it is too dark or too bright, else the detector's own."""
     brightest = float(np.quantile(image, 0.995)) / full_dn
     clipped = float(np.mean(image >= full_dn))
     if brightest < 0.1:
@@ -147,7 +147,7 @@ def way_px(one: TargetView, other: TargetView) -> float:
 
 
 def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = QualityLimits()) -> tuple[str, ...]:
-    """Why two images of one pose do not belong together; empty if they do."""
+    """Reasons why two images of one pose do not belong together; empty if they do."""
     way, most = way_px(before, after), limits.largest_motion_px
     reason = MotionFault(f"moved: the target went {way:.1f} px between its images, at most {most:g} are good")
     return () if way <= most else (reason,)
@@ -156,7 +156,7 @@ def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = 
 def judge_novelty(
     view: TargetView, recorded: Sequence[TargetView], limits: QualityLimits = QualityLimits()
 ) -> tuple[str, ...]:
-    """Why a pose adds nothing to those recorded; empty if it does."""
+    """Reason why a pose adds nothing to those recorded; empty if it does."""
     ways = [way_px(view, old) for old in recorded]
     if not ways or min(ways) >= limits.smallest_change_px:
         return ()

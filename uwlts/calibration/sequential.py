@@ -82,7 +82,7 @@ _LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger d
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """How the calibration is made.
+    """Settings of the calibration.
 
     Attributes
     ----------

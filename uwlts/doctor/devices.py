@@ -205,7 +205,7 @@ def try_stage(port: str) -> list[Finding]:
 
 
 def judge_settings(settings: Mapping[int, float]) -> list[Finding]:
-    """What differs from docs/how-to/hardware-stage.md in the answer to ``$$``, given by number."""
+    """Differences from docs/how-to/hardware-stage.md in the answer to ``$$``, given by number."""
     unsafe = {number: wanted for number, (wanted, _) in BEHAVIOUR.items() if settings.get(number) != wanted}
     other = {number: wanted for number, wanted in MECHANICS.items() if settings.get(number) != wanted}
     now = {n: f"${n} is {settings[n]:g}" if n in settings else f"${n} is not there" for n in (*unsafe, *other)}

@@ -114,7 +114,7 @@ def _examined(requirements: Iterable[Requirement]) -> list[tuple[Requirement, st
 
 
 def _load_faults(names: Sequence[str]) -> dict[str, str]:
-    """Why libraries cannot be imported, by their names; tried in another process, which may be ended by it."""
+    """Reasons why libraries cannot be imported, by name; tried in another process, which a library may end."""
     modules = {module: name for name in names for module in _modules(name)}
     faults, waiting = {}, list(modules)
     while waiting:

@@ -173,7 +173,7 @@ class AravisCamera(CameraDevice):
         return CameraInfo(f"{maker} {model}", serial, width, height, bits)
 
     def _identifier(self) -> bytes:
-        """How Aravis calls the camera: an IP address as it is, for everything else there is a search."""
+        """Name of the camera in Aravis: an IP address as it is, for everything else there is a search."""
         with suppress(ValueError):
             ip_address(self._name)
             return self._name.encode()

@@ -75,7 +75,7 @@ class FrameCheck:
 
     @property
     def counts(self) -> FrameCounts:
-        """What was found so far."""
+        """Numbers of good and faulty frames so far."""
         return FrameCounts(**self._counts)
 
     def judge(self, *, frame_id: int, time_s: float | None, complete: bool) -> FrameStatus:
@@ -110,7 +110,7 @@ class FrameCheck:
 
 
 def _advance(last: int, now: int) -> int:
-    """How many numbers a frame is ahead of the one before: 1 is the next, 0 the same, negative an older one."""
+    """Difference of a frame's number to that of the frame before: 1 is the next, 0 the same, negative an older one."""
     wrapped = last <= _COUNTER_16_BIT and last - now > _COUNTER_16_BIT // 2
     # A counter that does not leave out 0 would seem to stand still there.
     return max(now - last + _COUNTER_16_BIT, 1) if wrapped else now - last
@@ -209,14 +209,14 @@ class CameraDevice(ABC):
 
     @property
     def settings(self) -> CameraSettings:
-        """What the camera really does; known once it is configured."""
+        """Settings that the camera reports; known once it is configured."""
         if self._settings is None:
             raise HardwareError(f"the camera {self.address} is not configured: call configure() first")
         return self._settings
 
     @property
     def counts(self) -> FrameCounts:
-        """How many frames since ``start`` were good, and how many of each fault."""
+        """Numbers of frames since ``start`` that were good, and of each fault."""
         return self._check.counts
 
     @property

@@ -76,7 +76,7 @@ class Shown:
 
 
 def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> Shown:
-    """What one image of a capture shows; CalibrationError where the calibration does not fit the capture."""
+    """One image of a capture, evaluated; CalibrationError where the calibration does not fit the capture."""
     frame, full = capture[number], capture.header.saturation_dn
     # Dark parts raised, and small enough to be sent often.
     picture, scale = small_picture(frame.image, full_dn=full)
@@ -107,7 +107,7 @@ def look(capture: Capture, number: int, calibration: AnyCalibration | None) -> S
 
 
 def _outlook(capture: Capture, number: int) -> tuple[int | None, float | None]:
-    """How many images a recording will have, and the time in s that is left, by the pace of the latest ones."""
+    """Number of images that a recording will have, and the time left in s, by the pace of the latest ones."""
     planned = capture.header.provenance.get("images")
     if not isinstance(planned, int) or planned <= number:
         return None, None

@@ -123,7 +123,7 @@ def settled_exposure(
 
 
 _TRIES = 3
-"""How often an image is asked for whose frame was lost on its way."""
+"""Attempts to get an image whose frame was lost on its way."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure: several repeats of a lost GigE command."""
 _RUN_UP_MM = 1.0

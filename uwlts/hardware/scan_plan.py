@@ -146,7 +146,7 @@ class ScanPlan(RigPlan):
         )
 
     def zero_dn(self, sensor: Sensor) -> int:
-        """What stands for no difference in laser images from which a background is subtracted; 0 without one."""
+        """Grey value of no difference in laser images from which a background is subtracted; 0 without one."""
         return sensor.detector.full_scale_dn() + 1 if self.background else 0
 
     def check(self, stage: GrblStage) -> None:

@@ -130,7 +130,7 @@ LARGEST_MM = 0.05
 _LEAST_RELIEF = 0.2
 """Motion of the stripe in px per mm of the stage on lines that are used; below it noise dominates."""
 _LARGEST_BEND_PX = 2.0
-"""Where the motion changes by more from one image to the next there is an edge."""
+"""A change of the motion above this from one image to the next is an edge."""
 _FEWEST_LINES = 20
 """Lines from which a median and its scatter are estimated."""
 _SIGMAS = 4.0
@@ -154,7 +154,7 @@ class Relief:
     motion_px_per_mm: np.ndarray
 
     def slip(self, again: np.ndarray) -> tuple[float, float]:
-        """How far from it, in mm, the stage stands when the place shows the centres (N,) in px, and the standard error.
+        """Distance of the stage from it in mm when the place shows the centres (N,) in px, and its standard error.
 
         Infinite where too few lines are left.
         """

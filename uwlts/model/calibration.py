@@ -107,7 +107,7 @@ class WindowModel(Description):
 
 
 class FanModel(Description):
-    """How the laser sheet departs from a plane, and what the laser's window does to it, in the camera frame.
+    """Departure of the laser sheet from a plane, and the laser's window, in the camera frame.
 
     The fan begins at ``apex_mm`` and runs along the unit vector ``axis``. A beam that enters the line optics tilted by
     the angle ``bow_rad`` gives a cone rather than a plane. The normal of the laser's window is turned by
@@ -204,7 +204,7 @@ class Calibration(Description):
         return self.residuals.get(step, {})
 
     def origin(self) -> Origin:
-        """What the calibration was made from, by its provenance."""
+        """Evidence that the calibration was made from, by its provenance."""
         return Origin.model_validate(self.provenance)
 
     def index_of(self, medium: Medium) -> float:

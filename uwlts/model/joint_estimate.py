@@ -39,7 +39,7 @@ class CoveredRegion(_Stored):
 
 
 class ImageFit(_Stored):
-    """How well an image fits: the kind of its residuals, their rms without outliers, and their numbers."""
+    """Fit of one image: the kind of its residuals, their rms without outliers, and their numbers."""
 
     source: str
     kind: str

@@ -127,7 +127,7 @@ class StepHeight:
 
     @property
     def quantity(self) -> ParameterLabel:
-        """How the parameter is shown."""
+        """Name that the parameter is shown by."""
         return ParameterLabel(self.text, "mm")
 
 

@@ -20,7 +20,7 @@ class PeakRule(StrEnum):
 
 
 class StripeStatus(IntEnum):
-    """Why a line has a centre or has none."""
+    """Reason why a line has a centre or has none."""
 
     OK = 0
     NO_STRIPE = 1

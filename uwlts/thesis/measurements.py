@@ -89,7 +89,7 @@ def _polynomials(target: Path) -> PolynomialCalibration:
 
 _SIZE_PX = 5
 _SEARCHED_PX = 8
-"""How far from the stripe's place the peak is looked for."""
+"""Half width of the search for the peak about the stripe's place."""
 
 
 def thesis_stripes(

@@ -37,7 +37,7 @@ _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
 _SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
 """Symbols of marked designs, of plotly and of matplotlib."""
 _AWAY = (-26, 26, -54, 54, -82, 82)
-"""How far from a marked design its label stands, in px; the designs in turn."""
+"""Distances of labels from marked designs in px; the designs in turn."""
 _SHOWN = (
     "sigma_z_rms_mm",
     "sigma_z_mm",

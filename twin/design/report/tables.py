@@ -171,7 +171,7 @@ _FOLLOW = {
 
 
 def introduction(judged: Judged) -> list[tuple[str, str]]:
-    """What was asked and how many designs were judged, by key words."""
+    """The question and the number of designs judged, by key words."""
     study, bounds = judged.study, judged.study.bounds()
     facts = [
         ("base sensor", f"{study.sensor.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),

@@ -70,7 +70,7 @@ def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
 
 
 def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:
-    """Why the last image of ``after`` contradicts those before it, which ``before`` was solved from; empty if not."""
+    """Reason why the last image of ``after`` contradicts those that ``before`` was solved from, if it does."""
     if before is None:
         return ()
     rms, usual = after.image_rms_px(), before.rms_px()

@@ -36,7 +36,7 @@ _CHECK: dict[SingleParameter, str] = {
     StageParameter.SLOPE_2: _ALIGNMENT,
     TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
 }
-"""What to check of the parameters of which something is known before."""
+"""Checks of the parameters of which something is known before."""
 
 
 def format_deviation(key: ParameterKey, value: float, known: float, std: float, *, sigmas: float) -> str:
@@ -80,7 +80,7 @@ _MOST_NAMED, _MOST_SAID = 4, 6  # for a message that can be read
 
 @dataclass(frozen=True)
 class Findings:
-    """What speaks against an estimate, in words: contradictions, which make it useless, and doubts."""
+    """Findings against an estimate, in words: contradictions, which make it useless, and doubts."""
 
     contradictions: list[str]
     doubts: list[str]
@@ -93,7 +93,7 @@ class Findings:
 
 
 _Found = Iterator[tuple[bool, str]]
-"""What speaks against an estimate in words, each after whether it is a contradiction rather than a doubt."""
+"""Findings against an estimate, each with a flag that is true for a contradiction and false for a doubt."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class _Image:
 
 
 def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
-    """What speaks against an estimate, by the evidence that it was made from and the sensor as described."""
+    """Findings against an estimate, from its evidence and the sensor as described."""
     images = [
         _Image.of(residuals, piece)
         for piece, parts in zip(evidence, result.residuals, strict=True)

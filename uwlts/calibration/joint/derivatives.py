@@ -124,7 +124,7 @@ class PointDerivatives:
 def points_on_sheet(
     start: DescribedSheet, values: np.ndarray, rays: RayDerivatives, index: float
 ) -> PointDerivatives | None:
-    """Where rays in a medium meet the sheet; None where one does not."""
+    """Points where rays in a medium meet the sheet; None if one does not."""
     surface = sheet_surface(start.model(values), medium_index=index)
     reach, slope = surface.crossings(rays.origins, rays.directions)
     if not (reach > 0).all():

@@ -151,7 +151,7 @@ def _fit(
 
 
 def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
-    """What is known before: of each parameter by itself, and of many at once by an earlier estimate."""
+    """Prior knowledge: of each parameter by itself, and of many at once by an earlier estimate."""
     std = parameters.prior_std()
     known = np.isfinite(std)
     found = [((global_values - parameters.prior_mean())[known] / std[known], np.diag(1.0 / std)[known])]

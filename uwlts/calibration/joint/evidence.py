@@ -73,7 +73,7 @@ class StripeEvidence(ABC):
         """Standard uncertainty (b,) of the local parameters before; infinite where nothing is known."""
 
     def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
-        """What local parameters are off (c,) what is known before, in standard uncertainties; derivatives (c, b)."""
+        """Residuals (c,) of local parameters against prior knowledge, in standard uncertainties; derivatives (c, b)."""
         std = self.local_std(uncertainty)
         known = np.isfinite(std)
         return local[known] / std[known], np.diag(1.0 / std)[known]
@@ -280,12 +280,12 @@ class TargetEvidence(StripeEvidence):
         )
 
     def _bulge(self, points: np.ndarray) -> np.ndarray:
-        """How far (N,) the target's points (N, 2 or 3) rise for a bow of one."""
+        """Height (N,) of the target's points (N, 2 or 3) for a bow of one."""
         return np.sum((points[:, :2] - self.middle_mm) ** 2, axis=1) / self.radius_mm**2
 
 
 class _Pose:
-    """How the target stands to the camera in one image, and its derivatives by the parameters ``local_columns`` (c,).
+    """Pose of the target to the camera in one image, and its derivatives by the parameters ``local_columns`` (c,).
 
     The stage has moved by ``travel`` mm along ``direction``, ``nominal`` without its errors; where it has one of its
     own, that is the last of the parameters.

@@ -206,7 +206,7 @@ def priors_of(
     heights: dict[StepHeight, Prior],
     options: CalibrationOptions,
 ) -> dict[ParameterKey, Prior]:
-    """What is known of all global parameters but the lens's.
+    """Prior knowledge of all global parameters but the lens's.
 
     ``window`` is as described; the sheet's turns and shift start at ``turns`` (3,); ``heights`` are of step standards.
     """

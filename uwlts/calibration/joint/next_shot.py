@@ -291,7 +291,7 @@ def _in_image(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
 
 
 def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
-    """What a shot adds (P, P) to the inverse of the covariance; None where a ray meets nothing.
+    """Information (P, P) that a shot adds to the inverse of the covariance; None where a ray meets nothing.
 
     Its residuals are as noisy as those of the same kind; those of a kind new to the evidence as the noisiest stripe's.
     """

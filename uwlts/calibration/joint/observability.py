@@ -120,7 +120,7 @@ def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
 
 
 def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
-    """Where the camera sees points at Y and Z (N, 2) of the OCS: (N, 2), NaN where it does not."""
+    """Image places (N, 2) of points at Y and Z (N, 2) of the OCS; NaN where the camera does not see them."""
     transform = known.calibration.object_transform()
     return known.project(at_mm @ transform[:3, 1:3].T + transform[:3, 3])
 

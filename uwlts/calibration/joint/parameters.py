@@ -24,7 +24,7 @@ from uwlts.optics.window import RayDerivatives
 
 @dataclass(frozen=True, eq=False)
 class EarlierEstimate:
-    """What an earlier estimate says of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
+    """An earlier estimate of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
 
     ``whitening`` (K, K) is W with W^T W the inverse of the covariance: W (x - values) are K independent residuals of
     variance one. Raises CalibrationError: the covariance is not positive definite.
@@ -116,7 +116,7 @@ class Parameters:
         return np.array([self.priors[key].std if key in self.priors else np.inf for key in self.keys])
 
     def prior_mean(self) -> np.ndarray:
-        """What each parameter (P,) is before: where nothing is known its start, of the lens's zero."""
+        """Prior mean of each parameter (P,): its start where nothing is known, zero for those of the lens."""
         return np.array([self.priors[key].mean if key in self.priors else 0.0 for key in self.keys])
 
     def camera(self, values: np.ndarray) -> CameraModel:

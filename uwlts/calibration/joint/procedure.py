@@ -90,7 +90,7 @@ def calibrate_jointly(
 
 
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
-    """What is to be estimated from what the captures show, with a start; errors as `calibrate_jointly`."""
+    """The problem to estimate from the captures, with a start; errors as `calibrate_jointly`."""
     sensor, views = gathered.sensor, gathered.views()
     if not gathered.series:
         raise CalibrationError("no capture shows a target: the joint calibration starts with one in air or in water")

@@ -77,7 +77,7 @@ class WaterChange:
 
 
 def water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEstimate) -> list[WaterChange]:
-    """What the estimate of a calibration says of the media that it has beyond an earlier one, if they were seen."""
+    """Estimated media that a calibration has beyond an earlier one, if they were seen."""
     parameters, count = result.parameters, len(earlier.values)
     before = np.append(earlier.values, parameters.prior_mean()[count:])
     covariance = with_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
@@ -147,7 +147,7 @@ def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
 
 
 def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
-    """What is covered in new water, with the largest region covered in earlier water through the window."""
+    """Region covered in new water, with the largest region covered in earlier water through the window."""
     wet = [other for other in covered if other.window and other.medium is not None]
     if not wet:
         return region

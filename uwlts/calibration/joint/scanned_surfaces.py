@@ -31,7 +31,7 @@ class Surface(ABC):
         """Of points (3, N) of the scan's pixels, in their order."""
 
     def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What calibrated lengths between its parts are off (c,), in standard uncertainties, and derivatives (c, k)."""
+        """Residuals (c,) of calibrated lengths between its parts, in standard uncertainties, and derivatives (c, k)."""
         return np.empty(0), np.empty((0, len(local)))
 
 
@@ -139,9 +139,9 @@ class Cylinder(Surface):
 
 
 SCANNED = (Spheres.kind, Plane.kind, Cylinder.kind)
-"""What residuals on such surfaces are called."""
+"""Name of residuals on such surfaces."""
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
-"""How far the stage's direction leans from the one described, towards two directions across it."""
+"""Inclination of the stage's direction to the one described, towards two directions across it."""
 # Where the ray's crossing with the sheet moves almost along the surface, a residual in px would be out of all bounds.
 _LEAST_SHARE = 0.4
 

@@ -196,7 +196,7 @@ class PoseJudge:
         )
 
     def state(self, recorded: Sequence[RecordedPose]) -> State:
-        """How far recorded poses lead; errors as `state_of`."""
+        """State that recorded poses lead to; errors as `state_of`."""
         return state_of(recorded, self._setting, self._wanted)
 
     def recorded(self, path: Path) -> list[RecordedPose]:
@@ -246,7 +246,7 @@ class PoseJudge:
 
 
 def still_missing(state: State) -> list[str]:
-    """What camera and laser sheet still lack."""
+    """Evidence that camera and laser sheet still need."""
     return [*missing(state), *missing_sheet(state)]
 
 
@@ -312,7 +312,7 @@ class TargetPhase:
     def _why_wait(
         self, found: Found, state: State, advice: PoseAdvice | None, known: list[TargetView]
     ) -> tuple[str, ...]:
-        """Why the target as it stands need not be taken."""
+        """Reason why the target as it stands is not recorded."""
         view = found.usable
         if view is None:
             return found.reasons
@@ -363,7 +363,7 @@ class TargetPhase:
 
 
 def _spin(view: TargetView | None, state: State) -> float:
-    """How the target is turned in the image, as it was last seen."""
+    """Orientation of the target in the image, as it was last seen."""
     poses = [pose_of(view, state.camera)] if view is not None else state.poses[-1:]
     return float(np.arctan2(poses[0][1, 0], poses[0][0, 0])) if len(poses) else 0.0
 
@@ -378,7 +378,7 @@ class StepJudge:
     window: WindowModel
 
     def judge(self, image: np.ndarray) -> StepQuality:
-        """What an image (H, W) shows."""
+        """Quality of the step standard's stripe in an image (H, W)."""
         return judge_step(
             image,
             self.calibration,

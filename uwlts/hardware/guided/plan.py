@@ -133,7 +133,7 @@ class GuidedPlan(RigPlan):
         return self.described_sensor().medium(self.medium).kind == "air"
 
     def setting(self) -> Setting:
-        """How the target is seen; DescriptionError where sensor, medium or target are not valid."""
+        """The plan as a setting; DescriptionError if sensor, medium or target are not valid."""
         sensor = self.described_sensor()
         medium = sensor.medium(self.medium)
         mounted = medium.kind != "air" if self.window_mounted is None else self.window_mounted

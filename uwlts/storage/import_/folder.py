@@ -30,7 +30,7 @@ _SIZE_ADVICE = {
     (False, True): "it is turned by a quarter turn: turn it back",
     (False, False): "leave it out (ignore), or import it on its own",
 }
-"""What to do about an image of another size than the sensor's, by whether it is the first, and turned."""
+"""Advice on an image of another size than the sensor's, by whether it is the first, and turned."""
 
 
 @dataclass(eq=False)

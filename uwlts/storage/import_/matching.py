@@ -24,7 +24,7 @@ _LIGHTS = ("laser", "lamp", "ignore")
 
 @dataclass(frozen=True, eq=False)
 class ImageRow:
-    """What is known of one image: paths below the folder, NaN and None where it is not; ``number`` gives the order."""
+    """One image: paths below the folder, NaN and None for what is not known; ``number`` gives the order."""
 
     file: str
     number: int = 0
