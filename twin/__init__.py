@@ -1,8 +1,9 @@
 """Digital twin of an underwater laser triangulation sensor: renders captures with Mitsuba 3.
 
 `render` renders a scene into arrays, `simulate` into capture and truth files, `serve` plays it as camera and stage,
-`sweep` searches the design of a sensor, `demo` runs the whole chain of commands, and `reproduce` the evaluation of the
-thesis. Each is imported when it is first used, as Mitsuba must not be imported before its libLLVM is chosen.
+`record` renders a campaign of many captures, `sweep` searches the design of a sensor, `demo` runs the whole chain of
+commands, and `reproduce` the evaluation of the thesis. Each is imported when it is first used, as Mitsuba must not be
+imported before its libLLVM is chosen.
 """
 
 from importlib import import_module
@@ -11,17 +12,30 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from twin.design.sweep import SweepResult, sweep
     from twin.devices.serve import ServedTwin, serve
+    from twin.recording.campaigns import record
     from twin.recording.demonstration import demo
     from twin.recording.recording import Recording, render, simulate
     from twin.recording.reproduce import reproduce
 
-__all__ = ["Recording", "ServedTwin", "SweepResult", "demo", "render", "reproduce", "serve", "simulate", "sweep"]
+__all__ = [
+    "Recording",
+    "ServedTwin",
+    "SweepResult",
+    "demo",
+    "record",
+    "render",
+    "reproduce",
+    "serve",
+    "simulate",
+    "sweep",
+]
 
 _MODULES = {
     "Recording": "twin.recording.recording",
     "ServedTwin": "twin.devices.serve",
     "SweepResult": "twin.design.sweep",
     "demo": "twin.recording.demonstration",
+    "record": "twin.recording.campaigns",
     "render": "twin.recording.recording",
     "reproduce": "twin.recording.reproduce",
     "serve": "twin.devices.serve",

@@ -97,6 +97,12 @@ def serve(scene: str, **options: Any) -> None:
     print(f"ended after {served.rates()}")
 
 
+@_command(twin.record)
+def record(campaign: str, **options: Any) -> None:
+    """Example: twin record demo --out runs/campaign"""
+    print(f"wrote {twin.record(campaign, **options, show_progress=True)}")
+
+
 @_command(twin.reproduce)
 def reproduce(campaign: str | None = None, **options: Any) -> None:
     """Example: twin reproduce --campaigns 1 --every 10 --out runs/quick"""

@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from tests.uwlts.calibration_views import STEP_MM
 from tests.uwlts.simulated_campaign import PLACES_MM, SPHERES, Reality, drawn_reality, evidence, scan_of_spheres
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
@@ -24,6 +25,15 @@ from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
+from uwlts.model.parameter_keys import (
+    LensParameter,
+    MediumIndex,
+    ParameterKey,
+    StageParameter,
+    StepHeight,
+    TargetParameter,
+    WindowParameter,
+)
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
@@ -65,9 +75,14 @@ class Campaign:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a campaign measured, and the seconds that its calibration and its figures' uncertainties took."""
+    """What a campaign measured, and the seconds that its calibration and its figures' uncertainties took.
+
+    ``pulls`` (K,) are the errors of the calibration's parameters, made independent and of variance one by its
+    covariance.
+    """
 
     measured: list[Measured]
+    pulls: np.ndarray
     solve_s: float
     figures_s: float
 
@@ -84,7 +99,39 @@ def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
     uncertainty = described.uncertainty.model_copy(update=KNOWN_BETTER)
     better = described.model_copy(update={"uncertainty": uncertainty})
     scans.append(_scan(real, better, calibration, campaign, " known better"))
-    return Outcome([*scans[0][0], *scans[1][0]], solve_s, scans[0][1] + scans[1][1])
+    return Outcome(
+        [*scans[0][0], *scans[1][0]], parameter_pulls(calibration, real, described), solve_s, scans[0][1] + scans[1][1]
+    )
+
+
+def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) -> np.ndarray:
+    """Errors of the parameters whose truth is a number of the reality's, whitened by their stated covariance (K,)."""
+    camera = real.sensor.camera
+    window, (column, row) = camera.window, camera.principal_point()
+    slope_x = np.tan(np.radians(window.tilt_y_deg))
+    truth: dict[ParameterKey, float] = {
+        LensParameter.F: camera.focal_length_px(),
+        LensParameter.CX: column,
+        LensParameter.CY: row,
+        LensParameter.K1: camera.distortion.k1,
+        LensParameter.K2: camera.distortion.k2,
+        WindowParameter.DISTANCE: window.distance_mm,
+        WindowParameter.SLOPE_X: slope_x,
+        WindowParameter.SLOPE_Y: -np.tan(np.radians(window.tilt_x_deg)) * np.hypot(1.0, slope_x),
+        WindowParameter.THICKNESS: window.thickness_mm,
+        WindowParameter.GLASS_INDEX: window.index(real.sensor.laser.wavelength_nm),
+        StageParameter.SCALE: real.stage_scale,
+        TargetParameter.BOW: real.target_bow_mm,
+        MediumIndex("water"): real.index(described.media["water"]),
+        StepHeight(STEP_MM): real.step_mm,
+    }
+    estimate = calibration.joint
+    assert estimate is not None
+    known = [place for place, key in enumerate(estimate.parameters) if key in truth]
+    error = [estimate.values[place] - truth[estimate.parameters[place]] for place in known]
+    std = np.array(estimate.std)[known]
+    correlation = estimate.covariance_matrix()[np.ix_(known, known)] / np.outer(std, std)
+    return np.linalg.solve(np.linalg.cholesky(correlation), error / std)
 
 
 def _scan(
@@ -171,6 +218,8 @@ def main() -> int:
             f"{1e3 * np.mean(std):.1f} µm",
         )
     Console(width=120).print(table)
+    pulls = np.concatenate([outcome.pulls for outcome in outcomes])
+    print(f"parameters: mean square of {len(pulls)} whitened errors {np.mean(pulls**2):.3f}; 1 is right")
     solve, figures = (np.median([getattr(o, name) for o in outcomes]) for name in ("solve_s", "figures_s"))
     print(f"medians: {solve:.2f} s for a calibration, {figures:.2f} s for the uncertainties of two scans")
     return 0

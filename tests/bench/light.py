@@ -18,7 +18,7 @@ from twin.options import NONE, Options
 from twin.recording.studio import record_scene
 from twin.scene.description import load_scene
 from uwlts.model.library import load_sensor
-from uwlts.model.sensor import Medium
+from uwlts.model.sensor import Medium, Sensor
 
 SPP = 64
 SEEDS = 12
@@ -32,14 +32,37 @@ def stripe_noise(images: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean((images - truth)[:, stripe] ** 2)) / truth.max())
 
 
-def full_physics(water: str) -> tuple[float, float]:
-    """Median seconds of a frame of two spheres with all effects, and the noise of its light as a share of the peak.
+def recorded_frame(water: str) -> float:
+    """Median seconds from one recorded frame of two spheres to the next: all effects, detector, truth and disk."""
+    sensor = _in_named_water(water)
+    motion = {"start_mm": -0.5 * SEEDS, "step_mm": 1.0, "count": SEEDS + 2}
+    moments: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        record_scene(
+            load_scene("spheres", motion=motion),
+            sensor,
+            Path(folder, "spheres.h5"),
+            options=Options(spp=SPP),
+            progress=lambda done, total: moments.append(time.perf_counter()),
+        )
+    return float(np.median(np.diff(moments)[1:]))
+
+
+def _in_named_water(water: str) -> Sensor:
+    sensor = load_sensor("thesis-as-built")
+    table = sensor.media["water"].model_dump(include={"kind", "temperature_c"})
+    return sensor.model_copy(
+        update={"media": {**sensor.media, "water": Medium.model_validate(table | {"water": water})}}
+    )
+
+
+def rendered_light(water: str) -> tuple[float, float]:
+    """Median seconds to render the light of a frame of two spheres, and its noise as a share of the peak.
 
     The truth is the mean of all frames, so the error is a little understated and then corrected for it.
     """
-    sensor = load_sensor("thesis-as-built")
-    table = sensor.media["water"].model_dump(include={"kind", "temperature_c"})
-    renderer = Renderer(sensor, Medium.model_validate(table | {"water": water}), load_scene("spheres"))
+    sensor = _in_named_water(water)
+    renderer = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
     images, seconds = [], []
     for seed in range(SEEDS + 2):
         start = time.perf_counter()

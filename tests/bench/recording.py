@@ -31,12 +31,13 @@ class Recorded:
     """Frames per second that reached the disk, and how many were lost.
 
     ``followed`` of them were read from the growing file, their stripe found and turned into points, by a second
-    process; it was done ``behind_s`` after the recording.
+    process, at ``followed_hz`` from the first to the last; it was done ``behind_s`` after the recording.
     """
 
     rate_hz: float
     lost: int
     followed: int = 0
+    followed_hz: float = 0.0
     behind_s: float = 0.0
 
 
@@ -109,20 +110,21 @@ def _followed(out: Path, record: Callable[[], Recorded]) -> Recorded:
     ready.wait()
     recorded = record()
     start = time.perf_counter()
-    followed = ours.recv()
+    followed, followed_hz = ours.recv()
     behind_s = time.perf_counter() - start
     follower.join()
-    return Recorded(recorded.rate_hz, recorded.lost, followed, behind_s)
+    return Recorded(recorded.rate_hz, recorded.lost, followed, followed_hz, behind_s)
 
 
-def _follow(out: Path, ready: multiprocessing.synchronize.Event, told: multiprocessing.connection.Connection) -> None:
-    """What `uwlts watch` does, without a browser."""
+def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multiprocessing.connection.Connection) -> None:
+    """Follow a recording as `uwlts watch` does, without a browser."""
     sensor = load_sensor("thesis")
-    calibration, count = nominal_calibration(sensor, sensor.medium("air")), 0
+    calibration = nominal_calibration(sensor, sensor.medium("air"))
+    moments: list[float] = []
     ready.set()
     for seen in images_of(out, calibration):
         if seen is None:
             time.sleep(0.25)
-        else:
-            count += len(seen.points_mm) > 0
-    told.send(count)
+        elif len(seen.points_mm):
+            moments.append(time.perf_counter())
+    result.send((len(moments), (len(moments) - 1) / (moments[-1] - moments[0])))

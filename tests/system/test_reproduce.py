@@ -19,7 +19,7 @@ import pytest
 
 from twin import cli
 from twin.options import Options
-from twin.recording.reproduce import record_campaigns
+from twin.recording.campaigns import record_campaigns
 from twin.recording.studio import record_scene
 from twin.scene.campaign import load_campaign, takes
 from uwlts.model.errors import DescriptionError

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.recording.reproduce import record_campaigns
+from twin.recording.campaigns import record_campaigns
 from twin.scene.campaign import Campaign, load_campaign
 from uwlts.model.calibration import Calibration
 from uwlts.storage.capture import Capture

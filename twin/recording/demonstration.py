@@ -11,33 +11,26 @@ from pathlib import Path
 
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
-"""Commands of one stage run at a time: no single one keeps all processors busy."""
+"""Commands of one stage run at a time: none but the rendering keeps all processors busy."""
+CAMPAIGN = "demo"
 PLACEMENTS = ("near", "standoff", "far")
 SPHERES = tuple(f"spheres-{place}" for place in PLACEMENTS)
+OTHERS = ("step-scan", "pipe")
 
 
 def commands(out: Path) -> list[tuple[str, str]]:
     """Stage and command line of everything the demo does into a folder, in order."""
     folder = shlex.quote(str(out))
-    as_built = "--sensor thesis --as-built thesis-as-built --overwrite"
-    everywhere = f"--placement {' '.join(PLACEMENTS)}"
-    recordings = {
-        "target": "target.h5",
-        "target-through-window": "target-through-window.h5",
-        f"step {everywhere}": "step-{placement}.h5",
-        f"spheres {everywhere}": "spheres-{placement}.h5",
-        "step-scan": "step-scan-standoff.h5",
-        "pipe": "pipe-standoff.h5",
-    }
-    rows = [("render", f"twin simulate {scene} {as_built} --out {folder}/{name}") for scene, name in recordings.items()]
-    steps = " ".join(f"{folder}/step-{place}.h5" for place in PLACEMENTS)
-    for target, refractions, name, suffix, scans in (
-        ("target", 2, "calibration", "", (*SPHERES, "step-scan-standoff", "pipe-standoff")),
-        ("target-through-window", 1, "calibration-one-refraction", "-one-refraction", SPHERES),
+    rows = [("render", f"twin record {CAMPAIGN} --out {folder} --overwrite")]
+    steps = f"--step {' '.join(f'{folder}/step-{place}-water.h5' for place in PLACEMENTS)}"
+    bare, window, water = (f"{folder}/target-{kind}.h5" for kind in ("bare", "air", "water"))
+    for evidence, suffix, scans in (
+        (f"--air {bare} {window} --water {water} {steps}", "", (*SPHERES, *OTHERS)),
+        (f"--air {bare} {steps} --refractions 2", "-two-refractions", SPHERES),
+        (f"--air {window} {steps} --refractions 1", "-one-refraction", SPHERES),
     ):
-        calibration = f"{folder}/{name}.json"
-        air = f"--air {folder}/{target}.h5 --step {steps} --refractions {refractions}"
-        rows.append(("calibrate", f"uwlts calibrate {air} --out {calibration} --overwrite"))
+        calibration = f"{folder}/calibration{suffix}.json"
+        rows.append(("calibrate", f"uwlts calibrate {evidence} --out {calibration} --overwrite"))
         for scan in scans:
             capture, cloud = f"{folder}/{scan}", f"{folder}/{scan}{suffix}"
             made = f"{capture}.h5 --calibration {calibration} --out {cloud}.ply --overwrite"
@@ -51,7 +44,8 @@ def commands(out: Path) -> list[tuple[str, str]]:
 def demo(out: str | Path = "runs/demo") -> Path:
     """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
 
-    Runs exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html,
+    The campaign has imperfections as a real one has, and is calibrated jointly and by the thesis's two ways. Runs
+    exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html,
     whose path is returned.
 
     Parameters

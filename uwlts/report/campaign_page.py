@@ -303,7 +303,7 @@ _EXPLANATIONS = {
     "within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
     "rms distance": "Root mean square of those distances. Only rendered captures have a true surface. A best fit turns "
     "and shifts the whole cloud, as aligning it with a drawing would.",
-    "window distance": "From the camera's entrance pupil to the window's inner face, found from the step standard in "
+    "window distance": "From the camera's entrance pupil to the window's inner face, found from the images in "
     "water; true is what was set in the twin.",
     "interface distance": "With one refraction a single interface stands for the whole window; its distance has no "
     "true value.",

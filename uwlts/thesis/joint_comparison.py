@@ -1,4 +1,9 @@
-"""The joint calibration compared with the thesis's two ways, on the same images of its campaign."""
+"""The joint calibration compared with the thesis's two ways, by the evidence it uses, on scans that none has used.
+
+The thesis's two ways use the target in air, without or with the camera's window, and the steps. The joint calibration
+is made from both of these together, then with the target in water, then with half of the scans of spheres in water.
+Judged are the other half, and all scans in air.
+"""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -7,7 +12,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import count, groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -31,33 +36,51 @@ from uwlts.storage.files import json_text, written_aside
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, TWO, calibrations
-from uwlts.thesis.results import JointResults, JointSummary, MediumSummary, Method, PlaneScatter, SphereErrors
+from uwlts.thesis.results import (
+    JointMethod,
+    JointResults,
+    JointSummary,
+    MediumSummary,
+    Method,
+    PlaneScatter,
+    SphereErrors,
+)
 
 RESULTS = "joint.json"
+_USED = ("near", "standoff", "far")
+"""Placements of the spheres in water that a calibration may use."""
 _COVERAGE = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
+_BESIDE = 0.16  # of the distance between two campaigns, from method to method
 SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
 Progress = Callable[[int, int], None]
 
 
-def joint_calibration(folder: CampaignFolder) -> tuple[Calibration, float]:
-    """The joint calibration from a campaign, kept with the others; the time to solve it in s.
+def joint_calibration(folder: CampaignFolder, method: JointMethod = "joint_with_scans") -> tuple[Calibration, float]:
+    """A joint calibration from a campaign, kept with the others; the time to solve it in s.
 
-    Targets, steps, and the scans of spheres in water: these were made in another water than the calibration, whose
-    index follows from their roundness. Their sizes are not used. CaptureError where a recording is missing or damaged,
-    CalibrationError where they do not determine a calibration, or contradict each other.
+    Scans of spheres were made in another water than the calibration, whose index follows from their roundness. Their
+    sizes are not used. CaptureError where a recording is missing or damaged, CalibrationError where they do not
+    determine a calibration, or contradict each other.
     """
     options = CalibrationOptions(poses="stage", same_water=False, sizes_known=False)
+    same = method == "joint_same_evidence"
+    used = [scan.path for scan in folder.scans() if _is_used(scan)] if method == "joint_with_scans" else []
     with ExitStack() as stack:
-        targets = [stack.enter_context(Capture(folder.target(kind))) for kind in ("bare", "air", "water")]
+        kinds = ("bare", "air") if same else ("bare", "air", "water")
+        targets = [stack.enter_context(Capture(folder.target(kind))) for kind in kinds]
         steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
-        wet = [scan.path for scan in folder.scans() if scan.thing == "spheres" and scan.medium != "air"]
-        scans = [stack.enter_context(Capture(path)) for path in wet]
+        scans = [stack.enter_context(Capture(path)) for path in used]
         gathered = gather_jointly(targets, steps, scans, options=options)
     start = time.perf_counter()
     calibration = solve_jointly(gathered, options=options).calibration
     taken_s = time.perf_counter() - start
-    write_calibration(folder.path / "calibrations" / "joint.json", calibration, overwrite=True)
+    write_calibration(folder.path / "calibrations" / f"{method.replace('_', '-')}.json", calibration, overwrite=True)
     return calibration, taken_s
+
+
+def _is_used(scan: ScanFile) -> bool:
+    """Whether the joint calibration with scans uses a scan, so that none is judged by it."""
+    return scan.thing == "spheres" and scan.medium == "water" and scan.placement in _USED
 
 
 def compare_campaigns(
@@ -67,7 +90,7 @@ def compare_campaigns(
     again: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> list[JointResults]:
-    """Errors of every scan of spheres and planes by the three calibrations, with the joint one's uncertainties.
+    """Errors of all judged scans of spheres and planes by all calibrations, with the joint ones' uncertainties.
 
     Those of each campaign are kept in its folder, and read from there unless ``again`` is set or a recording is newer.
     ``progress(done, total)`` counts scans. CaptureError, CalibrationError or EvaluationError where a recording is
@@ -81,7 +104,7 @@ def compare_campaigns(
 
 
 def _compared(folder: CampaignFolder) -> list[ScanFile]:
-    return [scan for scan in folder.scans() if scan.thing in ("spheres", "plane")]
+    return [scan for scan in folder.scans() if scan.thing in ("spheres", "plane") and not _is_used(scan)]
 
 
 def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
@@ -92,32 +115,39 @@ def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
             send(None)
         return JointResults.read(path)
     sequential = calibrations(folder)
-    joint, solve_s = joint_calibration(folder)
+    joint: dict[JointMethod, Calibration] = {}
+    solve_s: dict[JointMethod, float] = {}
+    for way in JOINT:
+        joint[way], solve_s[way] = joint_calibration(folder, way)
     spheres, planes = [], []
     for scan in _compared(folder):
         if scan.thing == "spheres":
             one, two = (sequential.get((method, scan.medium)) for method in (PROPOSED, TWO))
-            spheres.append(_of_spheres(scan, {"joint": joint, "one_refraction": one, "two_refractions": two}))
+            spheres.append(_of_spheres(scan, {"one_refraction": one, "two_refractions": two}, joint))
         else:
-            planes.append(_of_plane(scan, joint))
+            planes.append(_of_plane(scan, joint["joint_with_scans"]))
         send(None)
     return JointResults(campaign=folder.path.name, solve_s=solve_s, spheres=spheres, planes=planes).keep(path)
 
 
-def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration | None]) -> SphereErrors:
-    errors, std_mm = {}, {}
+def _of_spheres(
+    scan: ScanFile, sequential: Mapping[Method, AnyCalibration | None], joint: Mapping[JointMethod, Calibration]
+) -> SphereErrors:
+    errors: dict[Method, dict[str, float]] = {}
+    std_mm: dict[JointMethod, dict[str, float]] = {}
     with Capture(scan.path) as capture:
         artefact, stripes = parse_artefact(capture.header.artefact or {}), find_stripes(capture)
-        for method, calibration in known.items():
-            if calibration is None:
-                continue
-            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=method == "joint")
+        for method, calibration in sequential.items():
+            if calibration is not None:
+                evaluation = evaluate_cloud(reconstruct_stripes(capture, stripes, calibration), artefact)
+                errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
+        for way, calibration in joint.items():
+            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=True)
             evaluation = evaluate_cloud(cloud, artefact)
-            errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
-            if method == "joint":
-                expanded = figure_uncertainties(cloud, evaluation)
-                std_mm = {name: expanded[name].expanded_mm / 2 for name in errors[method]}
-    return SphereErrors(placement=scan.placement, medium=scan.medium, std=std_mm, **errors)
+            errors[way] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
+            expanded = figure_uncertainties(cloud, evaluation)
+            std_mm[way] = {name: expanded[name].expanded_mm / 2 for name in errors[way]}
+    return SphereErrors(scan.placement, scan.medium, errors, std_mm)
 
 
 def _of_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
@@ -144,31 +174,38 @@ def _of_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
 def joint_summary(results: Sequence[JointResults]) -> JointSummary:
     """Errors of all campaigns' scans, share of the intervals that hold the truth, time to solve."""
     water, air = (_medium_summary(results, medium) for medium in ("water", "air"))
-    solve_s = [result.solve_s for result in results]
+    solve_s: dict[JointMethod, list[float]] = {way: [result.solve_s[way] for result in results] for way in JOINT}
     return JointSummary(**dict(water), solve_s=solve_s, campaigns=len(results), water=water, air=air)
 
 
 def _medium_summary(results: Sequence[JointResults], medium: str) -> MediumSummary:
     spheres = [scan for result in results for scan in result.spheres if scan.medium == medium]
-    methods = list(spheres[0].by_method()) if spheres else []
-    inside = [abs(scan.joint[n]) <= _COVERAGE * scan.std[n] for scan in spheres for n in (SPACING, *DIAMETERS)]
+    methods = list(spheres[0].errors_mm) if spheres else []
+    inside: dict[JointMethod, list[bool]] = {
+        way: [
+            abs(scan.errors_mm[way][name]) <= _COVERAGE * scan.std_mm[way][name]
+            for scan in spheres
+            for name in (SPACING, *DIAMETERS)
+        ]
+        for way in JOINT
+    }
     return MediumSummary(
-        spacing_error_mm={m: [scan.by_method()[m][SPACING] for scan in spheres] for m in methods},
-        diameter_error_mm={m: [scan.by_method()[m][n] for scan in spheres for n in DIAMETERS] for m in methods},
+        spacing_error_mm={m: [scan.errors_mm[m][SPACING] for scan in spheres] for m in methods},
+        diameter_error_mm={m: [scan.errors_mm[m][n] for scan in spheres for n in DIAMETERS] for m in methods},
         plane_std_over_speckle_limit=[p.over_limit for r in results for p in r.planes if p.medium == medium],
-        coverage_95=float(np.mean(inside)) if inside else None,
+        coverage_95={way: float(np.mean(held)) for way, held in inside.items() if held},
     )
 
 
 class _Row(NamedTuple):
-    """Mean and largest size of a quantity's errors by one calibration, mm, and that mean over the joint one's."""
+    """Mean and largest size of a quantity's errors by one calibration, mm; is it a joint one?"""
 
     quantity: str
     method: str
     mean: float
     largest: float
-    times: float
     number: int
+    joint: bool
 
 
 def _rows(part: MediumSummary) -> list[_Row]:
@@ -176,8 +213,7 @@ def _rows(part: MediumSummary) -> list[_Row]:
     for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
         sizes: dict[Method, np.ndarray] = {method: np.abs(errors) for method, errors in errors_mm.items()}
         for method, size in sizes.items():
-            times = size.mean() / sizes["joint"].mean()
-            rows.append(_Row(quantity, _WORDS[method], size.mean(), size.max(), times, len(size)))
+            rows.append(_Row(quantity, _WORDS[method], size.mean(), size.max(), len(size), method in JOINT))
     return rows
 
 
@@ -188,16 +224,24 @@ def summary_lines(summary: JointSummary) -> list[str]:
         for name, rows in groupby(_rows(part), lambda row: row.quantity):
             means = ", ".join(f"{row.method} {row.mean:.4f} mm (largest {row.largest:.4f})" for row in rows)
             lines.append(f"{medium}, error of the {name}, mean of the absolute values: {means}")
-        if part.coverage_95 is not None:
-            lines.append(f"{medium}, truth within the stated 95 % intervals: {100 * part.coverage_95:.0f} %")
+        for way, held in part.coverage_95.items():
+            lines.append(f"{medium}, {_WORDS[way]}, truth within the stated 95 % intervals: {100 * held:.0f} %")
         if over := part.plane_std_over_speckle_limit:
             lines.append(f"{medium}, scatter of planes over the speckle limit: {np.mean(over):.2f} on average")
-    return [*lines, f"joint estimate solved in {', '.join(f'{s:.1f}' for s in summary.solve_s)} s"]
+    solved = "; ".join(
+        f"{_WORDS[way]} {', '.join(f'{s:.1f}' for s in times)}" for way, times in summary.solve_s.items()
+    )
+    return [*lines, f"solved in s: {solved}"]
 
 
-_WORDS: dict[Method, str] = {"one_refraction": "one refraction", "two_refractions": "two refractions", "joint": "joint"}
-# Side by side within each campaign.
-_BESIDE: dict[Method, float] = {"one_refraction": -0.2, "two_refractions": 0.0, "joint": 0.2}
+JOINT: tuple[JointMethod, ...] = get_args(JointMethod)
+_WORDS: dict[Method, str] = {
+    "one_refraction": "one refraction",
+    "two_refractions": "two refractions",
+    "joint_same_evidence": "joint, from the same evidence",
+    "joint_with_target_in_water": "joint, with the target in water",
+    "joint_with_scans": "joint, with scans of spheres as well",
+}
 
 
 def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, overwrite: bool = False) -> JointSummary:
@@ -207,7 +251,7 @@ def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, ove
         (medium, part, _rows(part), svg_of(_errors_figure(results, medium))) for medium, part in summary.media().items()
     ]
     software = f"uwlts {uwlts.__version__}"
-    text = render_page("uwlts.thesis", "joint.html.j2", software=software, summary=summary, media=media)
+    text = render_page("uwlts.thesis", "joint.html.j2", software=software, summary=summary, media=media, words=_WORDS)
     with (
         written_aside(folder / "report.html", overwrite=overwrite) as page,
         written_aside(folder / "summary.json", overwrite=overwrite) as aside,
@@ -218,23 +262,25 @@ def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, ove
 
 
 def _errors_figure(results: Sequence[JointResults], medium: str) -> Figure:
-    """Errors of all scans by campaign; the joint ones with their stated 95 % intervals."""
+    """Errors of all scans by campaign, the methods side by side; the joint ones with their stated 95 % intervals."""
     figure, panels = new_figure(9.0, 3.4, columns=2)
     quantities = (("sphere spacing", (SPACING,)), ("sphere diameter", DIAMETERS))
     for axes, (quantity, figures) in zip(panels, quantities, strict=True):
-        for colour, (method, words) in zip((COLOURS[5], COLOURS[1], COLOURS[0]), _WORDS.items(), strict=True):
+        for number, (method, words) in enumerate(_WORDS.items()):
             points = [
-                (place + _BESIDE[method] + 0.03 * (number - 2.5), 1000 * errors[name], 1000 * scan.std[name])
+                (
+                    place + _BESIDE * (number - (len(_WORDS) - 1) / 2),
+                    1000 * errors[name],
+                    _COVERAGE * 1000 * scan.std_mm[method][name] if method in JOINT else 0.0,
+                )
                 for place, result in enumerate(results)
-                for number, scan in enumerate(scan for scan in result.spheres if scan.medium == medium)
-                if (errors := scan.by_method().get(method))
+                for scan in result.spheres
+                if scan.medium == medium and (errors := scan.errors_mm.get(method))
                 for name in figures
             ]
             if points:
-                x, y, std = np.array(points).T
-                is_joint = method == "joint"
-                label = f"{words}, with the stated 95 % intervals" if is_joint else words
-                axes.errorbar(x, y, _COVERAGE * std if is_joint else None, fmt="o", ms=4, color=colour, label=label)
+                x, y, half = np.array(points).T
+                axes.errorbar(x, y, half, fmt="o", ms=3, elinewidth=0.8, color=COLOURS[number], label=words)
         axes.set(title=f"{quantity} in {medium}", xlabel="campaign", ylabel="error / µm", xticks=range(len(results)))
     legend_below(figure)
     return figure

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from uwlts.model.errors import CaptureError, problems_of
 from uwlts.storage.files import json_text, written_aside
@@ -12,7 +12,10 @@ from uwlts.storage.files import json_text, written_aside
 Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""
 
-Method = Literal["one_refraction", "two_refractions", "joint"]
+JointMethod = Literal["joint_same_evidence", "joint_with_target_in_water", "joint_with_scans"]
+"""Joint calibrations by what they use: what the thesis's two ways use together, the target in water, scans besides."""
+
+Method = Literal["one_refraction", "two_refractions"] | JointMethod
 """Calibrations that the joint comparison sets side by side."""
 
 
@@ -127,25 +130,17 @@ class CampaignResults(_Kept):
     trials: int
 
 
-class SphereErrors(BaseModel):
-    """Errors of a scan of spheres by calibration and figure, and the joint calibration's standard uncertainties, mm."""
+@dataclass(frozen=True)
+class SphereErrors:
+    """Errors of a scan of spheres by calibration and figure, and the joint ones' standard uncertainties, mm.
 
-    model_config = ConfigDict(frozen=True)
+    A medium for which a method has no calibration lacks it.
+    """
 
     placement: str
     medium: str
-    joint: dict[str, float]
-    std: dict[str, float]
-    one_refraction: dict[str, float]
-    two_refractions: dict[str, float] | None = None
-
-    def by_method(self) -> dict[Method, dict[str, float]]:
-        """Errors by the calibrations that there are of the scan's medium."""
-        return {method: errors for method in get_args(Method) if (errors := getattr(self, method)) is not None}
-
-    @model_serializer(mode="wrap")
-    def _without_none(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {name: value for name, value in plain(self).items() if value is not None}
+    errors_mm: dict[Method, dict[str, float]]
+    std_mm: dict[JointMethod, dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -159,31 +154,34 @@ class PlaneScatter:
 
 
 class JointResults(_Kept):
-    """Joint and sequential calibrations of one campaign compared: the file joint.json."""
+    """Joint and sequential calibrations of one campaign compared: the file joint.json.
+
+    ``spheres`` and ``planes`` are scans that no calibration has used.
+    """
 
     format: Literal["uwlts-joint-comparison"] = "uwlts-joint-comparison"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     campaign: str
-    solve_s: float
+    solve_s: dict[JointMethod, float]
     spheres: list[SphereErrors]
     planes: list[PlaneScatter]
 
 
 class MediumSummary(BaseModel):
-    """Errors of all scans in a medium by calibration, and the share of the 95 % intervals that hold the truth."""
+    """Errors of all scans in a medium by calibration, and the shares of the 95 % intervals that hold the truth."""
 
     model_config = ConfigDict(frozen=True)
 
     spacing_error_mm: dict[Method, list[float]]
     diameter_error_mm: dict[Method, list[float]]
     plane_std_over_speckle_limit: list[float]
-    coverage_95: float | None
+    coverage_95: dict[JointMethod, float]
 
 
 class JointSummary(MediumSummary):
     """Summary of the comparison on all campaigns; what stands outside the media is in water."""
 
-    solve_s: list[float]
+    solve_s: dict[JointMethod, list[float]]
     campaigns: int
     water: MediumSummary
     air: MediumSummary

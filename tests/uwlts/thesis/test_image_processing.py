@@ -145,6 +145,19 @@ def test_noise_within_the_tolerance_is_not_smoothed(tmp_path):
     assert spreads[1] < 0.5 * spreads[0]
 
 
+def test_unless_set_the_tolerance_is_labviews(tmp_path):
+    """40 %: a pixel 30 % above its neighbours stays, and draws the vertex to it."""
+    image = parabolas(np.full(LINES, 30.0))
+    image[31] = (1.3 * image[31]).astype(np.uint16) // 2
+    known = found(np.full((1, LINES), 30.0))
+    with capture(tmp_path / "stripe.h5", [image], stripe_along="width") as opened:
+        default, manual, lower = (
+            thesis_stripes(opened, known, **how).centre_px for how in ({}, {"tolerance": 0.4}, {"tolerance": 0.2})
+        )
+    np.testing.assert_array_equal(default, manual)
+    assert (np.abs(default - lower)[2:-2] > 0.01).all()
+
+
 def test_a_plateau_is_placed_at_the_stripe_known_or_in_its_own_middle(tmp_path):
     image = np.full((LENGTH, LINES), 10, np.uint8)
     image[26:35, :20] = 255

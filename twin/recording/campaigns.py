@@ -1,0 +1,221 @@
+"""Records whole campaigns: all recordings of a seed, several at a time, resumed where an earlier run was stopped."""
+
+import json
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+
+from twin.options import CPU, Options, Variant, use_variant
+from twin.scene.campaign import Campaign, Take, load_campaign, takes
+from uwlts.model.errors import DescriptionError, Error, OutputError
+from uwlts.runtime.console import progress_bar
+from uwlts.runtime.workers import work_through
+from uwlts.storage.capture import part_path
+from uwlts.storage.files import written_aside
+from uwlts.storage.truth import truth_path
+
+PLAN = "plan.json"
+
+
+def record(
+    campaign: str | Path,
+    *,
+    out: str | Path,
+    seed: int = 0,
+    every: int = 1,
+    spp: int = 16,
+    workers: int | None = None,
+    overwrite: bool = False,
+    variant: Variant = CPU,
+    show_progress: bool = False,
+) -> Path:
+    """Render all recordings of a campaign into a folder, with the imperfections that a seed draws.
+
+    Run again, it resumes where it was stopped. The folder is returned.
+
+    Parameters
+    ----------
+    campaign
+        Name (see: twin scenes) or path of the campaign's description.
+    out
+        Folder for the captures and their ground truth. What is complete in it is not rendered again.
+    seed
+        Number from which imperfections and noise are drawn.
+    every
+        Take only every n-th profile of the scans; calibrations keep all their images.
+    workers
+        Recordings rendered at a time; as many as there are processors unless given.
+    overwrite
+        Render everything anew.
+    spp, variant
+        As for `simulate`.
+    show_progress
+        Draw a progress bar on the terminal.
+
+    Raises
+    ------
+    DescriptionError, DesignError, OutputError, SetupError
+        As `record_campaigns`, or an argument is out of its range.
+    """
+    for name, value, least in (
+        ("every", every, 1),
+        ("seed", seed, 0),
+        ("workers", 1 if workers is None else workers, 1),
+    ):
+        if value < least:
+            raise DescriptionError(f"{name} is {value}; it must be at least {least}")
+    described, folder = load_campaign(campaign), Path(out)
+    jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant)
+    plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed}
+    bar = progress_bar(f"rendering {described.title}") if show_progress else nullcontext(lambda done, total: None)
+    with bar as progress:
+        _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
+    return folder
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A take to render into a file, with its number of images and its files: capture, truth, unfinished capture."""
+
+    take: Take
+    path: Path
+    options: Options
+    variant: str
+
+    @property
+    def images(self) -> int:
+        return self.take.scene.motion.count * len(self.take.scene.motion.lights)
+
+    @property
+    def files(self) -> tuple[Path, Path, Path]:
+        return self.path, truth_path(self.path), part_path(self.path)
+
+
+def record_campaigns(
+    campaign: Campaign,
+    folder: Path,
+    *,
+    seeds: range,
+    every: int = 1,
+    spp: int = 16,
+    variant: str = CPU,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; returns these folders.
+
+    Complete recordings stay as they are and interrupted ones are gone on with; ``overwrite`` removes those of the
+    seeds and renders all anew. ``progress(done, total)`` counts images. DescriptionError where the folder holds a
+    campaign that was rendered differently, or a description is wrong; DesignError where the sensor cannot measure a
+    scene; OutputError where a file cannot be written; SetupError where a process that renders was ended from outside.
+    """
+    folders = [folder / f"campaign-{seed}" for seed in seeds]
+    jobs = [
+        job
+        for seed, place in zip(seeds, folders, strict=True)
+        for job in _jobs(campaign, place, seed=seed, every=every, spp=spp, variant=variant)
+    ]
+    plan = _plan(campaign, every=every, spp=spp, variant=variant)
+    _record_all(
+        jobs, folder, plan, recorded="campaign-*/*.h5*", workers=workers, overwrite=overwrite, progress=progress
+    )
+    return folders
+
+
+def _jobs(campaign: Campaign, place: Path, *, seed: int, every: int, spp: int, variant: str) -> list[_Job]:
+    return [
+        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed), variant)
+        for take in takes(campaign, seed=seed, every=every)
+    ]
+
+
+def _plan(campaign: Campaign, *, every: int, spp: int, variant: str) -> dict[str, object]:
+    return {"campaign": campaign.model_dump(mode="json"), "every": every, "spp": spp, "variant": variant}
+
+
+def _record_all(
+    jobs: list[_Job],
+    folder: Path,
+    plan: dict[str, object],
+    *,
+    recorded: str,
+    workers: int | None,
+    overwrite: bool,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Render what is not complete into a folder that keeps to a plan; ``recorded`` is the pattern of its captures."""
+    files = {file for job in jobs for file in job.files}
+    _keep_to_plan(folder, plan, files, recorded=recorded, overwrite=overwrite)
+    for place in {job.path.parent for job in jobs}:
+        place.mkdir(exist_ok=True)
+    if overwrite:
+        # All at once and not one by one: what an interrupted run leaves must not be taken for its own.
+        for path in (path for job in jobs for path in job.files):
+            path.unlink(missing_ok=True)
+    # The longest first, so that no process is left alone with a long one at the end.
+    waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
+    waiting.sort(key=lambda job: job.images, reverse=True)
+    total = sum(job.images for job in jobs)
+    counted = count(total - sum(job.images for job in waiting))
+    progress(next(counted), total)
+    work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+
+
+def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, recorded: str, overwrite: bool) -> None:
+    """Write the settings of a folder's campaigns, or check that they are the same as before; ``files`` are theirs."""
+    path = folder / PLAN
+    text = json.dumps(plan, indent=2) + "\n"
+    plan = json.loads(text)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = set(folder.glob(recorded))
+        content = path.read_bytes() if path.is_file() else b"null"
+    except OSError as error:
+        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    try:
+        known = json.loads(content)
+    except ValueError:
+        known = None
+    if known == plan:
+        return
+    how = f"that {PLAN} does not describe"
+    if isinstance(known, dict):
+        how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
+    if found and not overwrite:
+        raise DescriptionError(
+            f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start afresh"
+        )
+    if kept := found - files:
+        raise DescriptionError(
+            f"{folder} would keep recordings {how}, such as {min(kept)}: give another folder, or remove them first"
+        )
+    with written_aside(path, overwrite=True) as aside:
+        aside.write_text(text, encoding="utf-8")
+
+
+def _record(job: _Job, report: Callable[[None], None]) -> None:
+    """Render a take; calls ``report`` after every image."""
+    use_variant(job.variant)
+    import drjit as dr
+
+    from twin.recording.studio import record_scene
+
+    dr.set_thread_count(1)
+    take = job.take
+    try:
+        record_scene(
+            take.scene,
+            take.sensor,
+            job.path,
+            as_built=take.built,
+            options=job.options,
+            overwrite=True,
+            # What is there of an incomplete recording is a part to go on with, or lacks its truth.
+            resume=part_path(job.path).exists(),
+            progress=lambda images, total: report(None),
+        )
+    except Error as error:
+        raise type(error)(f"{job.path}: {error}") from error
