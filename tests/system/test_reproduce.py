@@ -19,6 +19,7 @@ import pytest
 
 from twin import cli
 from twin.options import Options
+from twin.recording.campaigns import record as record_one
 from twin.recording.campaigns import record_campaigns
 from twin.recording.studio import record_scene
 from twin.scene.campaign import load_campaign, takes
@@ -362,3 +363,34 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     for part in parts:
         with Capture(part) as capture:
             assert len(capture) < LONG
+
+
+def test_one_campaign_is_recorded_into_a_folder_of_its_own(
+    described: Path, rendered: tuple[Path, Progress], tmp_path: Path
+):
+    """The same captures as campaign 0 of several; again nothing is rendered, and another seed is refused."""
+    folder, campaign = tmp_path / "one", described / "small.toml"
+    assert record_one(campaign, out=folder, spp=4, workers=2) == folder
+    assert sorted(path.name for path in folder.glob("*.h5")) == sorted(
+        name for take in NAMES for name in (f"{take}.h5", f"{take}.truth.h5")
+    )
+    for name in NAMES:
+        assert_same_images(folder / f"{name}.h5", rendered[0] / "campaign-0" / f"{name}.h5")
+    before = contents(folder)
+    record_one(campaign, out=folder, spp=4)
+    assert contents(folder) == before
+    with pytest.raises(DescriptionError, match="made with another seed"):
+        record_one(campaign, out=folder, spp=4, seed=1)
+    assert contents(folder) == before
+
+
+def test_a_campaign_is_not_recorded_beside_captures_of_others(described: Path, tmp_path: Path):
+    foreign = tmp_path / "mine.h5"
+    foreign.write_bytes(b"a capture of the user's")
+    for overwrite in (False, True):
+        with pytest.raises(DescriptionError, match="mine.h5|another folder"):
+            record_one(described / "small.toml", out=tmp_path, overwrite=overwrite)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.h5"]
+    for key, wrong in (("seed", -1), ("every", 0), ("workers", 0)):
+        with pytest.raises(DescriptionError, match=f"{key} is {wrong}"):
+            record_one(described / "small.toml", out=tmp_path / "new", **{key: wrong})

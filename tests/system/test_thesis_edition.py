@@ -139,7 +139,8 @@ def imperfect(tmp_path_factory: pytest.TempPathFactory) -> CampaignFolder:
     """A small campaign with the random imperfections of seed 1, among them water of another temperature."""
     folder = tmp_path_factory.mktemp("imperfect")
     described = load_campaign("thesis").model_dump(include={"title", "sensor", "as_built", "imperfections"})
-    scans = {"scene": "spheres", "media": ["water"], "placements": ["near", "standoff", "far"]}
+    places = ["near", "near-2", "standoff", "standoff-2", "far", "far-2"]
+    scans = {"scene": "spheres", "media": ["water"], "placements": places}
     plane = {"scene": "plane", "media": ["water"], "placements": ["standoff"]}
     campaign = Campaign.model_validate(described | {"recordings": [*RECORDINGS[:4], scans, plane]})
     (recorded,) = record_campaigns(campaign, folder, seeds=range(1, 2), every=EVERY)
@@ -150,44 +151,48 @@ def root_mean_square(values) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+JOINT = "joint_with_scans"
+
+
 def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect: CampaignFolder):
     """Imperfections follow from the seed alone; only the images' noise depends on the processor that draws it.
 
-    Measured on a processor with AVX2: all nine figures (three spacings, six diameters) have a root mean square error of
-    0.010 mm jointly, 0.067 mm with one refraction and 0.079 mm with two; 0.011 mm are stated.
+    Measured on a processor with AVX2: all nine figures (three spacings, six diameters) of scans that no calibration has
+    used have a root mean square error of 0.010 mm jointly with other scans, 0.024 mm with the target in water, 0.074 mm
+    with one refraction and 0.082 mm with two; 0.020 mm are stated, as the water could have drifted between scans.
     """
     (result,) = compare_campaigns([imperfect])
     names = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
     errors = {
-        way: np.array([scan.by_method()[way][name] for scan in result.spheres for name in names])
-        for way in ("joint", "one_refraction", "two_refractions")
+        way: np.array([scan.errors_mm[way][name] for scan in result.spheres for name in names])
+        for way in (JOINT, "joint_with_target_in_water", "one_refraction", "two_refractions")
     }
-    stated = np.array([scan.std[name] for scan in result.spheres for name in names])
+    stated = np.array([scan.std_mm[JOINT][name] for scan in result.spheres for name in names])
     assert len(stated) == 9
-    print({way: root_mean_square(e) for way, e in errors.items()}, errors["joint"] / stated)
+    assert {scan.placement for scan in result.spheres} == {"near-2", "standoff-2", "far-2"}
+    print({way: root_mean_square(e) for way, e in errors.items()}, errors[JOINT] / stated)
 
     # Errors against their stated standard uncertainties. All figures share the calibration; their correlation is not
     # known. Whatever it is, a sum of squared normal variables with a mean of 1 exceeds any x > 1.54 at most as often as
     # a single one does (Szekely and Bakirov 2003, Probab. Theory Relat. Fields 126:184): 6.3e-5 beyond 4 sigma.
-    assert np.mean((errors["joint"] / stated) ** 2) < 4.0**2
+    assert np.mean((errors[JOINT] / stated) ** 2) < 4.0**2
 
     # The stated uncertainty hardly depends on the noise that was drawn: its level follows from some ten thousand stripe
     # centres and circles, to a few percent, and from descriptions. 30 % are far beyond a probability of 1e-4. It may
     # neither shrink to half or a third (too sure) nor grow (an advantage lost); that it is right is shown by the
     # simulated campaigns of tests/uwlts/calibration/joint/test_coverage.py.
-    assert 0.0110 / 1.3 < root_mean_square(stated) < 0.0110 * 1.3
+    assert 0.0204 / 1.3 < root_mean_square(stated) < 0.0204 * 1.3
 
-    # Factors of 6.5 and 7.6 are expected (ten campaigns: 7 for spacings, 11 for diameters), and 3 is required: a joint
-    # estimate whose errors are 2.2 times larger fails. By the noise of a scan a diameter moves by 0.007 mm,
-    # independently from scan to scan, and by that of the calibration all spacings by about 0.005 mm together. For
-    # 0.022 mm all spacings would have to move by 0.028 mm, more than five of their standard deviations (1e-7), or each
-    # of six diameters by 0.015 mm, more than two of theirs (1e-9).
+    # Factors of 7.7 and 8.7 are expected, and 3 is required: a joint estimate whose errors are 2.6 times larger fails.
+    # By the noise of a scan a diameter moves by 0.007 mm, independently from scan to scan, and by that of the calibration
+    # all spacings by about 0.005 mm together. For 0.025 mm all spacings would have to move by 0.028 mm, more than five of
+    # their standard deviations (1e-7), or each of six diameters by 0.015 mm, more than two of theirs (1e-9).
     for way in ("one_refraction", "two_refractions"):
-        assert root_mean_square(errors["joint"]) < root_mean_square(errors[way]) / 3, way
+        assert root_mean_square(errors[JOINT]) < root_mean_square(errors[way]) / 3, way
 
     summary = joint_summary([result])
     assert max(summary.plane_std_over_speckle_limit) < 1.5
-    assert summary.coverage_95 is not None
+    assert set(summary.coverage_95) == {"joint_same_evidence", "joint_with_target_in_water", JOINT}
     assert not summary.air.spacing_error_mm
     assert summary_lines(summary)[0].startswith("water, error of the sphere spacing")
 
