@@ -184,9 +184,9 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
     assert 0.0204 / 1.3 < root_mean_square(stated) < 0.0204 * 1.3
 
     # Factors of 7.7 and 8.7 are expected, and 3 is required: a joint estimate whose errors are 2.6 times larger fails.
-    # By the noise of a scan a diameter moves by 0.007 mm, independently from scan to scan, and by that of the calibration
-    # all spacings by about 0.005 mm together. For 0.025 mm all spacings would have to move by 0.028 mm, more than five of
-    # their standard deviations (1e-7), or each of six diameters by 0.015 mm, more than two of theirs (1e-9).
+    # By the noise of a scan a diameter moves by 0.007 mm, independently from scan to scan, and by that of the
+    # calibration all spacings by about 0.005 mm together. For 0.025 mm all spacings would have to move by 0.028 mm,
+    # over five of their standard deviations (1e-7), or each of six diameters by 0.015 mm, over two of theirs (1e-9).
     for way in ("one_refraction", "two_refractions"):
         assert root_mean_square(errors[JOINT]) < root_mean_square(errors[way]) / 3, way
 
