@@ -1,6 +1,8 @@
-"""How often stated 95 % intervals hold the truth: ``python -m tests.bench.coverage [campaigns]``.
+"""How often stated 95 % intervals hold the truth: ``python -m tests.bench.coverage [campaigns] [--varied]``.
 
-Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
+With ``--varied`` the sensor is another one than the thesis's, is known better or worse than its description states, or
+errs in ways that the calibration does not know; the campaigns of each kind have the target in water. Campaigns are
+simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
 standard is scanned and measured with each calibration.
 """
 
@@ -17,13 +19,23 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.uwlts.calibration_views import STEP_MM
-from tests.uwlts.simulated_campaign import PLACES_MM, SPHERES, Reality, drawn_reality, evidence, scan_of_spheres
+from tests.uwlts.simulated_campaign import (
+    PLACES_MM,
+    SPHERES,
+    ModelErrors,
+    Reality,
+    drawn_reality,
+    evidence,
+    scan_of_spheres,
+)
+from tests.virtual_sensors import altered
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.measurement.figure_uncertainty import figure_uncertainties
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
 from uwlts.model.library import load_sensor
 from uwlts.model.parameter_keys import (
     LensParameter,
@@ -65,12 +77,43 @@ class Measured:
 
 
 @dataclass(frozen=True)
+class Variation:
+    """Another kind of campaign: changes of the sensor's description, ``spread`` and ``errors`` of `drawn_reality`."""
+
+    name: str = "as described"
+    changes: tuple[tuple[str, dict[str, Any]], ...] = ()
+    spread: float = 1.0
+    errors: ModelErrors = ModelErrors()
+
+
+@dataclass(frozen=True)
 class Campaign:
     """A seed, and whether the target is seen in water as well as in air."""
 
     seed: int
     wet: bool
     step_mm: float = 3.0
+    variation: Variation = Variation()
+
+
+SAPPHIRE = {"window": {"glass": 1.766, "thickness_mm": 4.0}}
+VARIATIONS = (
+    Variation(),
+    Variation("lens of 8 mm", (("camera", {"focal_length_mm": 8.0}),)),
+    Variation("lens of 16 mm", (("camera", {"focal_length_mm": 16.0}),)),
+    Variation("window 90 mm from the pupil", (("camera", {"window": {"distance_mm": 90.0}}),)),
+    Variation("sapphire, 4 mm", (("camera", SAPPHIRE),)),
+    Variation("acrylic, 20 mm", (("camera", {"window": {"glass": 1.488, "thickness_mm": 20.0}}),)),
+    Variation("window tilted by 5 deg", (("camera", {"window": {"tilt_x_deg": 5.0, "tilt_y_deg": -3.0}}),)),
+    Variation("twice as far off as stated", spread=2.0),
+    Variation("half as far off as stated", spread=0.5),
+    Variation("k3 of 0.1", errors=ModelErrors(distortion=(("k3", 0.1),))),
+    Variation("p1 of 0.0005, p2 of -0.0005", errors=ModelErrors(distortion=(("p1", 5e-4), ("p2", -5e-4)))),
+    Variation("saddle of 0.05 mm", errors=ModelErrors(saddle_mm=0.05)),
+    Variation("target 0.1 % wider", errors=ModelErrors(stretch=1e-3)),
+    Variation("stripe on the target 0.1 px off by gloss", errors=ModelErrors(gloss_px=0.1)),
+)
+"""Sizes of model errors: distortion that moves the image's corner by 0.1 to 1 px; boards and gloss as they are met."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +126,16 @@ class Outcome:
 
     measured: list[Measured]
     pulls: np.ndarray
+    warned: bool
     solve_s: float
     figures_s: float
 
 
 def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
     """Calibrate, scan spheres at one of three places in turn, measure them; CalibrationError as `solve_jointly`."""
-    described = load_sensor("thesis")
-    real = drawn_reality(described, np.random.default_rng(campaign.seed))
+    how = campaign.variation
+    described = altered(load_sensor("thesis"), dict(how.changes))
+    real = drawn_reality(described, np.random.default_rng(campaign.seed), spread=how.spread, errors=how.errors)
     gathered = evidence(real, described, wet=campaign.wet)
     start = time.perf_counter()
     calibration = solve_jointly(gathered, options=OPTIONS).calibration
@@ -100,7 +145,11 @@ def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
     better = described.model_copy(update={"uncertainty": uncertainty})
     scans.append(_scan(real, better, calibration, campaign, " known better"))
     return Outcome(
-        [*scans[0][0], *scans[1][0]], parameter_pulls(calibration, real, described), solve_s, scans[0][1] + scans[1][1]
+        [*scans[0][0], *scans[1][0]],
+        parameter_pulls(calibration, real, described),
+        bool(calibration.origin().warnings),
+        solve_s,
+        scans[0][1] + scans[1][1],
     )
 
 
@@ -116,7 +165,7 @@ def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) 
         LensParameter.K1: camera.distortion.k1,
         LensParameter.K2: camera.distortion.k2,
         WindowParameter.DISTANCE: window.distance_mm,
-        WindowParameter.SLOPE_X: slope_x,
+        WindowParameter.SLOPE_X: float(slope_x),
         WindowParameter.SLOPE_Y: -np.tan(np.radians(window.tilt_x_deg)) * np.hypot(1.0, slope_x),
         WindowParameter.THICKNESS: window.thickness_mm,
         WindowParameter.GLASS_INDEX: window.index(real.sensor.laser.wavelength_nm),
@@ -200,9 +249,57 @@ def within(measured: Sequence[Measured]) -> float:
     return float(np.mean([abs(m.error_mm) <= NORMAL_95 * m.std_mm for m in measured]))
 
 
+def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
+    """The outcome of a campaign; None where the calibration refuses its evidence as contradictory."""
+    try:
+        return run_campaign(campaign)
+    except CalibrationError:
+        return None
+
+
+def varied(count: int) -> int:
+    """Run so many campaigns of each variation and print, for each, how often the truth is where it is said to be."""
+    table = Table(
+        "campaigns in water",
+        "refused",
+        "warned",
+        "spacing within 95 %",
+        "diameter",
+        "rms spacing",
+        "stated",
+        "parameters",
+    )
+    jobs = [Campaign(seed, True, variation=each) for each in VARIATIONS for seed in range(count)]
+    outcomes = work_through(attempt, jobs)
+    for number, variation in enumerate(VARIATIONS):
+        own = outcomes[number * count : (number + 1) * count]
+        kept = [outcome for outcome in own if outcome is not None]
+        found = judged(kept)
+        spacing, diameter = (found.get(("water known better", what), []) for what in ("spacing", "diameter"))
+        if not spacing:
+            table.add_row(variation.name, str(count), *["-"] * 6)
+            continue
+        error, std = np.array([(m.error_mm, m.std_mm) for m in spacing]).T
+        table.add_row(
+            variation.name,
+            str(count - len(kept)),
+            str(sum(outcome.warned for outcome in kept)),
+            f"{100 * within(spacing):.0f} %",
+            f"{100 * within(diameter):.0f} %",
+            f"{1e3 * np.sqrt(np.mean(error**2)):.1f} µm",
+            f"{1e3 * np.sqrt(np.mean(std**2)):.1f} µm",
+            f"{np.mean(np.concatenate([outcome.pulls for outcome in kept]) ** 2):.2f}",
+        )
+    Console(width=140).print(table)
+    return 0
+
+
 def main() -> int:
     """Run all campaigns and print how often the truth is where it is said to be."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else CAMPAIGNS
+    words = [word for word in sys.argv[1:] if word != "--varied"]
+    count = int(words[0]) if words else CAMPAIGNS
+    if "--varied" in sys.argv:
+        return varied(count)
     jobs = [Campaign(seed, wet) for seed in range(count) for wet in (True, False)]
     outcomes = work_through(run_campaign, jobs)
     table = Table("scan", "quantity", "number", "within 95 %", "rms error / std", "mean |error|", "mean std")

@@ -22,7 +22,23 @@ FORMULA = 1.5e-5
 # A finder of stripes gives up where a surface leans away further: the cosine of the angle of incidence.
 _LEAST_COSINE = 0.4
 _FEWEST_LIT = 50
+_LENGTHENED = 12.93 / 12.5
+"""Of the focal length, as of the sensor as built against its drawings."""
 _TRACED = 60
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """What the joint calibration does not know of: it has no parameter for it, and the description is silent.
+
+    ``distortion`` are coefficients added to the lens's. The target is a saddle, ``saddle_mm`` high at its edges'
+    middles, and printed wider along x by the share ``stretch``. Its gloss moves the stripe on it by ``gloss_px``.
+    """
+
+    distortion: tuple[tuple[str, float], ...] = ()
+    saddle_mm: float = 0.0
+    stretch: float = 0.0
+    gloss_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +46,7 @@ class Reality:
     """What a sensor, its stage and its standards really are where drawings and certificates say something else.
 
     ``lean`` (2,) are the slopes of the stage's direction against the target's normal,
-    ``warmer_k`` by how much the water is warmer than its thermometer says.
+    ``warmer_k`` by how much the water is warmer than its thermometer says. ``errors`` are those of the model.
     """
 
     sensor: Sensor
@@ -45,6 +61,7 @@ class Reality:
     stripe_px: float
     stage_mm: float
     rng: np.random.Generator
+    errors: ModelErrors = ModelErrors()
 
     def index(self, medium: Medium, drift_k: float = 0.0) -> float:
         """Index of a medium; that of water is of the second order in the temperature, also beyond 30 degC."""
@@ -57,11 +74,26 @@ class Reality:
         )
 
 
-def drawn_reality(described: Sensor, rng: np.random.Generator) -> Reality:
-    """A sensor built from drawings; what they state no uncertainty for differs as in the sensor as built."""
-    known, built = described.uncertainty, built_sensor()
-    camera, laser, window = built.camera, built.laser, described.camera.window
-    slope_x, slope_y = np.tan(np.radians(known.window_tilt_deg)) * rng.standard_normal(2)
+def drawn_reality(
+    described: Sensor, rng: np.random.Generator, *, spread: float = 1.0, errors: ModelErrors = ModelErrors()
+) -> Reality:
+    """A sensor built from drawings; what they state no uncertainty for differs as in the sensor as built.
+
+    All that they state an uncertainty for differs by ``spread`` times as much as they say.
+    """
+    stated = described.uncertainty
+    known = stated.model_copy(
+        update={name: spread * value for name, value in stated.model_dump().items() if isinstance(value, float)}
+    )
+    built = built_sensor()
+    camera, window = described.camera, described.camera.window
+    distortion = built.camera.distortion.model_dump()
+    laser = described.laser.model_copy(update={"window": built.laser.window})
+    for name, value in errors.distortion:
+        distortion[name] += value
+    tilt_x, tilt_y = np.radians([window.tilt_x_deg, window.tilt_y_deg])
+    as_drawn = np.array([np.tan(tilt_y), -np.tan(tilt_x) * np.hypot(1.0, np.tan(tilt_y))])
+    slope_x, slope_y = as_drawn + np.tan(np.radians(known.window_tilt_deg)) * rng.standard_normal(2)
     bow, facing = np.radians([known.bow_deg, known.laser_window_tilt_deg]) * rng.standard_normal(2)
     window = window.model_copy(
         update={
@@ -75,17 +107,18 @@ def drawn_reality(described: Sensor, rng: np.random.Generator) -> Reality:
     camera = camera.model_copy(
         update={
             "window": window,
-            "focal_length_mm": camera.focal_length_mm + rng.normal(0, 0.03),
-            "principal_point_px": tuple(camera.principal_point() + rng.normal(0, 4.0, 2)),
+            "distortion": built.camera.distortion.model_validate(distortion),
+            "focal_length_mm": camera.focal_length_mm * _LENGTHENED + rng.normal(0, 0.03),
+            "principal_point_px": tuple(camera.principal_point() + rng.normal((6.7, -5.6), 4.0)),
         }
     )
     facing_window = laser.window.model_copy(update={"tilt_y_deg": float(np.degrees(facing + bow))})
     laser = laser.model_copy(
         update={
             "window": facing_window,
-            "baseline_mm": laser.baseline_mm + rng.normal(0, 0.5),
-            "triangulation_angle_deg": laser.triangulation_angle_deg + rng.normal(0, 0.1),
-            "roll_deg": laser.roll_deg + rng.normal(0, 0.1),
+            "baseline_mm": laser.baseline_mm + rng.normal(-0.8, 0.5),
+            "triangulation_angle_deg": laser.triangulation_angle_deg + rng.normal(0.15, 0.1),
+            "roll_deg": laser.roll_deg + rng.normal(0.25, 0.1),
         }
     )
     return Reality(
@@ -101,6 +134,7 @@ def drawn_reality(described: Sensor, rng: np.random.Generator) -> Reality:
         stripe_px=rng.uniform(0.1, 0.15),
         stage_mm=known.stage_position_mm,
         rng=rng,
+        errors=errors,
     )
 
 
@@ -170,9 +204,10 @@ def target_series(
     corner = np.sum(grid[:, :2] ** 2, axis=1).max()
 
     def bulge(points: np.ndarray) -> np.ndarray:
-        return real.target_bow_mm * np.sum(points[:, :2] ** 2, axis=1) / corner
+        x2, y2 = points[:, 0] ** 2, points[:, 1] ** 2
+        return (real.target_bow_mm * (x2 + y2) + 2 * real.errors.saddle_mm * (x2 - y2)) / corner
 
-    bent = np.column_stack([flat[:, :2], bulge(flat)])
+    bent = np.column_stack([flat[:, 0] * (1 + real.errors.stretch), flat[:, 1], bulge(flat)])
     fan = FanRays.of(real, index, rays)
     images, stripes = [], []
     for position in positions:
@@ -187,7 +222,7 @@ def target_series(
             lit = fan.on_plane(rotation[:, 2], rotation[:, 2] @ origin + bulge((lit - origin) @ rotation))
         on_it = (np.abs((lit - origin) @ rotation)[:, :2] < 115.0).all(axis=1)
         pixels = seen(sensor, lit[on_it], index=index, window=view.window)
-        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)]))
+        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)]) + [0.0, real.errors.gloss_px])
     evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
     return Series(view, evidence, True, ["target"])
 

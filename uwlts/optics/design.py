@@ -211,14 +211,25 @@ def scheimpflug_angle_rad(*, triangulation_angle_rad: float, magnification: floa
     return math.atan(math.tan(triangulation_angle_rad) / magnification)
 
 
+DEPOLARISED_CONTRAST = math.sqrt(0.5)
+"""Speckle contrast of a surface that depolarises, as paint does: two independent patterns of equal mean on top of each
+other (Goodman, Speckle Phenomena in Optics, section 3.4)."""
+
+
 def speckle_limit_um(
-    *, wavelength_nm: float, focal_length_mm: float, f_number: float, distance_mm: float, contrast: float = 1.0
+    *,
+    wavelength_nm: float,
+    focal_length_mm: float,
+    f_number: float,
+    distance_mm: float,
+    contrast: float = DEPOLARISED_CONTRAST,
 ) -> float:
     """Standard uncertainty of a laser spot's position across the camera's axis, on the object, for speckle contrast C.
 
     Dorsch, Haeusler and Herrmann 1994, Applied Optics 33:1306: C lambda / (2 pi sin u), where the object sees the pupil
     of diameter f / N under the half-angle u. The uncertainty along the laser's axis is larger by 1 / sin theta_t: the
-    thesis's 16 um at 250 mm are across, and 28 um in depth. Behind a window take the apparent distance.
+    thesis's 16 um at 250 mm are across, for a contrast of 1, and 28 um in depth. Behind a window take the apparent
+    distance.
     """
     _require_positive(
         wavelength_nm=wavelength_nm,

@@ -93,7 +93,7 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
         DesignRow("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
         DesignRow("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
         DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
-        DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994"),
+        DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994, contrast 0.71"),
         DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
         DesignRow("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
     ]

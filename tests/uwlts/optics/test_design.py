@@ -228,13 +228,15 @@ def test_object_plane_lens_plane_and_image_plane_meet_in_one_line():
 
 
 def test_the_thesis_speckle_limit():
-    across = speckle_limit_um(wavelength_nm=635, focal_length_mm=12.5, f_number=4, distance_mm=250)
+    thesis = {"wavelength_nm": 635, "focal_length_mm": 12.5, "f_number": 4, "distance_mm": 250}
+    across = speckle_limit_um(**thesis, contrast=1.0)
     assert across == pytest.approx(16, abs=0.5)
     # sin u = 12.5 / 8 / 250 = 1 / 160 but for 2e-5: 160 * 0.635 / (2 pi).
     assert across == pytest.approx(16.170, abs=0.001)
     assert across / math.sin(ANGLE) == pytest.approx(28.2, abs=0.05)
-    halved = speckle_limit_um(wavelength_nm=635, focal_length_mm=12.5, f_number=4, distance_mm=250, contrast=0.5)
-    assert halved == pytest.approx(across / 2)
+    assert speckle_limit_um(**thesis, contrast=0.5) == pytest.approx(across / 2)
+    # Of two independent patterns of equal mean the variances add: 2 (1/2)^2.
+    assert speckle_limit_um(**thesis) == pytest.approx(across * math.sqrt(0.5))
 
 
 def test_the_thesis_window_thickness_needs_a_smaller_opening_than_the_bore():
@@ -321,9 +323,9 @@ def test_the_table_of_the_thesis_sensor(thesis):
         "fused silica window for 1 MPa, clamped": (7.044, "mm"),
         # tan 35 deg * 1.3312 over 12.5 / 299.37.
         "image plane to lens axis, sheet in focus": (87.44, "deg"),
-        # 0.635 / (2 pi) over 12.5 / 8 / 299.37, and over sin 35 deg.
-        "speckle limit across the camera's axis": (19.36, "um"),
-        "speckle limit along the laser's axis": (33.76, "um"),
+        # 0.635 / (2 pi) over 12.5 / 8 / 299.37, times sqrt(1/2), and over sin 35 deg.
+        "speckle limit across the camera's axis": (13.69, "um"),
+        "speckle limit along the laser's axis": (23.87, "um"),
     }
     for name, (value, unit) in expected.items():
         assert table[name].value == pytest.approx(value, rel=5e-4), name

@@ -17,10 +17,15 @@ BY_CHANCE = 1e-4
 
 
 @pytest.fixture(scope="module")
-def measured():
+def outcomes():
+    """What all campaigns found."""
+    return [run_campaign(Campaign(seed, wet=seed < WET)) for seed in range(WET + DRY)]
+
+
+@pytest.fixture(scope="module")
+def measured(outcomes):
     """Errors over stated standard uncertainties, and shares within 95 %, of all scans together, by quantity."""
-    campaigns = [Campaign(seed, wet=seed < WET) for seed in range(WET + DRY)]
-    found = judged([run_campaign(campaign) for campaign in campaigns])
+    found = judged(outcomes)
     return {
         quantity: [m for (_, other), some in found.items() if other == quantity for m in some]
         for quantity in ("spacing", "diameter")
@@ -50,3 +55,15 @@ def test_errors_are_as_large_as_stated(measured, quantity):
     square = np.mean([(m.error_mm / m.std_mm) ** 2 for m in measured[quantity]])
     lowest, highest = chi2.ppf([BY_CHANCE, 1 - BY_CHANCE], scans) / scans
     assert lowest < square < highest
+
+
+def test_the_covariance_is_that_of_the_errors(outcomes):
+    """Errors of lens, window, water, stage, target and step, whitened by their covariance: some 300 of variance one.
+
+    Their mean square lies within 0.73 and 1.32. A covariance too large by a factor of 1.5 makes it 0.67, one too small
+    by that factor 1.5.
+    """
+    pulls = np.concatenate([outcome.pulls for outcome in outcomes])
+    assert len(pulls) == 14 * WET + 12 * DRY
+    lowest, highest = chi2.ppf([BY_CHANCE, 1 - BY_CHANCE], len(pulls)) / len(pulls)
+    assert lowest < np.mean(pulls**2) < highest
