@@ -89,7 +89,9 @@ def test_calibration_finds_the_sensor_as_built(campaign: tuple[Path, Calibration
     assert calibration.residuals["sheet"]["rms_mm"] < 0.08
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize(
+    "placement", [p if p == "standoff" else pytest.param(p, marks=pytest.mark.slow) for p in PLACEMENTS]
+)
 def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationResult], placement: str):
     folder, result = campaign
     path = record(

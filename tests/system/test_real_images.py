@@ -54,6 +54,7 @@ def imported(tmp_path: Path, folder: str, description: str) -> Capture:
     return Capture(tmp_path / "real.h5")
 
 
+@pytest.mark.slow
 def test_the_chessboard_gives_the_authors_camera(tmp_path: Path):
     target = '[target]\nkind = "chessboard"\ncolumns = 11\nrows = 6\nsquare_mm = 13.0\n'
     with imported(tmp_path, "chessboard", 'lamp = "frame*.png"' + SENSOR + target) as capture:

@@ -36,6 +36,7 @@ def study_of(paths: dict[str, float], **rest: object) -> Study:
     return Study.model_validate({"title": "test", "variables": ranges, "sampling": {"kind": "sobol"}} | rest)
 
 
+@pytest.mark.slow
 def test_every_derivative_is_the_limit_of_differences():
     assert set(VALUES) == set(PARAMETER_OF)
     study, names = study_of(VALUES), list(SMOOTH)

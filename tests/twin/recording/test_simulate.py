@@ -133,7 +133,9 @@ def test_ideal_recordings_have_no_noise(small, scene, tmp_path):
     assert (np.median(frames[0][1]), frames[0][1].min()) == (2, 2)
 
 
-@pytest.mark.parametrize("frames", [1, 4, 6])
+@pytest.mark.parametrize(
+    "frames", [pytest.param(1, marks=pytest.mark.slow), 4, pytest.param(6, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_recording_goes_on_where_it_stopped(undisturbed, small, scene, tmp_path, frames):
     path, part = tmp_path / "scan.h5", tmp_path / "scan.h5.part"
     with pytest.raises(KeyboardInterrupt):

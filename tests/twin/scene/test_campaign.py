@@ -213,6 +213,7 @@ def test_a_recording_as_described_has_no_imperfections():
     assert take.scene == load_scene("pipe", motion=load_scene("pipe").motion.model_dump() | {"count": 1})
 
 
+@pytest.mark.slow
 def test_size_of_the_windows_tilts():
     built = load_sensor("thesis-as-built").camera.window
     windows = [found["target"].built.camera.window for found in over_seeds("window_tilt_std_deg", [0])]
@@ -227,11 +228,13 @@ def test_one_sensor_records_a_whole_campaign():
     assert all(sensor == sensors[0] for sensor in sensors)
 
 
+@pytest.mark.slow
 def test_size_of_the_sheets_bow():
     built = load_sensor("thesis-as-built").laser.bow_deg
     assert_spread([found[STEP].built.laser.bow_deg - built for found in over_seeds("sheet_bow_std_deg", [2])], 0.15)
 
 
+@pytest.mark.slow
 def test_size_of_the_waters_temperature():
     drawings = over_seeds("temperature_half_width_c", [0, 1, 2, 3])
     warmer = {
@@ -247,6 +250,7 @@ def test_size_of_the_waters_temperature():
     assert drawings[0]["target"].built.media["air"] == load_sensor("thesis-as-built").media["air"]
 
 
+@pytest.mark.slow
 def test_size_of_the_targets_errors():
     assert_spread([plate(found["target"]).bow_mm for found in over_seeds("target_bow_std_mm", [0])], 0.02)
     found = drawn(7, **SIZES)
@@ -257,6 +261,7 @@ def test_size_of_the_targets_errors():
     assert plates[0].errors_seed == plates[1].errors_seed != plate(drawn(8, **SIZES)["target"]).errors_seed
 
 
+@pytest.mark.slow
 def test_size_of_the_targets_tilt():
     """Put up anew for every recording, it is turned about X and Y, not about Z."""
     drawings = over_seeds("target_tilt_std_deg", [0, 1])
@@ -267,6 +272,7 @@ def test_size_of_the_targets_tilt():
     assert_independent(tilts[:, 0, 0], tilts[:, 1, 0])
 
 
+@pytest.mark.slow
 def test_size_of_the_stages_errors():
     one, other = (drawn(seed, stage_position_std_mm=0.003) for seed in (0, 1))
     errors = [takes_of[name].scene.motion.position_errors_mm for takes_of in (one, other) for name in PLANES]
@@ -277,6 +283,7 @@ def test_size_of_the_stages_errors():
     assert_independent(errors[0][1:], errors[0][:-1])
 
 
+@pytest.mark.slow
 def test_size_of_the_stages_lead():
     shares = []
     for found in over_seeds("stage_lead_std", [0, 3]):
@@ -289,6 +296,7 @@ def test_size_of_the_stages_lead():
     assert_spread(shares, 5e-5)
 
 
+@pytest.mark.slow
 def test_size_of_the_stages_misalignment():
     drawings = over_seeds("stage_misalignment_std_deg", [0, 1, 2, 3])
     by_name = {name: np.array([deflection_deg(found[name]) for found in drawings]) for name in NAMES[:-1]}
@@ -306,6 +314,7 @@ def test_size_of_the_stages_misalignment():
     assert_independent(along_z[:, 0], by_name["target-water"][:, 0])
 
 
+@pytest.mark.slow
 def test_size_of_the_steps_height():
     heights = []
     for found in over_seeds("step_height_half_width_mm", [2]):
