@@ -125,7 +125,7 @@ def campaign() -> tuple[int, float, float, float]:
     """The thesis's spheres in air and water and its calibration: frames, seconds, GiB, and late over early frames."""
     as_built = load_sensor("thesis-as-built")
     recordings = [("target", {}, 0), *(("step", {"placement": place}, 0) for place in ("near", "standoff", "far"))]
-    recordings.append(("target", {"medium": "water", "window_mounted": True, "motion": _in_water()}, 0))
+    recordings.append(("target-through-window", {"medium": "water", "motion": _in_water()}, 0))
     for medium, place, seed in itertools.product(("air", "water"), ("near", "standoff", "far"), (1, 2)):
         recordings.append(("spheres", {"medium": medium, "placement": place}, seed))
     moments: list[float] = []
