@@ -22,6 +22,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from twin.options import use_variant
+
 RESULT = Path("runs/bench.json")
 CORES = 2
 
@@ -59,10 +61,8 @@ def median_seconds(action: Callable[[int], object], *, warm_up: int = 3, runs: i
 
 def rendering() -> list[Row]:
     """Time of a full-size laser frame and a lamp frame of the thesis's sensor."""
-    from twin.options import NONE, use_variant
-
-    use_variant()
     from twin.light.renderer import Renderer
+    from twin.options import NONE
     from twin.scene.description import load_scene
     from uwlts.model.library import load_sensor
 
@@ -238,6 +238,8 @@ def main() -> int:
     if (count := len(os.sched_getaffinity(0))) > CORES:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
         print(f"{count} cores found, measuring on {CORES}")
+    # Before the renderer is imported.
+    use_variant()
     console, rows = Console(width=130), []
     for number, name in enumerate(chosen, 1):
         summary = (SECTIONS[name].__doc__ or "").partition(":")[0].rstrip(".\n")
