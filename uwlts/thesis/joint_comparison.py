@@ -238,9 +238,9 @@ JOINT: tuple[JointMethod, ...] = get_args(JointMethod)
 _WORDS: dict[Method, str] = {
     "one_refraction": "one refraction",
     "two_refractions": "two refractions",
-    "joint_same_evidence": "joint, from the same evidence",
+    "joint_same_evidence": "joint, same evidence",
     "joint_with_target_in_water": "joint, with the target in water",
-    "joint_with_scans": "joint, with scans of spheres as well",
+    "joint_with_scans": "joint, with scans too",
 }
 
 

@@ -42,14 +42,14 @@ def test_summary_and_page_say_the_same(tmp_path):
     assert summary.coverage_95 == pytest.approx(held)
     assert summary.solve_s == {way: [8.0, 9.0] for way in JOINT}
     assert "two_refractions" not in summary.air.spacing_error_mm
-    assert any("scans of spheres as well 0.0050 mm (largest 0.0100)" in line for line in summary_lines(summary))
+    assert any("with scans too 0.0050 mm (largest 0.0100)" in line for line in summary_lines(summary))
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     rows = re.findall(r'<td class="words">sphere spacing</td><td class="words">([a-z ,]+)</td><td>([0-9.]+)</td>', page)
     expected = [np.mean(np.abs(e)) for e in summary.spacing_error_mm.values()]
     assert [float(mean) for _, mean in rows[:5]] == pytest.approx(expected, abs=5e-5)
     assert page.count("<svg") == 2
     assert "0.80 times the speckle limit" in page
-    assert "as well 67 %" in page
+    assert "with scans too 67 %" in page
 
 
 def test_existing_results_are_not_overwritten(tmp_path):
