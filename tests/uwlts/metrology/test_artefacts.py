@@ -68,9 +68,8 @@ def test_two_spheres_before_a_wall_with_outliers(wall_z):
     for number, sphere in enumerate(result.spheres):
         # The noise that was drawn, about the true sphere; the fitted one moves by some 0.005 mm, its limbs as much.
         true = np.linalg.norm(spheres[6000 * number : 6000 * (number + 1)] - CENTRES[number], axis=1)
-        # Where the wall cuts the spheres, some of its points within the noise stay, and some of theirs go: of twelve
-        # draws +5 a sphere on average with a standard deviation of 6 at the worst wall; five of these.
-        assert sphere.points_used == pytest.approx(6000, abs=35)
+        # Where the wall cuts the sphere some points of the wall within the noise stay: 2 permille is a tenth of them.
+        assert sphere.points_used == pytest.approx(6000, abs=0.002 * 6000)
         assert sphere.points_rejected <= 30
         assert sphere.pe_mm == pytest.approx(np.ptp(true), abs=0.15)
         assert sphere.std_mm == pytest.approx(true.std(), rel=0.02)
@@ -84,8 +83,7 @@ def test_two_spheres_before_a_wall_with_outliers(wall_z):
     belongs = np.zeros(len(points), dtype=bool)
     belongs[:12000] = True
     wrongly = np.isfinite(result.deviation_mm) & ~belongs[shuffled]
-    # 20 on average at the worst wall; as a count 40 are exceeded once in 50,000 draws.
-    assert np.count_nonzero(wrongly) <= 40
+    assert np.count_nonzero(wrongly) < 24
     assert np.count_nonzero(np.isfinite(result.deviation_mm)) == result.points_used
 
 
@@ -329,8 +327,7 @@ def test_another_height_is_not_found(height_mm):
 def test_flat_and_curved_profiles_have_no_step(curvature):
     y = np.linspace(-80, 80, 800)
     z = 300 + curvature * y**2 + np.random.default_rng(0).normal(0, SIGMA, 800)
-    # Of a curved profile noise may make two faces out, too near to each other to be the step's.
-    with pytest.raises(EvaluationError, match="no two|faces are .* apart"):
+    with pytest.raises(EvaluationError, match="no two"):
         label_step_faces(np.column_stack([y, z]), height_mm=HEIGHT)
 
 
