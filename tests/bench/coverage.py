@@ -1,16 +1,15 @@
 """How often stated 95 % intervals hold the truth: ``python -m tests.bench.coverage [campaigns] [--varied]``.
 
-With ``--varied`` the sensor is another one than the thesis's, is known better or worse than its description states, or
-errs in ways that the calibration does not know; the campaigns of each kind have the target in water. Campaigns are
-simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
-standard is scanned and measured with each calibration.
+Campaigns are simulated by Fermat's principle (`tests.uwlts.simulated_campaign`), calibrated jointly, and a sphere
+standard is scanned and measured with each calibration. With ``--varied``, campaigns in water use other sensors than the
+thesis's, sensors whose uncertainty is stated wrongly, and errors that the calibration does not model.
 """
 
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +80,7 @@ class Variation:
     """Another kind of campaign: changes of the sensor's description, ``spread`` and ``errors`` of `drawn_reality`."""
 
     name: str = "as described"
-    changes: tuple[tuple[str, dict[str, Any]], ...] = ()
+    changes: dict[str, Any] = field(default_factory=dict)
     spread: float = 1.0
     errors: ModelErrors = ModelErrors()
 
@@ -96,15 +95,14 @@ class Campaign:
     variation: Variation = Variation()
 
 
-SAPPHIRE = {"window": {"glass": 1.766, "thickness_mm": 4.0}}
 VARIATIONS = (
     Variation(),
-    Variation("lens of 8 mm", (("camera", {"focal_length_mm": 8.0}),)),
-    Variation("lens of 16 mm", (("camera", {"focal_length_mm": 16.0}),)),
-    Variation("window 90 mm from the pupil", (("camera", {"window": {"distance_mm": 90.0}}),)),
-    Variation("sapphire, 4 mm", (("camera", SAPPHIRE),)),
-    Variation("acrylic, 20 mm", (("camera", {"window": {"glass": 1.488, "thickness_mm": 20.0}}),)),
-    Variation("window tilted by 5 deg", (("camera", {"window": {"tilt_x_deg": 5.0, "tilt_y_deg": -3.0}}),)),
+    Variation("lens of 8 mm", {"camera": {"focal_length_mm": 8.0}}),
+    Variation("lens of 16 mm", {"camera": {"focal_length_mm": 16.0}}),
+    Variation("window 90 mm from the pupil", {"camera": {"window": {"distance_mm": 90.0}}}),
+    Variation("sapphire, 4 mm", {"camera": {"window": {"glass": 1.766, "thickness_mm": 4.0}}}),
+    Variation("acrylic, 20 mm", {"camera": {"window": {"glass": 1.488, "thickness_mm": 20.0}}}),
+    Variation("window tilted by 5 deg", {"camera": {"window": {"tilt_x_deg": 5.0, "tilt_y_deg": -3.0}}}),
     Variation("twice as far off as stated", spread=2.0),
     Variation("half as far off as stated", spread=0.5),
     Variation("k3 of 0.1", errors=ModelErrors(distortion=(("k3", 0.1),))),
@@ -134,7 +132,7 @@ class Outcome:
 def run_campaign(campaign: Campaign, send: Any = None) -> Outcome:
     """Calibrate, scan spheres at one of three places in turn, measure them; CalibrationError as `solve_jointly`."""
     how = campaign.variation
-    described = altered(load_sensor("thesis"), dict(how.changes))
+    described = altered(load_sensor("thesis"), how.changes)
     real = drawn_reality(described, np.random.default_rng(campaign.seed), spread=how.spread, errors=how.errors)
     gathered = evidence(real, described, wet=campaign.wet)
     start = time.perf_counter()
@@ -157,7 +155,7 @@ def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) 
     """Errors of the parameters whose truth is a number of the reality's, whitened by their stated covariance (K,)."""
     camera = real.sensor.camera
     window, (column, row) = camera.window, camera.principal_point()
-    slope_x = np.tan(np.radians(window.tilt_y_deg))
+    slope_x, slope_y = (window.normal()[:2] / window.normal()[2]).tolist()
     truth: dict[ParameterKey, float] = {
         LensParameter.F: camera.focal_length_px(),
         LensParameter.CX: column,
@@ -165,8 +163,8 @@ def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) 
         LensParameter.K1: camera.distortion.k1,
         LensParameter.K2: camera.distortion.k2,
         WindowParameter.DISTANCE: window.distance_mm,
-        WindowParameter.SLOPE_X: float(slope_x),
-        WindowParameter.SLOPE_Y: -np.tan(np.radians(window.tilt_x_deg)) * np.hypot(1.0, slope_x),
+        WindowParameter.SLOPE_X: slope_x,
+        WindowParameter.SLOPE_Y: slope_y,
         WindowParameter.THICKNESS: window.thickness_mm,
         WindowParameter.GLASS_INDEX: window.index(real.sensor.laser.wavelength_nm),
         StageParameter.SCALE: real.stage_scale,

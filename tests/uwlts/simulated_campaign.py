@@ -29,7 +29,7 @@ _TRACED = 60
 
 @dataclass(frozen=True)
 class ModelErrors:
-    """What the joint calibration does not know of: it has no parameter for it, and the description is silent.
+    """Errors that the joint calibration has no parameters for and the description does not mention.
 
     ``distortion`` are coefficients added to the lens's. The target is a saddle, ``saddle_mm`` high at its edges'
     middles, and printed wider along x by the share ``stretch``. Its gloss moves the stripe on it by ``gloss_px``.
@@ -91,8 +91,7 @@ def drawn_reality(
     laser = described.laser.model_copy(update={"window": built.laser.window})
     for name, value in errors.distortion:
         distortion[name] += value
-    tilt_x, tilt_y = np.radians([window.tilt_x_deg, window.tilt_y_deg])
-    as_drawn = np.array([np.tan(tilt_y), -np.tan(tilt_x) * np.hypot(1.0, np.tan(tilt_y))])
+    as_drawn = window.normal()[:2] / window.normal()[2]
     slope_x, slope_y = as_drawn + np.tan(np.radians(known.window_tilt_deg)) * rng.standard_normal(2)
     bow, facing = np.radians([known.bow_deg, known.laser_window_tilt_deg]) * rng.standard_normal(2)
     window = window.model_copy(

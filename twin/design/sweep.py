@@ -8,7 +8,6 @@ continues where it was.
 from __future__ import annotations
 
 import re
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -153,7 +152,7 @@ def sweep(
     if overwrite:
         clear(folder)
     with (
-        progress_bar(described.title) if show_progress else nullcontext(lambda done, total: None) as progress,
+        progress_bar(described.title, shown=show_progress) as progress,
         open_workers(workers=workers, scheduler=scheduler) as pool,
     ):
         screen(described, folder, pool, progress=progress)

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -69,8 +68,7 @@ def record(
     described, folder = load_campaign(campaign), Path(out)
     jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant)
     plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed}
-    bar = progress_bar(f"rendering {described.title}") if show_progress else nullcontext(lambda done, total: None)
-    with bar as progress:
+    with progress_bar(f"rendering {described.title}", shown=show_progress) as progress:
         _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
     return folder
 

@@ -6,7 +6,6 @@ Mitsuba is imported when the first scene is rendered, after its variant and libL
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -197,7 +196,7 @@ def simulate(
     files, paths = {"overwrite": overwrite, "resume": resume}, []
     for each in described:
         path = out.with_name(out.name.replace("{placement}", each.placement))
-        with progress_bar(f"{each.title}, {each.placement}") if show_progress else nullcontext(None) as progress:
+        with progress_bar(f"{each.title}, {each.placement}", shown=show_progress) as progress:
             record_scene(each, nominal, path, as_built=built, options=options, progress=progress, **files)
         report(f"wrote {path}")
         paths.append(path)

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 
 from twin.options import CPU, Variant
@@ -78,8 +77,7 @@ def reproduce(
     campaign = campaign or ("joint" if joint else "thesis")
     folder = Path(out or Path("runs") / Path(campaign).stem)
     described = load_campaign(campaign)
-    bar = progress_bar(f"rendering {described.title}") if show_progress else nullcontext(lambda done, total: None)
-    with bar as progress:
+    with progress_bar(f"rendering {described.title}", shown=show_progress) as progress:
         record_campaigns(
             described,
             folder,

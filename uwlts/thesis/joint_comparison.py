@@ -47,6 +47,7 @@ from uwlts.thesis.results import (
 )
 
 RESULTS = "joint.json"
+JOINT: tuple[JointMethod, ...] = get_args(JointMethod)
 _USED = ("near", "standoff", "far")
 """Placements of the spheres in water that a calibration may use."""
 _COVERAGE = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
@@ -55,7 +56,7 @@ SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2
 Progress = Callable[[int, int], None]
 
 
-def joint_calibration(folder: CampaignFolder, method: JointMethod = "joint_with_scans") -> tuple[Calibration, float]:
+def joint_calibration(folder: CampaignFolder, method: JointMethod) -> tuple[Calibration, float]:
     """A joint calibration from a campaign, kept with the others; the time to solve it in s.
 
     Scans of spheres were made in another water than the calibration, whose index follows from their roundness. Their
@@ -122,31 +123,32 @@ def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
     spheres, planes = [], []
     for scan in _compared(folder):
         if scan.thing == "spheres":
-            one, two = (sequential.get((method, scan.medium)) for method in (PROPOSED, TWO))
-            spheres.append(_of_spheres(scan, {"one_refraction": one, "two_refractions": two}, joint))
+            ways: dict[Method, tuple[str, str]] = {
+                "one_refraction": (PROPOSED, scan.medium),
+                "two_refractions": (TWO, scan.medium),
+            }
+            known: dict[Method, AnyCalibration] = {
+                way: sequential[found] for way, found in ways.items() if found in sequential
+            }
+            spheres.append(_of_spheres(scan, known | joint))
         else:
             planes.append(_of_plane(scan, joint["joint_with_scans"]))
         send(None)
     return JointResults(campaign=folder.path.name, solve_s=solve_s, spheres=spheres, planes=planes).keep(path)
 
 
-def _of_spheres(
-    scan: ScanFile, sequential: Mapping[Method, AnyCalibration | None], joint: Mapping[JointMethod, Calibration]
-) -> SphereErrors:
+def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> SphereErrors:
     errors: dict[Method, dict[str, float]] = {}
     std_mm: dict[JointMethod, dict[str, float]] = {}
     with Capture(scan.path) as capture:
         artefact, stripes = parse_artefact(capture.header.artefact or {}), find_stripes(capture)
-        for method, calibration in sequential.items():
-            if calibration is not None:
-                evaluation = evaluate_cloud(reconstruct_stripes(capture, stripes, calibration), artefact)
-                errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
-        for way, calibration in joint.items():
-            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=True)
+        for method, calibration in known.items():
+            cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=method in JOINT)
             evaluation = evaluate_cloud(cloud, artefact)
-            errors[way] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
-            expanded = figure_uncertainties(cloud, evaluation)
-            std_mm[way] = {name: expanded[name].expanded_mm / 2 for name in errors[way]}
+            errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
+            if method in JOINT:
+                expanded = figure_uncertainties(cloud, evaluation)
+                std_mm[method] = {name: expanded[name].expanded_mm / 2 for name in errors[method]}
     return SphereErrors(scan.placement, scan.medium, errors, std_mm)
 
 
@@ -234,7 +236,6 @@ def summary_lines(summary: JointSummary) -> list[str]:
     return [*lines, f"solved in s: {solved}"]
 
 
-JOINT: tuple[JointMethod, ...] = get_args(JointMethod)
 _WORDS: dict[Method, str] = {
     "one_refraction": "one refraction",
     "two_refractions": "two refractions",

@@ -11,14 +11,11 @@ from uwlts.runtime.interrupts import interrupts_kept
 def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixture):
     """Python reports and drops what a weak reference's callback raises; Ctrl-C may fall into one at any time."""
 
-    class Thing:
-        pass
-
     def callback(_: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), interrupts_kept():
-        thing = Thing()
+        thing: set[int] = set()
         reference = weakref.ref(thing, callback)
         del thing
         time.sleep(1)
