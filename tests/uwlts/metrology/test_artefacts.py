@@ -66,24 +66,24 @@ def test_two_spheres_before_a_wall_with_outliers(wall_z):
     shuffled = rng.permutation(len(points))
     result = evaluate_cloud(cloud_of(points[shuffled]), DUMBBELL)
     for number, sphere in enumerate(result.spheres):
-        # The noise that was drawn, about the true sphere; the fitted one moves by some 0.005 mm, its limbs as much.
+        # Where the wall cuts the sphere some points of the wall lie within the noise and count, some of the sphere do
+        # not. The limits are the means over forty draws and five standard deviations.
         true = np.linalg.norm(spheres[6000 * number : 6000 * (number + 1)] - CENTRES[number], axis=1)
-        # Where the wall cuts the sphere some points of the wall within the noise stay: 2 permille is a tenth of them.
-        assert sphere.points_used == pytest.approx(6000, abs=0.002 * 6000)
-        assert sphere.points_rejected <= 30
-        assert sphere.pe_mm == pytest.approx(np.ptp(true), abs=0.15)
-        assert sphere.std_mm == pytest.approx(true.std(), rel=0.02)
-        assert abs(sphere.diameter_error_mm) < 5 * sphere.diameter_std_mm < 0.05
-        np.testing.assert_allclose(sphere.centre_mm, CENTRES[number], atol=0.03)
+        assert sphere.points_used == pytest.approx(6000, abs=40)
+        assert sphere.points_rejected <= 48
+        assert np.ptp(true) - 0.05 < sphere.pe_mm < 2 * 5.2 * SIGMA
+        assert sphere.std_mm == pytest.approx(true.std(), rel=0.05)
+        assert abs(sphere.diameter_error_mm) < 7 * sphere.diameter_std_mm < 0.07
+        np.testing.assert_allclose(sphere.centre_mm, CENTRES[number], atol=0.04)
     spacing = result.spacings[0]
-    assert abs(spacing.sse_mm) < 5 * spacing.spacing_std_mm < 0.03
-    assert abs(spacing.sse_known_radius_mm) < 5 * spacing.spacing_std_mm
+    assert abs(spacing.sse_mm) < 6 * spacing.spacing_std_mm < 0.03
+    assert abs(spacing.sse_known_radius_mm) < 6 * spacing.spacing_std_mm
     assert result.sse_mm == spacing.sse_mm
     assert result.pe_mm == max(sphere.pe_mm for sphere in result.spheres)
     belongs = np.zeros(len(points), dtype=bool)
     belongs[:12000] = True
     wrongly = np.isfinite(result.deviation_mm) & ~belongs[shuffled]
-    assert np.count_nonzero(wrongly) < 24
+    assert np.count_nonzero(wrongly) < 50
     assert np.count_nonzero(np.isfinite(result.deviation_mm)) == result.points_used
 
 
@@ -255,24 +255,25 @@ def step_profile(
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("tilt_deg", [-20, -7, 0, 20])
-def test_profiles_are_labelled_and_measured(shape, tilt_deg):
-    scaled, kept = [], 0
-    for seed in range(6):
+def test_profiles_are_labelled_and_measured(shape):
+    scaled, kept, strays = [], 0, 0
+    for seed, tilt_deg in enumerate(np.repeat([-20, -7, 0, 20], 6)):
         points, tread = step_profile(np.random.default_rng(seed), shape, tilt_deg=tilt_deg)
         labels = label_step_faces(points, height_mm=24.0)
         named = labels != StepFace.NEITHER
-        # An outlier may fall on a tread by chance (0.5 mm of 120); mixed points and the other tread never pass.
-        assert np.count_nonzero(labels[named] != tread[named]) <= 1
-        assert not np.any(named[:900] & (tread[:900] == StepFace.NEITHER))
+        # Mixed points and the other tread never pass.
+        np.testing.assert_array_equal(labels[:900][named[:900]], tread[:900][named[:900]])
+        strays += np.count_nonzero(named[900:])
         kept += np.count_nonzero(named)
         for reference in ("lower", "upper"):
             height = step_height(points, labels, reference=reference)
             scaled.append((height.height_mm - HEIGHT) / height.std_mm)
+    # Of 24 x 8 outliers, each falls on a tread by chance as 0.5 mm of 120: more than seven in 2e-6 of all draws.
+    assert strays <= 7
     # Edges and outliers blank 1 mm to each side: at most 12 x 2 of 176 mm.
-    assert kept > 6 * 900 * (1 - 24 / 176 - 0.02)
-    assert np.abs(scaled).max() < 4.5
-    assert np.std(scaled) > 0.3
+    assert kept > 24 * 900 * (1 - 24 / 176 - 0.02)
+    # The root mean square of 24 values of unit variance lies within these limits but for 2e-5 of all draws.
+    assert 0.45 < np.sqrt(np.mean(np.square(scaled))) < 1.66
 
 
 def test_the_height_of_many_profiles_has_no_bias_and_the_stated_scatter():
@@ -327,7 +328,7 @@ def test_another_height_is_not_found(height_mm):
 def test_flat_and_curved_profiles_have_no_step(curvature):
     y = np.linspace(-80, 80, 800)
     z = 300 + curvature * y**2 + np.random.default_rng(0).normal(0, SIGMA, 800)
-    with pytest.raises(EvaluationError, match="no two"):
+    with pytest.raises(EvaluationError, match="step faces"):
         label_step_faces(np.column_stack([y, z]), height_mm=HEIGHT)
 
 

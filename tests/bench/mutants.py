@@ -1,0 +1,261 @@
+"""How many small changes of the code the tests notice: ``python -m tests.bench.mutants [package ...] [--sample N]``.
+
+From each package mutants are drawn at random by Cosmic Ray's operators: another arithmetic operator, comparison, sign,
+number, truth value, a loop that is left out. Annotations are not changed. Each is tried in a copy of the checkout on
+the tests (without the slow ones) that run the changed line, shortest first, then on the others of their files. A mutant
+that no test notices survives; whether it changes a result at all is for the reader to judge. Needs
+``pip install -e '.[mutants]'``.
+"""
+
+import argparse
+import ast
+import json
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import SimpleQueue
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+from coverage import CoverageData
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+ROOT = Path(__file__).resolve().parents[2]
+TESTS = {
+    "uwlts/optics": ["tests/uwlts/optics", "tests/uwlts/measurement", "tests/uwlts/calibration", "tests/uwlts/thesis"],
+    "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/measurement"],
+    "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/measurement"],
+    "uwlts/measurement": ["tests/uwlts/measurement", "tests/uwlts/cli", "tests/uwlts/report", "tests/system"],
+    "twin/light": ["tests/twin/light", "tests/twin/recording"],
+    "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
+}
+"""Packages, and folders of the tests that run them."""
+# These change no result, or end every test at once, as bitwise operators between floating-point numbers do.
+_LEFT_OUT = {"NoOp", "RemoveDecorator", "ExceptionReplacer", "VariableReplacer", "VariableInserter"}
+_BITWISE = {"BitAnd", "BitOr", "BitXor", "LShift", "RShift"}
+_LONGEST_S = 240.0  # of the tests for one mutant
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A changed line; ``occurrence`` counts the places in the file where Cosmic Ray's ``operator`` applies."""
+
+    package: str
+    file: str
+    line: int
+    operator: str
+    occurrence: int
+
+    def code(self, source: str) -> str:
+        """The file's text with the change."""
+        return mutate_code(source, get_operator(f"core/{self.operator}")(), self.occurrence)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a mutant: ``killed``, ``survived`` or ``not run`` by any test; the line before and after."""
+
+    mutant: Mutant
+    outcome: str
+    before: str
+    after: str
+
+
+def annotated_lines(source: str) -> set[tuple[int, int]]:
+    """Line and column of everything within annotations of types."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        for name in ("annotation", "returns"):
+            if (annotation := getattr(node, name, None)) is not None:
+                found |= {(each.lineno, each.col_offset) for each in ast.walk(annotation) if isinstance(each, ast.expr)}
+    return found
+
+
+def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
+    """So many mutants of a package, from any place in it at most one."""
+    places: dict[tuple[str, int, int], list[Mutant]] = {}
+    for path in sorted((ROOT / package).rglob("*.py")):
+        source, file = path.read_text(), str(path.relative_to(ROOT))
+        annotated, tree = annotated_lines(source), get_ast(source)
+        for name in operator_names():
+            short = name.removeprefix("core/")
+            kind, *between = short.split("_")
+            mixed = kind == "ReplaceBinaryOperator" and len(_BITWISE & set(between)) == 1
+            if short in _LEFT_OUT or mixed:
+                continue
+            operator = get_operator(name)()
+            positions = [at for node in ast_nodes(tree) for at in operator.mutation_positions(node)]
+            for occurrence, ((line, column), _) in enumerate(positions):
+                within = any(at[0] == line and abs(at[1] - column) <= 40 for at in annotated)
+                if not (within and "BitOr" in short):
+                    places.setdefault((file, line, column), []).append(Mutant(package, file, line, short, occurrence))
+    chosen = rng.sample(sorted(places), min(number, len(places)))
+    return [rng.choice(places[place]) for place in chosen]
+
+
+def copied(folder: Path) -> Path:
+    """The checkout's files, as they are now, without what Git ignores."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    for name in listed.stdout.splitlines():
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    return folder
+
+
+@dataclass(frozen=True)
+class Tests:
+    """What tests ran: ``of_line``, those that ran a line of a file; ``seconds`` each took."""
+
+    of_line: dict[tuple[str, int], set[str]]
+    of_file: dict[str, set[str]]
+    seconds: dict[str, float]
+
+    @classmethod
+    def observed(cls, folder: Path, package: str) -> "Tests":
+        """Run a package's tests once."""
+        report = folder / "report.xml"
+        options = ["-m", "not slow", f"--cov={package}", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
+        subprocess.run(
+            [*_pytest(), *options, "-o", "junit_family=xunit1", "-n", "2", "--dist", "loadfile", *TESTS[package]],
+            cwd=folder,
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
+        seconds: dict[str, float] = {}
+        for case in ElementTree.parse(report).getroot().iter("testcase"):
+            seconds[f"{case.get('file')}::{case.get('name')}"] = float(case.get("time", 0))
+        data = CoverageData(str(folder / ".coverage"))
+        data.read()
+        of_line: dict[tuple[str, int], set[str]] = {}
+        of_file: dict[str, set[str]] = {}
+        for path in data.measured_files():
+            file = str(Path(path).relative_to(folder))
+            for line, contexts in data.contexts_by_lineno(path).items():
+                for context in filter(None, contexts):
+                    test, phase = context.rsplit("|", 1)
+                    # What a fixture runs may serve any test of the file.
+                    tests = {test} if phase == "run" else {t for t in seconds if t.startswith(test.split("::")[0])}
+                    of_line.setdefault((file, line), set()).update(tests)
+                    of_file.setdefault(file, set()).update(tests)
+        return cls(of_line, of_file, seconds)
+
+    def chosen(self, mutant: Mutant, lines: Sequence[int]) -> Iterator[str]:
+        """Tests for a mutant: of its statement's lines, or of its file where no test but the import runs them."""
+        first: set[str] = set().union(*(self.of_line.get((mutant.file, line), set()) for line in lines))
+        first = first or self.of_file.get(mutant.file, set())
+        files = {test.split("::")[0] for test in first}
+        beside = {test for test in self.seconds if test.split("::")[0] in files} - first
+        left = _LONGEST_S
+        for tests in (first, beside):
+            for test in sorted(tests & self.seconds.keys(), key=lambda t: self.seconds[t]):
+                left -= self.seconds[test]
+                if left < 0 and test not in first:
+                    return
+                yield test
+
+
+def statement_lines(source: str, line: int) -> range:
+    """Lines of the smallest statement that holds a line, without the body of what it heads."""
+    best = range(line, line + 1)
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or line):
+            body = getattr(node, "body", None)
+            end = body[0].lineno - 1 if body else node.end_lineno or line
+            if line <= end:
+                best = range(node.lineno, end + 1)
+    return best
+
+
+def tried(mutant: Mutant, folder: Path, tests: Tests) -> Result:
+    """Change the file in a copy of the checkout, run the tests, and put it back."""
+    path = folder / mutant.file
+    source = path.read_text()
+    changed = mutant.code(source)
+    before, after = (text.splitlines()[mutant.line - 1].strip() for text in (source, changed))
+    chosen = list(tests.chosen(mutant, statement_lines(source, mutant.line)))
+    if not chosen:
+        return Result(mutant, "not run", before, after)
+    path.write_text(changed)
+    limit = 60 + 5 * sum(tests.seconds[test] for test in chosen)
+    try:
+        done = subprocess.run(
+            [*_pytest(), "-x", *chosen], cwd=folder, timeout=limit, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        outcome = "killed" if done.returncode else "survived"
+    except subprocess.TimeoutExpired:
+        outcome = "killed"
+    finally:
+        path.write_text(source)
+    return Result(mutant, outcome, before, after)
+
+
+def _pytest() -> list[str]:
+    return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+
+
+def of_package(package: str, number: int, seed: int, workers: int, console: Console) -> list[Result]:
+    """Draw mutants of a package and try them."""
+    mutants = drawn(package, number, random.Random(f"{seed} {package}"))
+    with tempfile.TemporaryDirectory() as temporary:
+        folders: SimpleQueue[Path] = SimpleQueue()
+        for worker in range(workers):
+            folders.put(copied(Path(temporary) / str(worker)))
+        tests = Tests.observed(copied(Path(temporary) / "observed"), package)
+
+        def one(mutant: Mutant) -> Result:
+            folder = folders.get()
+            try:
+                return tried(mutant, folder, tests)
+            finally:
+                folders.put(folder)
+
+        with ThreadPoolExecutor(workers) as pool:
+            return list(track(pool.map(one, mutants), package, total=len(mutants), console=console))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.mutants", description=__doc__.splitlines()[0])
+    parser.add_argument("packages", nargs="*", metavar="package", help=", ".join(TESTS))
+    parser.add_argument("--sample", type=int, default=60, help="mutants of each package (default: 60)")
+    parser.add_argument("--seed", type=int, default=0, help="draw others by another number")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each package")
+    options = parser.parse_args()
+    if unknown := set(options.packages) - TESTS.keys():
+        parser.error(f"no tests are named for {', '.join(sorted(unknown))}: choose from {', '.join(TESTS)}")
+    console, results = Console(), []
+    for package in options.packages or TESTS:
+        results += of_package(package, options.sample, options.seed, options.workers, console)
+        options.out.write_text(json.dumps([asdict(result) for result in results], indent=1))
+    table = Table("package", "mutants", "killed", "survived", "not run", "score")
+    for package in dict.fromkeys(result.mutant.package for result in results):
+        count = Counter(result.outcome for result in results if result.mutant.package == package)
+        numbers = [count.total(), *(count[outcome] for outcome in ("killed", "survived", "not run"))]
+        table.add_row(package, *map(str, numbers), f"{count['killed'] / count.total():.0%}")
+    console.print(table)
+    for result in results:
+        if result.outcome != "killed":
+            where = f"{result.mutant.file}:{result.mutant.line} {result.outcome}"
+            console.print(where, f"  - {result.before}", f"  + {result.after}", sep="\n", markup=False, soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()
