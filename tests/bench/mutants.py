@@ -36,7 +36,7 @@ TESTS = {
     "uwlts/optics": ["tests/uwlts/optics", "tests/uwlts/measurement", "tests/uwlts/calibration", "tests/uwlts/thesis"],
     "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/measurement"],
     "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/measurement"],
-    "uwlts/measurement": ["tests/uwlts/measurement", "tests/uwlts/cli", "tests/uwlts/report", "tests/system"],
+    "uwlts/measurement": ["tests/uwlts/measurement", "tests/uwlts/report", "tests/system/test_joint_command.py"],
     "twin/light": ["tests/twin/light", "tests/twin/recording"],
     "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
 }
