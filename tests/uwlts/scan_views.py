@@ -10,6 +10,7 @@ from uwlts.calibration.joint.gathering import ScanStripes
 from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
+from uwlts.optics.brightness import moved_by_blur_px
 
 VIEW = ViewMedium(True, 0)
 SLOPE = np.array([0.004, -0.003])
@@ -60,35 +61,41 @@ class Body:
 
 
 def scan_of(sensor: Sensor, bodies, artefact, *, stage_mm, count=200, noise=NONE, source="scan"):
-    """Stripes on bodies while the stage stands at positions (F,), and which body each lies on: (N,)."""
+    """Stripes on bodies while the stage stands at positions (F,), and which body each lies on: (N,).
+
+    The stripes are sharp; how far blur may have moved them is what it may do on a matt surface.
+    """
     frame, pose = camera_from_object(sensor), laser_pose(sensor)
     rotation = frame[:3, :3]
     origin = rotation.T @ (pose.origin_mm - frame[:3, 3])
     angle = np.linspace(-1, 1, count) * np.radians(sensor.laser.fan_angle_deg / 2)
     rays = (np.sin(angle)[:, None] * pose.fan + np.cos(angle)[:, None] * pose.axis) @ rotation
     moves, pupil = rotation.T @ stage_direction(sensor), -rotation.T @ frame[:3, 3]
-    pixels, image, which = [], [], []
+    pixels, brightness, image, which = [], [], [], []
     for number, position in enumerate(stage_mm):
         travel = (position + noise.draw(noise.stage_mm, ())) * moves
         for place, body in enumerate(bodies):
             points, normals = body.lit(origin + travel, rays)
             towards = pupil + travel - points
             facing = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
-            points = points[facing > _FACING] - travel
+            points, lit = points[facing > _FACING] - travel, -np.sum(rays * normals, axis=1)[facing > _FACING]
             if not len(points):
                 continue
             found = seen(sensor, points @ rotation.T + frame[:3, 3], index=WATER, window=True)
-            found = found[inside(found, sensor)]
+            there = inside(found, sensor)
+            found = found[there]
+            brightness.append(np.maximum(lit[there], 0.01))
             pixels.append(found + np.column_stack([np.zeros(len(found)), noise.draw(noise.stripe_px, len(found))]))
             image.append(np.full(len(found), number))
             which.append(np.full(len(found), place))
-    pixels = np.vstack(pixels)
+    pixels, frames, width = np.vstack(pixels), np.concatenate(image), np.full(sum(map(len, pixels)), 4.0)
     stripes = ScanStripes(
         source,
-        np.concatenate(image),
+        frames,
         pixels[:, 0],
         pixels[:, 1],
-        np.full(len(pixels), 4.0),
+        width,
+        moved_by_blur_px(frames, np.rint(pixels[:, 0]).astype(int), pixels[:, 1], np.concatenate(brightness), width),
         np.zeros(len(pixels)),
         np.asarray(stage_mm, dtype=float),
         np.array([1.0, 0.0, 0.0]),

@@ -16,6 +16,7 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
+from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 from uwlts.storage.files import sha256_of
@@ -24,10 +25,6 @@ _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
-
-# Rendered spheres show 0.2 to 0.5 of what blur may do, by how the light is spread in it, and that what comes from
-# beside the sheet is right to a tenth; the described thickness of the sheet is less certain.
-_BLUR_SHARE, _BESIDE_SHARE = 0.3, 0.2
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
@@ -93,6 +90,7 @@ def point_uncertainty(
     stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
+    beside = beside_std(header.sensor.uncertainty)
     random, moved = [], []
     for start in range(0, len(pixels), _BLOCK):
         here = slice(start, start + _BLOCK)
@@ -103,9 +101,9 @@ def point_uncertainty(
         step = by_pixel * noise[here, None]
         random.append(np.stack([step[:, i] * step[:, j] for i, j in PAIRS], axis=1))
         if blur_px is not None:
-            by_root = np.concatenate([by_root, [_BLUR_SHARE * by_pixel * blur_px[here, None]]])
+            by_root = np.concatenate([by_root, [BLUR_STD * by_pixel * blur_px[here, None]]])
         if beside_mm is not None:
-            by_root = np.concatenate([by_root, [_BESIDE_SHARE * beside_mm[here]]])
+            by_root = np.concatenate([by_root, [beside * beside_mm[here]]])
         moved.append(by_root)
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)

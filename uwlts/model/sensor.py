@@ -440,8 +440,9 @@ class Uncertainty(Description):
     follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
     medium whose index is given. Of the stage: each position, the scale of
     all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
-    its plane when it bends like a dish, and the height of the steps. An uncertainty of zero means that the quantity is
-    not estimated but taken as described.
+    its plane when it bends like a dish, and the height of the steps. ``sheet_thickness`` is relative: that of the
+    thickness of the laser's sheet. An uncertainty of zero means that the quantity is not estimated but taken as
+    described.
     """
 
     window_distance_mm: NotNegative = 5.0
@@ -458,6 +459,7 @@ class Uncertainty(Description):
     stage_alignment_deg: Positive = 0.5
     target_bow_mm: NotNegative = 0.03
     step_height_mm: Positive = 0.01
+    sheet_thickness: NotNegative = 0.1
 
     def stage_lean(self) -> float:
         """Standard uncertainty of the direction of the stage as a slope."""

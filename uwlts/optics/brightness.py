@@ -17,10 +17,14 @@ from scipy.ndimage import uniform_filter
 
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import laser_pose
-from uwlts.model.sensor import Laser, Sensor, Vector
+from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
 from uwlts.optics.reconstruction import reconstruct_profile
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
+
+BLUR_STD = 1.0 / math.sqrt(3.0)
+"""Standard uncertainty of what blur moves centres by, over the largest possible: that is left as it is, and anything
+between none and all of it is as likely (JCGM 100:2008, 4.3.7)."""
 
 _MOST_BLUR_PX = 0.1
 """Centres that blur may move by more, which is as much as speckle does, are left out."""
@@ -105,6 +109,11 @@ def slopes_of_brightness(
     exposure = exposure_ms[frame] if np.all(exposure_ms[np.unique(frame)] > 0) else 1.0
     by_stage, _ = _slopes(row, line, np.log(amplitude / exposure), position, rows=reach, columns=_LINES)
     return by_stage
+
+
+def beside_std(uncertainty: Uncertainty) -> float:
+    """Relative standard uncertainty of `beside_sheet`, which goes with the square of the sheet's thickness."""
+    return 2.0 * uncertainty.sheet_thickness
 
 
 def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float) -> np.ndarray:

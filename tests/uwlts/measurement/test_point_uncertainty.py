@@ -315,7 +315,8 @@ def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(ca
             :, None
         ]
     )
-    added = [0.3 * per_px * blur[:, None], 0.2 * beside]
+    # Any part of what blur may do is as likely; the sheet's thickness, known to 10 %, counts by its square.
+    added = [per_px * blur[:, None] / np.sqrt(3), 0.2 * beside]
     expected = sum(np.stack([each[:, i] * each[:, j] for i, j in PAIRS], axis=1) for each in added)
     # Patterns that move the points by less than 0.05 um together are left out.
     np.testing.assert_allclose(known.systematic_mm2() - plain.systematic_mm2(), expected, atol=1e-7, rtol=1e-2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.joint.evidence import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
-from uwlts.calibration.joint.noise import Noise, judged, outliers, with_slope_bias
+from uwlts.calibration.joint.noise import Noise, judged, outliers, with_common_error
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
@@ -167,8 +167,7 @@ def _noise(evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> di
         of_kind = [r for parts in residuals for r in parts if r.kind == kind]
         result[kind] = judged(kind, of_kind, points)
         if kind in SCANNED:
-            scanned = [e.surface for e in evidence if isinstance(e, SurfaceScanEvidence)]
-            bodies = sum(surface.count for surface in scanned if surface.kind == kind)
-            each = sum(len(r.values) for r in of_kind) / bodies
-            result[kind] = with_slope_bias(result[kind], points_per_body=each)
+            scans = [e for e in evidence if isinstance(e, SurfaceScanEvidence) and e.surface.kind == kind]
+            common_px, bodies = np.concatenate([e.common_px for e in scans]), sum(e.surface.count for e in scans)
+            result[kind] = with_common_error(result[kind], common_px, bodies=bodies)
     return result

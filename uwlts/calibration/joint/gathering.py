@@ -58,7 +58,8 @@ class Series:
 class ScanStripes:
     """The stripe centres (N,) of a scan, the stage's positions (F,), and what is known of what was scanned.
 
-    ``slopes`` (N,) are those of the brightness (`uwlts.optics.brightness.slopes_of_brightness`).
+    ``blur_px`` (N,) is by how much blur may move them, ``slopes`` (N,) are those of the brightness
+    (`uwlts.optics.brightness`).
     """
 
     source: str
@@ -66,6 +67,7 @@ class ScanStripes:
     line: np.ndarray
     centre_px: np.ndarray
     width_px: np.ndarray
+    blur_px: np.ndarray
     slopes: np.ndarray
     stage_mm: np.ndarray
     stage_direction: np.ndarray
@@ -165,7 +167,8 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeOptions) -
             "sensor, take one without poses"
         )
     found = find_stripes(capture, options=stripe)
-    found = found[sharp_lines(found)[0]]
+    sharp, blur = sharp_lines(found)
+    found = found[sharp]
     stage = capture.stage_mm[:]
     return ScanStripes(
         source=capture.path.name,
@@ -173,6 +176,7 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeOptions) -
         line=found.line,
         centre_px=found.centre_px,
         width_px=found.width_px,
+        blur_px=blur,
         slopes=slopes_of_brightness(found.frame, found.line, found.amplitude, stage, capture.exposure_ms[:]),
         stage_mm=stage,
         stage_direction=np.array(capture.header.stage_direction),

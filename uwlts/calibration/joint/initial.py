@@ -14,7 +14,15 @@ from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series
 from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium
-from uwlts.calibration.joint.scanned_surfaces import Cylinder, Plane, Spheres, Surface, SurfaceScanEvidence, across_of
+from uwlts.calibration.joint.scanned_surfaces import (
+    LEAST_SHARE,
+    Cylinder,
+    Plane,
+    Spheres,
+    Surface,
+    SurfaceScanEvidence,
+    across_of,
+)
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.calibration.sheet import fit_sheet, object_frame
 from uwlts.calibration.target_images import Placement
@@ -28,7 +36,7 @@ from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
-from uwlts.optics.brightness import beside_sheet
+from uwlts.optics.brightness import BLUR_STD, beside_sheet, beside_std
 from uwlts.optics.camera import directions
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.optics.window import trace_window
@@ -270,12 +278,16 @@ def surface_scan(
     across = 1 if start.stripe_along == "width" else 0
     pixels = np.stack((line, centre) if across else (centre, line), axis=1).astype(np.float64)
     stage_mm = stripes.stage_mm[stripes.frame]
-    points = reconstruct_pixels(
-        start, pixels, medium_index=medium_index, stage_mm=stage_mm, stage_direction=direction
-    ).points_mm
+
+    def reconstructed(pixels: np.ndarray, stage_mm: np.ndarray) -> np.ndarray:
+        return reconstruct_pixels(
+            start, pixels, medium_index=medium_index, stage_mm=stage_mm, stage_direction=direction
+        ).points_mm
+
+    on_sheet = reconstructed(pixels, stage_mm)
     width, slopes, along = stripes.width_px, stripes.slopes, tuple(direction.tolist())
     beside = beside_sheet(start, sensor, line, centre, width, slopes, medium_index=medium_index, stage_direction=along)
-    points = points + beside
+    points = on_sheet + beside
     # At the rims few points are left, and those are doubtful, as are those where the brightness changes fast.
     often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS
     good = often & (np.abs(stripes.slopes) < _STEEPEST) & np.isfinite(points).all(axis=1)
@@ -287,16 +299,22 @@ def surface_scan(
     used, surface, local = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
     kept = there[used]
     frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
-    rotation, stage_mm = transform[:3, :3], stripes.stage_mm[frames]
+    rotation, position_mm = transform[:3, :3], stripes.stage_mm[frames]
+    # What light from beside the sheet moves the points by, as pixels across the stripe.
+    per_px = reconstructed(pixels[kept] + np.eye(2)[across], stage_mm[kept]) - on_sheet[kept]
+    outward = surface.distances(rotation @ points[kept].T + transform[:3, 3:], local).outward.T @ rotation
+    least = LEAST_SHARE * np.linalg.norm(per_px, axis=1)
+    beside_px = np.sum(outward * beside[kept], axis=1) / np.maximum(np.abs(np.sum(outward * per_px, axis=1)), least)
     evidence = SurfaceScanEvidence(
         view=stripes.view,
         pixels=pixels[kept],
         across=across,
-        sources={image + n: f"{stripes.source}, at {position:g} mm" for n, position in enumerate(stage_mm)},
+        sources={image + n: f"{stripes.source}, at {position:g} mm" for n, position in enumerate(position_mm)},
         beside_mm=rotation @ beside[kept].T,
+        common_px=np.hypot(BLUR_STD * stripes.blur_px[kept], beside_std(sensor.uncertainty) * np.nan_to_num(beside_px)),
         surface=surface,
         frame=frame,
-        stage_mm=stage_mm,
+        stage_mm=position_mm,
         direction=rotation @ direction,
         across_stage=across_of(direction) @ rotation.T,
         image=image,

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.joint.estimate import Evidence
 from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence, TargetEvidence
-from uwlts.calibration.joint.noise import Noise, with_slope_bias
+from uwlts.calibration.joint.noise import Noise, with_common_error
 from uwlts.calibration.joint.observability import (
     estimate_in,
     format_weaknesses,
@@ -32,6 +32,9 @@ _SAMPLES = 400  # of a curve; more than the image of one needs for a point on ea
 # A step standard and spheres as the thesis used them, in size; more images of a sphere say nothing new.
 STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
 SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
+_ON_SPHERES_PX = 0.01
+"""What blur of 4 px (full width) leaves uncertain on matt spheres of this size, root mean square."""
+
 _SEEN = np.radians(60)
 """A sphere is seen this far round from the side that faces the sensor."""
 
@@ -226,6 +229,7 @@ def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertaint
         pixels=np.vstack(pixels),
         across=known.across(),
         beside_mm=np.zeros((3, sum(counts))),
+        common_px=np.full(sum(counts), _ON_SPHERES_PX),
         surface=Spheres(np.full(SPHERES, SPHERE_MM), unknown, apart, unknown[1:], sphere),
         frame=np.repeat(np.repeat(np.arange(_SPHERE_IMAGES), SPHERES), counts),
         stage_mm=positions,
@@ -303,9 +307,9 @@ def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
     noise = {name: Noise(sigma, joint.shared_variance[name]) for name, sigma in joint.scatter_px.items()}
     stripe = max((each for name, each in noise.items() if name != TARGET), key=Noise.effective_px)
     noise = {part.kind: noise.get(part.kind, stripe) for part in parts}
-    if Spheres.kind in noise:
-        each = sum(len(part.values) for part in parts) / SPHERES
-        noise[Spheres.kind] = with_slope_bias(noise[Spheres.kind], points_per_body=each)
+    if isinstance(evidence, SurfaceScanEvidence):
+        kind, surface = evidence.surface.kind, evidence.surface
+        noise[kind] = with_common_error(noise[kind], evidence.common_px, bodies=surface.count)
     count, local = len(known.values), len(local_values)
     total = np.zeros((count + local,) * 2)
     _, before = evidence.known_before(local_values, uncertainty)

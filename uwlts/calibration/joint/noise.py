@@ -11,10 +11,6 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 _OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
 _LAGS = 100  # lines; filters and speckle join a few, wrong models some tens
 _SHARED_LAG = 0.05  # correlation that some thousand pairs no longer separate from none, by three standard errors
-_SLOPE_BIAS_PX = 0.01
-"""Size of the error of a stripe's centre that goes with the slope of the surface, of which
-`uwlts.optics.brightness` takes out two thirds where rendered spheres show it."""
-
 _FINEST_PX = 1e-3  # no point of an image counts as better known: what is known before would count for nothing
 
 
@@ -63,9 +59,10 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
     return Noise(sigma, max(together, 1.0))
 
 
-def with_slope_bias(noise: Noise, *, points_per_body: float) -> Noise:
-    """Noise on a scanned body, whose points share what the stripe's centre is off where the surface leans."""
-    return Noise(noise.sigma_px, noise.together, points_per_body * (_SLOPE_BIAS_PX / noise.sigma_px) ** 2)
+def with_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> Noise:
+    """Noise on scanned bodies, all points of which share an error of the standard uncertainties ``common_px`` (N,)."""
+    points_per_body, common = len(common_px) / bodies, float(np.mean(common_px**2))
+    return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
 
 
 def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:

@@ -143,7 +143,7 @@ SCANNED = (Spheres.kind, Plane.kind, Cylinder.kind)
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
 """Inclination of the stage's direction to the one described, towards two directions across it."""
 # Where the ray's crossing with the sheet moves almost along the surface, a residual in px would be out of all bounds.
-_LEAST_SHARE = 0.4
+LEAST_SHARE = 0.4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -156,6 +156,7 @@ class SurfaceScanEvidence(StripeEvidence):
     Attributes
     ----------
     beside_mm : (3, N); from the sheet's middle to where their light comes from, camera frame: `uwlts.optics.brightness`
+    common_px : (N,); standard uncertainty of what that and blur leave, which all points of a body share
     frame : (N,) int; in which image each lies, from 0
     direction, across_stage : (3,), (2, 3); in which growing positions move the sensor as described, and two directions
         across, orthonormal, camera frame
@@ -163,6 +164,7 @@ class SurfaceScanEvidence(StripeEvidence):
     """
 
     beside_mm: np.ndarray
+    common_px: np.ndarray
     surface: Surface
     frame: np.ndarray
     stage_mm: np.ndarray
@@ -201,13 +203,7 @@ class SurfaceScanEvidence(StripeEvidence):
         )
         kind, surface_columns, found = self.surface.kind, np.arange(count), []
         of_all = self.stripe_residuals(
-            parameters,
-            points,
-            off,
-            kind=kind,
-            local_columns=surface_columns,
-            image=self.image,
-            least_share=_LEAST_SHARE,
+            parameters, points, off, kind=kind, local_columns=surface_columns, image=self.image, least_share=LEAST_SHARE
         )
         for number in np.unique(self.frame):
             here, columns = self.frame == number, np.append(surface_columns, count + number)
