@@ -1,5 +1,6 @@
 """Chooses Mitsuba's variant before any test module imports the renderer, and loads the sensor most tests start from."""
 
+import ctypes
 import fcntl
 import os
 import signal
@@ -27,6 +28,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--noise", type=int, default=0, help="draw all noise anew: another number, other noise (0: the usual)"
     )
+    parser.addoption(
+        "--lanes", type=int, default=0, help="vectors in the renderer's kernels as of another processor: 4, 8 or 16"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -39,6 +43,18 @@ def pytest_configure(config: pytest.Config) -> None:
         import sitecustomize
 
         sitecustomize.change_mitsuba()
+    if lanes := config.getoption("--lanes"):
+        use_lanes(lanes)
+
+
+def use_lanes(count: int) -> None:
+    """Compile this process's kernels for vectors of so many numbers: 4 as for SSE, 8 for AVX2, 16 for AVX-512."""
+    import drjit
+
+    drjit.eval(drjit.llvm.Float(0.0))  # starts LLVM, which takes the processor's own
+    library = ctypes.CDLL(str(Path(drjit.__file__).parent / "libdrjit-core.so"))
+    # No part of Dr.Jit's Python interface: jit_llvm_set_target(const char *, const char *, uint32_t).
+    library._Z19jit_llvm_set_targetPKcS0_j(b"haswell", b"+avx2,+fma", count)
 
 
 # A shell starts what runs in its background with SIGINT ignored, and children inherit that: here Ctrl-C is tested.
