@@ -106,10 +106,11 @@ VARIATIONS = (
     Variation("twice as far off as stated", spread=2.0),
     Variation("half as far off as stated", spread=0.5),
     Variation("k3 of 0.1", errors=ModelErrors(distortion=(("k3", 0.1),))),
-    Variation("p1 of 0.0005, p2 of -0.0005", errors=ModelErrors(distortion=(("p1", 5e-4), ("p2", -5e-4)))),
+    Variation("p1 of 0.001, p2 of -0.001", errors=ModelErrors(distortion=(("p1", 1e-3), ("p2", -1e-3)))),
     Variation("saddle of 0.05 mm", errors=ModelErrors(saddle_mm=0.05)),
     Variation("target 0.1 % wider", errors=ModelErrors(stretch=1e-3)),
     Variation("stripe on the target 0.1 px off by gloss", errors=ModelErrors(gloss_px=0.1)),
+    Variation("the same, stated", {"uncertainty": {"target_stripe_px": 0.1}}, errors=ModelErrors(gloss_px=0.1)),
 )
 """Sizes of model errors: distortion that moves the image's corner by 0.1 to 1 px; boards and gloss as they are met."""
 
@@ -168,7 +169,13 @@ def parameter_pulls(calibration: Calibration, real: Reality, described: Sensor) 
         WindowParameter.THICKNESS: window.thickness_mm,
         WindowParameter.GLASS_INDEX: window.index(real.sensor.laser.wavelength_nm),
         StageParameter.SCALE: real.stage_scale,
+        LensParameter.P1: camera.distortion.p1,
+        LensParameter.P2: camera.distortion.p2,
         TargetParameter.BOW: real.target_bow_mm,
+        TargetParameter.SADDLE: real.target_saddle_mm,
+        TargetParameter.STRETCH_X: real.stretch[0],
+        TargetParameter.STRETCH_Y: real.stretch[1],
+        TargetParameter.STRIPE: real.gloss_px,
         MediumIndex("water"): real.index(described.media["water"]),
         StepHeight(STEP_MM): real.step_mm,
     }

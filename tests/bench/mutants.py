@@ -2,9 +2,9 @@
 
 From each package mutants are drawn at random by Cosmic Ray's operators: another arithmetic operator, comparison, sign,
 number, truth value, a loop that is left out. Annotations are not changed. Each is tried in a copy of the checkout on
-the tests (without the slow ones) that run the changed line, shortest first, then on the others of their files. A mutant
-that no test notices survives; whether it changes a result at all is for the reader to judge. Needs
-``pip install -e '.[mutants]'``.
+the tests that run the changed line, shortest first, then on the others of their files; slow ones are left out, but with
+``--again FILE``, which tries the survivors of earlier results on all. A mutant that no test notices survives; whether
+it changes a result at all is for the reader to judge. Needs ``pip install -e '.[mutants]'``.
 """
 
 import argparse
@@ -129,10 +129,11 @@ class Tests:
     seconds: dict[str, float]
 
     @classmethod
-    def observed(cls, folder: Path, package: str) -> "Tests":
+    def observed(cls, folder: Path, package: str, *, slow: bool) -> "Tests":
         """Run a package's tests once."""
         report = folder / "report.xml"
-        options = ["-m", "not slow", f"--cov={package}", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
+        options = [f"--cov={package}", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
+        options += [] if slow else ["-m", "not slow"]
         subprocess.run(
             [*_pytest(), *options, "-o", "junit_family=xunit1", "-n", "2", "--dist", "loadfile", *TESTS[package]],
             cwd=folder,
@@ -167,7 +168,7 @@ class Tests:
         for tests in (first, beside):
             for test in sorted(tests & self.seconds.keys(), key=lambda t: self.seconds[t]):
                 left -= self.seconds[test]
-                if left < 0 and test not in first:
+                if left < 0:
                     return
                 yield test
 
@@ -211,14 +212,13 @@ def _pytest() -> list[str]:
     return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
 
 
-def of_package(package: str, number: int, seed: int, workers: int, console: Console) -> list[Result]:
-    """Draw mutants of a package and try them."""
-    mutants = drawn(package, number, random.Random(f"{seed} {package}"))
+def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int, console: Console) -> list[Result]:
+    """Try mutants of a package."""
     with tempfile.TemporaryDirectory() as temporary:
         folders: SimpleQueue[Path] = SimpleQueue()
         for worker in range(workers):
             folders.put(copied(Path(temporary) / str(worker)))
-        tests = Tests.observed(copied(Path(temporary) / "observed"), package)
+        tests = Tests.observed(copied(Path(temporary) / "observed"), package, slow=slow)
 
         def one(mutant: Mutant) -> Result:
             folder = folders.get()
@@ -231,19 +231,31 @@ def of_package(package: str, number: int, seed: int, workers: int, console: Cons
             return list(track(pool.map(one, mutants), package, total=len(mutants), console=console))
 
 
+def read(path: Path) -> list[Result]:
+    """Results as `main` keeps them."""
+    return [Result(**each | {"mutant": Mutant(**each["mutant"])}) for each in json.loads(path.read_text())]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.mutants", description=__doc__.splitlines()[0])
     parser.add_argument("packages", nargs="*", metavar="package", help=", ".join(TESTS))
     parser.add_argument("--sample", type=int, default=60, help="mutants of each package (default: 60)")
     parser.add_argument("--seed", type=int, default=0, help="draw others by another number")
+    parser.add_argument("--again", type=Path, help="try the survivors of these results on all tests")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each package")
     options = parser.parse_args()
     if unknown := set(options.packages) - TESTS.keys():
         parser.error(f"no tests are named for {', '.join(sorted(unknown))}: choose from {', '.join(TESTS)}")
-    console, results = Console(), []
+    console, results = Console(), read(options.again) if options.again else []
     for package in options.packages or TESTS:
-        results += of_package(package, options.sample, options.seed, options.workers, console)
+        if options.again:
+            mutants = [each.mutant for each in results if each.mutant.package == package and each.outcome != "killed"]
+        else:
+            mutants = drawn(package, options.sample, random.Random(f"{options.seed} {package}"))
+        slow = options.again is not None
+        tried_now = of_package(package, mutants, slow=slow, workers=options.workers, console=console)
+        results = [each for each in results if each.mutant not in mutants] + tried_now
         options.out.write_text(json.dumps([asdict(result) for result in results], indent=1))
     table = Table("package", "mutants", "killed", "survived", "not run", "score")
     for package in dict.fromkeys(result.mutant.package for result in results):

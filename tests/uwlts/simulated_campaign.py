@@ -45,8 +45,9 @@ class ModelErrors:
 class Reality:
     """What a sensor, its stage and its standards really are where drawings and certificates say something else.
 
-    ``lean`` (2,) are the slopes of the stage's direction against the target's normal,
-    ``warmer_k`` by how much the water is warmer than its thermometer says. ``errors`` are those of the model.
+    ``lean`` (2,) are the slopes of the stage's direction against the target's normal, ``warmer_k`` by how much the
+    water is warmer than its thermometer says. ``target_saddle_mm`` is twice the height of the middles of the target's
+    sides across x, ``stretch`` (2,) that of its columns and rows, ``gloss_px`` by how much it moves the stripe on it.
     """
 
     sensor: Sensor
@@ -61,7 +62,9 @@ class Reality:
     stripe_px: float
     stage_mm: float
     rng: np.random.Generator
-    errors: ModelErrors = ModelErrors()
+    target_saddle_mm: float
+    stretch: np.ndarray
+    gloss_px: float
 
     def index(self, medium: Medium, drift_k: float = 0.0) -> float:
         """Index of a medium; that of water is of the second order in the temperature, also beyond 30 degC."""
@@ -89,6 +92,7 @@ def drawn_reality(
     camera, window = described.camera, described.camera.window
     distortion = built.camera.distortion.model_dump()
     laser = described.laser.model_copy(update={"window": built.laser.window})
+    distortion |= dict(zip(("p1", "p2"), rng.normal(0, known.tangential, 2), strict=True))
     for name, value in errors.distortion:
         distortion[name] += value
     as_drawn = window.normal()[:2] / window.normal()[2]
@@ -133,7 +137,9 @@ def drawn_reality(
         stripe_px=rng.uniform(0.1, 0.15),
         stage_mm=known.stage_position_mm,
         rng=rng,
-        errors=errors,
+        target_saddle_mm=rng.normal(0, known.target_bow_mm) + 2 * errors.saddle_mm,
+        stretch=rng.normal(0, known.target_stretch, 2) + [errors.stretch, 0.0],
+        gloss_px=rng.normal(0, known.target_stripe_px) + errors.gloss_px,
     )
 
 
@@ -204,9 +210,9 @@ def target_series(
 
     def bulge(points: np.ndarray) -> np.ndarray:
         x2, y2 = points[:, 0] ** 2, points[:, 1] ** 2
-        return (real.target_bow_mm * (x2 + y2) + 2 * real.errors.saddle_mm * (x2 - y2)) / corner
+        return (real.target_bow_mm * (x2 + y2) + real.target_saddle_mm * (x2 - y2)) / corner
 
-    bent = np.column_stack([flat[:, 0] * (1 + real.errors.stretch), flat[:, 1], bulge(flat)])
+    bent = np.column_stack([flat[:, :2] * (1 + real.stretch), bulge(flat)])
     fan = FanRays.of(real, index, rays)
     images, stripes = [], []
     for position in positions:
@@ -221,7 +227,7 @@ def target_series(
             lit = fan.on_plane(rotation[:, 2], rotation[:, 2] @ origin + bulge((lit - origin) @ rotation))
         on_it = (np.abs((lit - origin) @ rotation)[:, :2] < 115.0).all(axis=1)
         pixels = seen(sensor, lit[on_it], index=index, window=view.window)
-        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)]) + [0.0, real.errors.gloss_px])
+        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)]) + [0.0, real.gloss_px])
     evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
     return Series(view, evidence, True, ["target"])
 

@@ -86,9 +86,15 @@ class StageParameter(_SingleParameter):
 
 
 class TargetParameter(_SingleParameter):
-    """Bend of the target in mm."""
+    """Errors of the target: bends in mm, as a dish at its corners, and as a saddle twice that of the middles of the
+    sides that its x axis crosses; relative stretch along x and y; shift of the stripe on it in px, as by gloss.
+    """
 
     BOW = "target_bow", "bend of the target", "µm", 1e3
+    SADDLE = "target_saddle", "saddle of the target", "µm", 1e3
+    STRETCH_X = "target_stretch_x", "stretch of the target along its rows", "µm/m", 1e6
+    STRETCH_Y = "target_stretch_y", "stretch of the target along its columns", "µm/m", 1e6
+    STRIPE = "target_stripe", "shift of the stripe on the target", "px"
 
 
 _INDEX_OF, _HEIGHT_OF, _STEP = "index of ", "height of the ", " mm step"

@@ -440,9 +440,10 @@ class Uncertainty(Description):
     follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
     medium whose index is given. Of the stage: each position, the scale of
     all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
-    its plane when it bends like a dish, and the height of the steps. ``sheet_thickness`` is relative: that of the
-    thickness of the laser's sheet. An uncertainty of zero means that the quantity is not estimated but taken as
-    described.
+    its plane when it bends like a dish or like a saddle, the relative error of its lengths along rows and columns, by
+    how much its surface shifts the stripe, and the height of the steps. ``tangential`` is that of the lens's p1 and p2;
+    ``sheet_thickness`` is relative: that of the thickness of the laser's sheet. An uncertainty of zero means that the
+    quantity is not estimated but taken as described.
     """
 
     window_distance_mm: NotNegative = 5.0
@@ -458,7 +459,10 @@ class Uncertainty(Description):
     stage_scale: NotNegative = 1e-4
     stage_alignment_deg: Positive = 0.5
     target_bow_mm: NotNegative = 0.03
+    target_stretch: NotNegative = 2e-5
+    target_stripe_px: NotNegative = 0.02
     step_height_mm: Positive = 0.01
+    tangential: NotNegative = 5e-4
     sheet_thickness: NotNegative = 0.1
 
     def stage_lean(self) -> float:

@@ -35,6 +35,12 @@ _CHECK: dict[SingleParameter, str] = {
     StageParameter.SLOPE_1: _ALIGNMENT,
     StageParameter.SLOPE_2: _ALIGNMENT,
     TargetParameter.BOW: "the target's flatness, or uncertainty.target_bow_mm",
+    TargetParameter.SADDLE: "the target's flatness, or uncertainty.target_bow_mm",
+    TargetParameter.STRETCH_X: "the target's spacings, or uncertainty.target_stretch",
+    TargetParameter.STRETCH_Y: "the target's spacings, or uncertainty.target_stretch",
+    TargetParameter.STRIPE: "the target's gloss, or uncertainty.target_stripe_px",
+    LensParameter.P1: "the lens, or uncertainty.tangential",
+    LensParameter.P2: "the lens, or uncertainty.tangential",
 }
 """Checks of the parameters of which something is known before."""
 
@@ -142,10 +148,24 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
     return Findings([words for wrong, words in found if wrong], [words for wrong, words in found if not wrong])
 
 
-def _of_priors(result: Estimate) -> _Found:
-    """Parameters far from what was known before, the farthest first."""
-    parameters = result.parameters
-    found = []
+@dataclass(frozen=True)
+class Deviation:
+    """A parameter that the evidence ``alone`` says far from what was ``known`` before with the uncertainty ``std``."""
+
+    sigmas: float
+    key: ParameterKey
+    alone: float
+    known: float
+    std: float
+
+    def words(self) -> str:
+        """The deviation, and what to check."""
+        return format_deviation(self.key, self.alone, self.known, self.std, sigmas=self.sigmas)
+
+
+def deviations(result: Estimate) -> list[Deviation]:
+    """Parameters that are doubtfully far from what was known before, the farthest first."""
+    parameters, found = result.parameters, []
     for key, value, known, std, after in zip(
         parameters.keys,
         result.values,
@@ -161,9 +181,13 @@ def _of_priors(result: Estimate) -> _Found:
         sigmas = abs(value - known) / share
         if sigmas > _DOUBTFUL:
             alone = known + (value - known) * (std / share) ** 2
-            found.append((sigmas, format_deviation(key, alone, known, std, sigmas=sigmas)))
-    for sigmas, words in sorted(found, reverse=True):
-        yield sigmas > _WRONG, words
+            found.append(Deviation(sigmas, key, alone, known, std))
+    return sorted(found, key=lambda each: each.sigmas, reverse=True)
+
+
+def _of_priors(result: Estimate) -> _Found:
+    for each in deviations(result):
+        yield each.sigmas > _WRONG, each.words()
 
 
 def _of_earlier(result: Estimate) -> _Found:

@@ -18,6 +18,9 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.optics.window import leaning
 
 TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
+BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
+STRETCH = (TargetParameter.STRETCH_X, TargetParameter.STRETCH_Y)
+SHIFT = TargetParameter.STRIPE
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +94,16 @@ class StripeEvidence(ABC):
         return replace(self, predicted=predicted)
 
     def on_sheet(
-        self, parameters: Parameters, global_values: np.ndarray, here: np.ndarray | slice = slice(None)
+        self,
+        parameters: Parameters,
+        global_values: np.ndarray,
+        here: np.ndarray | slice = slice(None),
+        *,
+        shifted_px: float = 0.0,
     ) -> PointDerivatives | None:
-        """Points of the sheet that the pixels show; None where a ray misses it."""
+        """Points of the sheet that the pixels show, of a stripe shifted across itself; None where a ray misses it."""
         at_px = self.pixels if self.predicted is None else self.predicted
-        return parameters.on_sheet(global_values, self.view, at_px[here])
+        return parameters.on_sheet(global_values, self.view, at_px[here] - shifted_px * np.eye(2)[self.across])
 
     def stripe_residuals(
         self,
@@ -227,10 +235,9 @@ class TargetEvidence(StripeEvidence):
         if rays is None:
             return None
         start, along = pose.into_target(rays.origins), pose.rotation.T @ rays.directions
-        bow = parameters.value(global_values, TargetParameter.BOW)
         known = self.placement.points_mm[here]
-        bulge = self._bulge(known)
-        reach = (bow * bulge - start[2]) / along[2]
+        bends = self._bends(known)
+        reach = (_values(parameters, global_values, BENDS) @ bends - start[2]) / along[2]
         if not (reach > 0).all():
             return None
         at = rays.origins + reach * rays.directions
@@ -241,7 +248,8 @@ class TargetEvidence(StripeEvidence):
             return moved[..., :2, :] - slope * moved[..., 2:, :]
 
         by_rays = flat(pose.rotation.T @ (rays.origins_by + reach * rays.directions_by))
-        found = (start + reach * along)[:2] - known[:, :2].T
+        stretch = 1.0 + _values(parameters, global_values, STRETCH)
+        found = (start + reach * along)[:2] - stretch[:, None] * known[:, :2].T
         into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), target mm to px
 
         def to_pixels(moved: np.ndarray) -> np.ndarray:
@@ -252,7 +260,9 @@ class TargetEvidence(StripeEvidence):
         by_global = np.empty((2, len(known), len(parameters.keys)))
         for axis in (0, 1):
             by_global[axis] = parameters.by_global(by_rays[:, axis], self.view)
-            parameters.add(by_global[axis], TargetParameter.BOW, slope[axis] * bulge)
+            for key, bend in zip(BENDS, bends, strict=True):
+                parameters.add(by_global[axis], key, slope[axis] * bend)
+            parameters.add(by_global[axis], STRETCH[axis], -known[:, axis])
             parameters.add(by_global[axis], StageParameter.SCALE, by_scale[axis])
         values = (found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel()
         by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
@@ -260,28 +270,36 @@ class TargetEvidence(StripeEvidence):
 
     def _of_stripe(self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose") -> Residuals | None:
         here = self.lit(pose.image)
-        points = self.on_sheet(parameters, global_values, here)
+        points = self.on_sheet(parameters, global_values, here, shifted_px=parameters.value(global_values, SHIFT))
         if points is None:
             return None
         at = pose.into_target(points.points)
-        bow, bulge = parameters.value(global_values, TargetParameter.BOW), self._bulge(at.T)
+        bends, (bow, saddle) = self._bends(at.T), _values(parameters, global_values, BENDS)
         # Height above the bent target: its gradient by the point in the target's frame.
-        offset = at[:2] - self.middle_mm[:, None]
-        gradient = np.stack([*(-2.0 * bow / self.radius_mm**2 * offset), np.ones(at.shape[1])])
+        steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle], [bow - saddle]])
+        gradient = np.stack([*(steep * (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
+        outward = pose.rotation @ gradient
+        by_stripe = -np.sum(outward * points.by_rays[COLUMNS.index("uv"[self.across])], axis=0)
+        by_global = {SHIFT: by_stripe, StageParameter.SCALE: pose.by_scale() @ gradient}
         off = Distances(
-            at[2] - bow * bulge,
-            pose.rotation @ gradient,
+            at[2] - bow * bends[0] - saddle * bends[1],
+            outward,
             np.einsum("in,cin->nc", gradient, pose.by_local(points.points)),
-            {TargetParameter.BOW: -bulge, StageParameter.SCALE: pose.by_scale() @ gradient},
+            dict(zip(BENDS, -bends, strict=True)) | by_global,
         )
         columns = pose.local_columns
         return self.stripe_residuals(
             parameters, points, off, kind=STRIPE, local_columns=columns, image=pose.image, here=here
         )
 
-    def _bulge(self, points: np.ndarray) -> np.ndarray:
-        """Height (N,) of the target's points (N, 2 or 3) for a bow of one."""
-        return np.sum((points[:, :2] - self.middle_mm) ** 2, axis=1) / self.radius_mm**2
+    def _bends(self, points: np.ndarray) -> np.ndarray:
+        """Heights (2, N) of the target's points (N, 2 or 3) for a bow of one, and for a saddle of one."""
+        x2, y2 = ((points[:, :2] - self.middle_mm) / self.radius_mm).T ** 2
+        return np.stack([x2 + y2, x2 - y2])
+
+
+def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[ParameterKey, ...]) -> np.ndarray:
+    return np.array([parameters.value(global_values, key) for key in keys])
 
 
 class _Pose:

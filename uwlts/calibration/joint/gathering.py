@@ -7,7 +7,9 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.derivatives import SHEET
+from uwlts.calibration.joint.evidence import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.parameters import Prior, ViewMedium, window_values
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sources_of
@@ -17,14 +19,14 @@ from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.joint_estimate import Origin
 from uwlts.model.parameter_keys import (
+    LensParameter,
     MediumIndex,
     ParameterKey,
     SheetParameter,
     StageParameter,
     StepHeight,
-    TargetParameter,
 )
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor, Uncertainty
 from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeOptions, find_stripes
@@ -210,7 +212,7 @@ def priors_of(
     heights: dict[StepHeight, Prior],
     options: CalibrationOptions,
 ) -> dict[ParameterKey, Prior]:
-    """Prior knowledge of all global parameters but the lens's.
+    """Prior knowledge of all global parameters but those of the lens that only the evidence tells.
 
     ``window`` is as described; the sheet's turns and shift start at ``turns`` (3,); ``heights`` are of step standards.
     """
@@ -234,5 +236,15 @@ def priors_of(
         priors |= dict.fromkeys(SLOPES, Prior(0.0, known.stage_lean()))
     if options.poses != "free" or gathered.scans:
         priors[StageParameter.SCALE] = Prior(0.0, known.stage_scale)
-    priors[TargetParameter.BOW] = Prior(0.0, known.target_bow_mm)
+    if gathered.series:
+        priors |= dict.fromkeys(BENDS, Prior(0.0, known.target_bow_mm))
+        priors |= dict.fromkeys(STRETCH, Prior(0.0, known.target_stretch))
+        priors[SHIFT] = Prior(0.0, known.target_stripe_px)
+        priors |= dict.fromkeys(added_tangential(options.camera, known), Prior(0.0, known.tangential))
     return priors | heights
+
+
+def added_tangential(camera: CameraOptions, known: Uncertainty) -> tuple[LensParameter, ...]:
+    """Tangential distortions that are estimated though not asked for, from what is known of them before."""
+    asked = {"p1", "p2"} & {*camera.distortion} or known.tangential == 0
+    return () if asked else (LensParameter.P1, LensParameter.P2)

@@ -12,7 +12,7 @@ from uwlts.calibration.camera import placement_pose, solve_camera
 from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
-from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series
+from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, added_tangential
 from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.scanned_surfaces import (
     LEAST_SHARE,
@@ -122,7 +122,9 @@ def series_start(
     Raises CalibrationError: a camera without a window in air does not explain the images by and large.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
-    intrinsics = Intrinsics(options.camera, width_px=width_px, height_px=height_px)
+    tangential = tuple(key.text for key in added_tangential(options.camera, sensor.uncertainty))
+    extended = replace(options.camera, distortion=(*options.camera.distortion, *tangential))
+    intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
     staged = not free and base.approaching is not None
     seen = solve_camera(

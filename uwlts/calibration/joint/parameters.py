@@ -92,7 +92,8 @@ class Parameters:
 
     ``sheet`` and ``window`` are as described, the window None where nothing is seen through it; ``media`` are the names
     of those other than air. ``priors`` has every parameter but the lens's, in the order of the vector, which lacks
-    those that are held; ``earlier`` is what an earlier calibration says of the vector's first parameters besides.
+    those that are held, and those of the lens of which something is known before; ``earlier`` is what an earlier
+    calibration says of the vector's first parameters besides.
     """
 
     intrinsics: Intrinsics
@@ -104,8 +105,9 @@ class Parameters:
     keys: tuple[ParameterKey, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        known = (key for key, prior in self.priors.items() if prior.std > 0)
-        object.__setattr__(self, "keys", (*self.intrinsics.keys, *known))
+        lens = self.intrinsics.keys
+        known = (key for key, prior in self.priors.items() if prior.std > 0 and key not in lens)
+        object.__setattr__(self, "keys", (*lens, *known))
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""

@@ -1,14 +1,15 @@
 """The joint calibration from captures: target images in air and in water, stripes on it, steps, scans; in any mix."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.consistency import Findings, findings
+from uwlts.calibration.joint.consistency import Findings, deviations, findings
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
+from uwlts.calibration.joint.evidence import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
 from uwlts.calibration.joint.parameters import Parameters
@@ -17,8 +18,12 @@ from uwlts.calibration.joint.stored_estimate import calibration_of
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
 from uwlts.model.errors import CalibrationError
+from uwlts.model.parameter_keys import TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
+
+_WRONG_TARGET = 0.01
+"""Stretch beyond which it is another target than the one described."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +54,25 @@ class JointProblem:
         )
 
     def judged(self) -> tuple[Estimate, Findings]:
-        """The estimate and what speaks against it; errors as `estimate`."""
+        """The estimate and what speaks against it; errors as `estimate`.
+
+        A target that is bent or stretched by far more than it is known to be, as the images show, is taken for as
+        uncertain as that: what they do not show of its form may be as wrong.
+        """
         result = self.solve()
-        return result, findings(result, self.evidence, sensor=self.sensor)
+        doubtful = [each for each in deviations(result) if isinstance(each.key, TargetParameter)]
+        size = {each.key: abs(each.alone - each.known) for each in doubtful}
+        if not doubtful or any(size.get(key, 0.0) > _WRONG_TARGET for key in STRETCH):
+            return result, findings(result, self.evidence, sensor=self.sensor)
+        priors = dict(self.parameters.priors)
+        for alike in (BENDS, STRETCH, (SHIFT,)):
+            widest = max(size.get(key, 0.0) for key in alike)
+            priors |= {key: replace(priors[key], std=max(priors[key].std, widest)) for key in alike}
+        wider = replace(self, parameters=replace(self.parameters, priors=priors))
+        result = wider.solve()
+        against = findings(result, self.evidence, sensor=self.sensor)
+        doubts = [f"{each.words()}; taken for as uncertain as that" for each in doubtful]
+        return result, replace(against, doubts=doubts + against.doubts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -270,7 +270,7 @@ def solve_refreshed(
         raise CalibrationError("; ".join(warnings))
     turns = known.values[[old.keys.index(key) for key in SHEET[:3]]]
     described = priors_of(gathered, calibration.window, turns, heights, options)
-    priors = old.priors | {key: prior for key, prior in described.items() if key not in old.priors}
+    priors = old.priors | {key: prior for key, prior in described.items() if key not in old.keys}
     if index_std is not None:
         priors |= {key: replace(priors[key], std=index_std) for key in map(MediumIndex, gathered.media)}
     earlier = EarlierEstimate(known.values, known.covariance)

@@ -58,12 +58,12 @@ def test_errors_are_as_large_as_stated(measured, quantity):
 
 
 def test_the_covariance_is_that_of_the_errors(outcomes):
-    """Errors of lens, window, water, stage, target and step, whitened by their covariance: some 300 of variance one.
+    """Errors of lens, window, water, stage, target and step, whitened by their covariance: some 400 of variance one.
 
-    Their mean square lies within 0.73 and 1.32. A covariance too large by a factor of 1.5 makes it 0.67, one too small
+    Their mean square lies within 0.77 and 1.26. A covariance too large by a factor of 1.5 makes it 0.67, one too small
     by that factor 1.5.
     """
     pulls = np.concatenate([outcome.pulls for outcome in outcomes])
-    assert len(pulls) == 14 * WET + 12 * DRY
+    assert len(pulls) == 20 * WET + 18 * DRY
     lowest, highest = chi2.ppf([BY_CHANCE, 1 - BY_CHANCE], len(pulls)) / len(pulls)
     assert lowest < np.mean(pulls**2) < highest

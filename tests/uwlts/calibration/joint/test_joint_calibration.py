@@ -121,6 +121,10 @@ def at_truth(view):
         "laser_window_turn": 0.003,
         "stage_scale": 1e-4,
         "target_bow": 0.02,
+        "target_saddle": -0.015,
+        "target_stretch_x": 2e-4,
+        "target_stretch_y": -1e-4,
+        "target_stripe": 0.04,
         "height of the 23 mm step": 23.0,
     }
     priors = {parameter_of(text): Prior(value, 1.0) for text, value in known.items()}
