@@ -158,6 +158,10 @@ class Deviation:
     known: float
     std: float
 
+    def wrong(self) -> bool:
+        """Whether it contradicts what was known, rather than gives a doubt."""
+        return self.sigmas > _WRONG
+
     def words(self) -> str:
         """The deviation, and what to check."""
         return format_deviation(self.key, self.alone, self.known, self.std, sigmas=self.sigmas)
@@ -187,7 +191,7 @@ def deviations(result: Estimate) -> list[Deviation]:
 
 def _of_priors(result: Estimate) -> _Found:
     for each in deviations(result):
-        yield each.sigmas > _WRONG, each.words()
+        yield each.wrong(), each.words()
 
 
 def _of_earlier(result: Estimate) -> _Found:

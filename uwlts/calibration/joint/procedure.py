@@ -22,9 +22,6 @@ from uwlts.model.parameter_keys import TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 
-_WRONG_TARGET = 0.01
-"""Stretch beyond which it is another target than the one described."""
-
 
 @dataclass(frozen=True, eq=False)
 class JointProblem:
@@ -57,13 +54,15 @@ class JointProblem:
         """The estimate and what speaks against it; errors as `estimate`.
 
         A target that is bent or stretched by far more than it is known to be, as the images show, is taken for as
-        uncertain as that: what they do not show of its form may be as wrong.
+        uncertain as that, for what they do not show of its form may be as wrong; but not where anything else
+        contradicts what is known, as where the spacing of its points is another one.
         """
         result = self.solve()
-        doubtful = [each for each in deviations(result) if isinstance(each.key, TargetParameter)]
-        size = {each.key: abs(each.alone - each.known) for each in doubtful}
-        if not doubtful or any(size.get(key, 0.0) > _WRONG_TARGET for key in STRETCH):
+        far = deviations(result)
+        doubtful = [each for each in far if isinstance(each.key, TargetParameter)]
+        if not doubtful or any(each.wrong() for each in far if each not in doubtful):
             return result, findings(result, self.evidence, sensor=self.sensor)
+        size = {each.key: abs(each.alone - each.known) for each in doubtful}
         priors = dict(self.parameters.priors)
         for alike in (BENDS, STRETCH, (SHIFT,)):
             widest = max(size.get(key, 0.0) for key in alike)
