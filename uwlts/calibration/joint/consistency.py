@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import assert_never
 
 import numpy as np
+from scipy.stats import chi2
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
 from uwlts.calibration.joint.evidence import TARGET, Residuals, TargetEvidence
@@ -78,6 +79,8 @@ _WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
 _OUTLIER_SHARE = 0.2  # outliers are few; more are another structure in the images
 _DOUBTFUL, _WRONG = 4.0, 6.0
 """Standard uncertainties from what was known before. Design values are rough, so small deviations are only doubts."""
+_LEAST_TOLD, _TOLD, _FEWEST_TOLD = 0.02, 0.5, 6
+"""Shares of a standard uncertainty from which the evidence tells anything of a parameter, and much; of how many."""
 _FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
 """Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
 _POSITIONS_WRONG, _FEWEST_POSITIONS = 3.0, 4  # the rms of four positions exceeds three sigma once in a million
@@ -167,9 +170,28 @@ class Deviation:
         return format_deviation(self.key, self.alone, self.known, self.std, sigmas=self.sigmas)
 
 
-def deviations(result: Estimate) -> list[Deviation]:
-    """Parameters that are doubtfully far from what was known before, the farthest first."""
-    parameters, found = result.parameters, []
+def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]:
+    """Parameters at least so many standard uncertainties from what was known before, the farthest first."""
+    far = [each for each, _ in _compared(result) if each.sigmas > least]
+    return sorted(far, key=lambda each: each.sigmas, reverse=True)
+
+
+def understated(result: Estimate) -> float:
+    """By which factor what was known of sensor, media and stage is farther off than stated; 1 if it is not.
+
+    The root of the mean square of deviations over standard uncertainties (Birge's ratio), where chance alone would
+    make that as large once in a thousand calibrations.
+    """
+    sensor = ((each, told) for each, told in _compared(result) if not isinstance(each.key, TargetParameter))
+    squares = np.array([each.sigmas**2 for each, told in sensor if told > _TOLD])
+    if len(squares) < _FEWEST_TOLD or squares.sum() < chi2.ppf(0.999, len(squares)):
+        return 1.0
+    return float(np.sqrt(squares.mean()))
+
+
+def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
+    """All parameters known before, each with the share of that uncertainty that the evidence took away."""
+    parameters = result.parameters
     for key, value, known, std, after in zip(
         parameters.keys,
         result.values,
@@ -178,15 +200,11 @@ def deviations(result: Estimate) -> list[Deviation]:
         result.std().values(),
         strict=True,
     ):
-        if not np.isfinite(std):
-            continue
-        # The estimate contains the prior: this is the variance of their difference where both are right.
-        share = float(np.sqrt(max(std**2 - after**2, (0.1 * std) ** 2)))
-        sigmas = abs(value - known) / share
-        if sigmas > _DOUBTFUL:
-            alone = known + (value - known) * (std / share) ** 2
-            found.append(Deviation(sigmas, key, alone, known, std))
-    return sorted(found, key=lambda each: each.sigmas, reverse=True)
+        if np.isfinite(std):
+            # The estimate contains the prior: this is the variance of their difference where both are right.
+            told = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_TOLD**2)))
+            alone = known + (value - known) / told**2
+            yield Deviation(abs(value - known) / (told * std), key, alone, known, std), told
 
 
 def _of_priors(result: Estimate) -> _Found:

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.joint.consistency import Findings, deviations, findings
+from uwlts.calibration.joint.consistency import Findings, deviations, findings, understated
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.evidence import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
@@ -21,6 +21,8 @@ from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
+
+_NOTICED = 3.0  # standard uncertainties: what is taken for more uncertain loses little where that was chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,24 +55,33 @@ class JointProblem:
     def judged(self) -> tuple[Estimate, Findings]:
         """The estimate and what speaks against it; errors as `estimate`.
 
-        A target that is bent or stretched by far more than it is known to be, as the images show, is taken for as
-        uncertain as that, for what they do not show of its form may be as wrong; but not where anything else
-        contradicts what is known, as where the spacing of its points is another one.
+        Where all that was known before is farther off than stated, or the target is bent or stretched more than it is
+        known to be, that is taken for as uncertain as it is off, for what the evidence does not show may be as wrong;
+        but not where a single parameter contradicts what is known.
         """
         result = self.solve()
-        far = deviations(result)
-        doubtful = [each for each in far if isinstance(each.key, TargetParameter)]
-        if not doubtful or any(each.wrong() for each in far if each not in doubtful):
+        compared, factor = deviations(result, least=0.0), understated(result)
+        of_target = [each for each in compared if isinstance(each.key, TargetParameter)]
+        form = [each for each in of_target if each.sigmas > _NOTICED]
+        if not (form or factor > 1.0) or any(each.wrong() for each in compared if each not in of_target):
             return result, findings(result, self.evidence, sensor=self.sensor)
-        size = {each.key: abs(each.alone - each.known) for each in doubtful}
-        priors = dict(self.parameters.priors)
+        off = {each.key: abs(each.alone - each.known) for each in of_target}
+        priors = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
         for alike in (BENDS, STRETCH, (SHIFT,)):
-            widest = max(size.get(key, 0.0) for key in alike)
-            priors |= {key: replace(priors[key], std=max(priors[key].std, widest)) for key in alike}
-        wider = replace(self, parameters=replace(self.parameters, priors=priors))
-        result = wider.solve()
-        against = findings(result, self.evidence, sensor=self.sensor)
-        doubts = [f"{each.words()}; taken for as uncertain as that" for each in doubtful]
+            if any(each.key in alike for each in form):
+                together = sum(off.get(key, 0.0) for key in alike)
+                priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in alike}
+        stated = self.sensor.uncertainty
+        scaled = stated.model_copy(update={name: factor * value for name, value in stated})
+        sensor = self.sensor.model_copy(update={"uncertainty": scaled})
+        result = replace(self, parameters=replace(self.parameters, priors=priors), sensor=sensor).solve()
+        against = findings(result, self.evidence, sensor=sensor)
+        doubts = [f"{each.words()}; taken for as uncertain as that" for each in form]
+        if factor > 1.0:
+            doubts.append(
+                f"what the description states of window, media, laser, stage and target is off by {factor:.1f} times "
+                "the uncertainties stated with it: all are taken for that much larger; check [uncertainty]"
+            )
         return result, replace(against, doubts=doubts + against.doubts)
 
 
