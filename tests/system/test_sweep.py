@@ -209,8 +209,9 @@ def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):
         assert len(read_parts(out / "screen")["design"]) == count
     columns = read_parts(out / "screen")
     meets = columns["violation"] == 0
-    # The optimiser looks where constraints hold: more often among its last designs than among its first, random ones.
-    assert meets[-200:].mean() > meets[:60].mean() + 0.1
+    # By chance 0.39 of all designs meet the constraint, 0.035 more or less of 200. The optimiser looks where it holds;
+    # what it proposes depends on which designs are judged when it does, so that 0.53 to 0.69 were seen.
+    assert meets[-200:].mean() > 0.45
 
 
 @pytest.mark.parametrize(

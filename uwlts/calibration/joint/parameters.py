@@ -17,7 +17,7 @@ from uwlts.calibration.joint.derivatives import (
 )
 from uwlts.model.calibration import CameraModel, SheetModel, WindowModel
 from uwlts.model.errors import CalibrationError
-from uwlts.model.parameter_keys import MediumIndex, ParameterKey
+from uwlts.model.parameter_keys import LensParameter, MediumIndex, ParameterKey
 from uwlts.optics.camera import project_through_window
 from uwlts.optics.window import RayDerivatives
 
@@ -105,9 +105,8 @@ class Parameters:
     keys: tuple[ParameterKey, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        lens = self.intrinsics.keys
-        known = (key for key, prior in self.priors.items() if prior.std > 0 and key not in lens)
-        object.__setattr__(self, "keys", (*lens, *known))
+        known = (key for key, prior in self.priors.items() if prior.std > 0 and not isinstance(key, LensParameter))
+        object.__setattr__(self, "keys", (*self.intrinsics.keys, *known))
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""

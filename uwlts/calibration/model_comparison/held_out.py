@@ -19,7 +19,7 @@ from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.calibration.target_images import pose_values
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError
-from uwlts.model.parameter_keys import ParameterKey, SheetParameter, WindowParameter
+from uwlts.model.parameter_keys import LensParameter, ParameterKey, SheetParameter, TargetParameter, WindowParameter
 
 _HELD: dict[str, tuple[ParameterKey, ...]] = {
     "window_tilt": (WindowParameter.SLOPE_X, WindowParameter.SLOPE_Y),
@@ -87,12 +87,14 @@ def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
 def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
     """The problem with the candidate's parameters, starting where it started.
 
+    The target is a dish at most: more ways in which it may differ would take up some of what a model lacks.
     The distance of a single interface is only known to lie near the described one, as it stands for a pane of glass.
     """
     known = problem.parameters
     options = replace(known.intrinsics.options, distortion=candidate.distortion)
     intrinsics = Intrinsics(options, width_px=known.intrinsics.width_px, height_px=known.intrinsics.height_px)
     held = {key for field, keys in _HELD.items() if not getattr(candidate, field) for key in keys}
+    held |= {*TargetParameter} - {TargetParameter.BOW}
     window, priors = known.window, dict(known.priors)
     if candidate.refractions == 1 and window is not None:
         window = WindowModel(refractions=1, distance_mm=window.distance_mm, normal=window.normal)
@@ -102,7 +104,9 @@ def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
             WindowParameter.THICKNESS: replace(priors[WindowParameter.THICKNESS], mean=0.0),
             WindowParameter.GLASS_INDEX: replace(priors[WindowParameter.GLASS_INDEX], mean=1.0),
         }
-    priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in priors.items()}
+    # What is not known of the lens is for the images to tell.
+    known_before = {key: prior for key, prior in priors.items() if not isinstance(key, LensParameter)}
+    priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in known_before.items()}
     parameters = replace(known, intrinsics=intrinsics, window=window, priors=priors)
     start = dict(zip(known.keys, problem.global_values, strict=True))
     global_values = np.array([start.get(key, 0.0) for key in parameters.keys])
@@ -188,6 +192,7 @@ def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence
 
 
 _ROUNDS, _SETTLED_PX = 20, 1e-4  # steps of the pose, far below the noise of a centre
+_CHOOSING_ROUNDS = 10  # of which so many choose what is near enough to count
 _BY_CHANCE = 0.0027  # probability of three standard deviations or more
 
 
@@ -283,13 +288,16 @@ def _residuals(
     problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray, *, fitted: tuple[str, ...]
 ) -> list[Residuals]:
     """Residuals of the evidence with its local parameters, fitted to those of some kinds."""
-    for _ in range(_ROUNDS):
+    near = np.empty(0, dtype=bool)
+    for number in range(_ROUNDS):
         parts = _seen(problem, estimate, evidence, local)
         chosen = [part for part in parts if part.kind in fitted]
         if not chosen:
             return parts
         values, by_local = np.concatenate([p.values for p in chosen]), np.vstack([p.by_local for p in chosen])
-        near = np.abs(values) <= max(outlier_limit(values), _SETTLED_PX)
+        # Values at the limit would be left out and taken in again for ever.
+        if number < _CHOOSING_ROUNDS:
+            near = np.abs(values) <= max(outlier_limit(values), _SETTLED_PX)
         step = -np.linalg.lstsq(by_local[near], values[near], rcond=None)[0]
         local = local + step
         if np.abs(by_local @ step).max() < _SETTLED_PX:
