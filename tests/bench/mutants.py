@@ -1,4 +1,4 @@
-"""How many small changes of the code the tests notice: ``python -m tests.bench.mutants [package ...] [--sample N]``.
+"""Mutation testing, the share of small faults that the tests find: ``python -m tests.bench.mutants [package ...]``.
 
 From each package mutants are drawn at random by Cosmic Ray's operators: another arithmetic operator, comparison, sign,
 number, truth value, a loop that is left out. Annotations are not changed. Each is tried in a copy of the checkout on

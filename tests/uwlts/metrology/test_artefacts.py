@@ -256,20 +256,20 @@ def step_profile(
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_profiles_are_labelled_and_measured(shape):
-    scaled, kept, strays = [], 0, 0
+    scaled, kept, outliers = [], 0, 0
     for seed, tilt_deg in enumerate(np.repeat([-20, -7, 0, 20], 6)):
         points, tread = step_profile(np.random.default_rng(seed), shape, tilt_deg=tilt_deg)
         labels = label_step_faces(points, height_mm=24.0)
         named = labels != StepFace.NEITHER
         # Mixed points and the other tread never pass.
         np.testing.assert_array_equal(labels[:900][named[:900]], tread[:900][named[:900]])
-        strays += np.count_nonzero(named[900:])
+        outliers += np.count_nonzero(named[900:])
         kept += np.count_nonzero(named)
         for reference in ("lower", "upper"):
             height = step_height(points, labels, reference=reference)
             scaled.append((height.height_mm - HEIGHT) / height.std_mm)
     # Of 24 x 8 outliers, each falls on a tread by chance as 0.5 mm of 120: more than seven in 2e-6 of all draws.
-    assert strays <= 7
+    assert outliers <= 7
     # Edges and outliers blank 1 mm to each side: at most 12 x 2 of 176 mm.
     assert kept > 24 * 900 * (1 - 24 / 176 - 0.02)
     # The root mean square of 24 values of unit variance lies within these limits but for 2e-5 of all draws.

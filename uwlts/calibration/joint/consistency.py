@@ -79,8 +79,9 @@ _WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
 _OUTLIER_SHARE = 0.2  # outliers are few; more are another structure in the images
 _DOUBTFUL, _WRONG = 4.0, 6.0
 """Standard uncertainties from what was known before. Design values are rough, so small deviations are only doubts."""
-_LEAST_TOLD, _TOLD, _FEWEST_TOLD = 0.02, 0.5, 6
-"""Shares of a standard uncertainty from which the evidence tells anything of a parameter, and much; of how many."""
+_LEAST_GAIN, _MUCH_GAINED, _FEWEST_GAINED = 0.02, 0.5, 6
+"""Information gained over the prior, as a share of its standard uncertainty: the least that is distinguished from
+rounding, the least that makes a parameter count for Birge's ratio, and how many parameters that ratio needs."""
 _FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
 """Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
 _POSITIONS_WRONG, _FEWEST_POSITIONS = 3.0, 4  # the rms of four positions exceeds three sigma once in a million
@@ -182,15 +183,20 @@ def understated(result: Estimate) -> float:
     The root of the mean square of deviations over standard uncertainties (Birge's ratio), where chance alone would
     make that as large once in a thousand calibrations.
     """
-    sensor = ((each, told) for each, told in _compared(result) if not isinstance(each.key, TargetParameter))
-    squares = np.array([each.sigmas**2 for each, told in sensor if told > _TOLD])
-    if len(squares) < _FEWEST_TOLD or squares.sum() < chi2.ppf(0.999, len(squares)):
+    squares = np.array(
+        [
+            each.sigmas**2
+            for each, gain in _compared(result)
+            if gain > _MUCH_GAINED and not isinstance(each.key, TargetParameter)
+        ]
+    )
+    if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.ppf(0.999, len(squares)):
         return 1.0
     return float(np.sqrt(squares.mean()))
 
 
 def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
-    """All parameters known before, each with the share of that uncertainty that the evidence took away."""
+    """All parameters known before, each with the standard deviation that the evidence removed, over that before."""
     parameters = result.parameters
     for key, value, known, std, after in zip(
         parameters.keys,
@@ -202,9 +208,9 @@ def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
     ):
         if np.isfinite(std):
             # The estimate contains the prior: this is the variance of their difference where both are right.
-            told = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_TOLD**2)))
-            alone = known + (value - known) / told**2
-            yield Deviation(abs(value - known) / (told * std), key, alone, known, std), told
+            gain = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_GAIN**2)))
+            alone = known + (value - known) / gain**2
+            yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
 
 
 def _of_priors(result: Estimate) -> _Found:

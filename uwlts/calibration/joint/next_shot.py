@@ -33,7 +33,7 @@ _SAMPLES = 400  # of a curve; more than the image of one needs for a point on ea
 STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
 SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
 _ON_SPHERES_PX = 0.01
-"""What blur of 4 px (full width) leaves uncertain on matt spheres of this size, root mean square."""
+"""Standard uncertainty of stripe centres on matt spheres by blur, for a stripe with a full width of 4 px."""
 
 _SEEN = np.radians(60)
 """A sphere is seen this far round from the side that faces the sensor."""
