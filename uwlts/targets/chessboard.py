@@ -1,4 +1,4 @@
-"""The chessboard target, found as a whole."""
+"""The chessboard target, seen as a whole or in part."""
 
 from typing import Annotated, Literal
 
@@ -25,70 +25,120 @@ class ChessboardTarget(Target):
     Attributes
     ----------
     columns, rows : number of inner corners along X and along Y
-    square_mm : side of a square
+    square_mm : side of a square, or its sides [along X, along Y] if it is not square
     """
 
     kind: Literal["chessboard"] = "chessboard"
     columns: Annotated[int, Field(ge=3)]
     rows: Annotated[int, Field(ge=3)]
-    square_mm: Positive
+    square_mm: Positive | tuple[Positive, Positive]
+
+    @property
+    def sides_mm(self) -> np.ndarray:
+        """Sides (2,) of a square along X and Y."""
+        return np.full(2, self.square_mm)
 
     @property
     def indices(self) -> np.ndarray:
         return lattice_indices(self.columns, self.rows)
 
     def points_at(self, indices: np.ndarray) -> np.ndarray:
-        return np.column_stack([indices * self.square_mm, np.zeros(len(indices))])
+        return np.column_stack([indices * self.sides_mm, np.zeros(len(indices))])
 
     @property
     def spacing_mm(self) -> float:
-        return self.square_mm
-
-    def findable(self, in_view: np.ndarray) -> bool:
-        return bool(in_view.all())
+        return float(self.sides_mm.min())
 
     def patches(self) -> list[Patch]:
         squares = lattice_indices(self.columns + 1, self.rows + 1)
         dark = squares[squares.sum(axis=1) % 2 == 0]
-        return [Patch(*corners) for corners in (np.hstack([dark - 1, dark]) * self.square_mm).tolist()]
+        return [Patch(*corners) for corners in (np.hstack([dark - 1, dark]) * np.tile(self.sides_mm, 2)).tolist()]
 
     def detect(self, image: np.ndarray) -> TargetView:
         # Imported late: a description alone does not need the detector.
-        from uwlts.targets.detection import corner_quality, eight_bit
+        from uwlts.targets.detection import corner_quality, count_seen, eight_bit, why_no_chessboard
 
         grey = eight_bit(image)
-        size = (self.columns, self.rows)
-        found, corners = cv2.findChessboardCornersSB(grey, size, flags=_SECTOR_FLAGS)
-        if not found:
-            found, corners = cv2.findChessboardCorners(grey, size, flags=_QUAD_FLAGS)
-        if not found:
+        part, reasons = None, []
+        for name, find in _DETECTORS.items():
+            grid = find(grey, self.columns, self.rows)
+            if grid is None:
+                continue
+            grid = _refined(image, grid)
+            reason = why_no_chessboard(grey, grid)
+            if reason is not None:
+                reasons.append(f"of what OpenCV or the own search took for it ({name}), {reason}")
+            elif self.findable(np.isfinite(grid[..., 0]).ravel()) and (part is None or count_seen(grid) > count_seen(part)):
+                part = grid
+            if part is not None and count_seen(part) > _NEARLY_WHOLE * self.columns * self.rows:
+                break
+        if part is None:
             raise TargetError(
-                f"found no chessboard of {size[0]} x {size[1]} inner corners; the whole board must be in view with a "
-                "bright rim, and columns and rows count inner corners, not squares"
+                f"found no chessboard of {self.columns} x {self.rows} inner corners"
+                + "".join(f"; {reason}" for reason in reasons)
+                + "; columns and rows count inner corners, not squares, and of a board that is partly in view two sides "
+                "that meet must be"
             )
-        # Corners are moved to the saddle of the grey levels, in a window that stays within the squares around them.
-        grid = corners.reshape(self.rows, self.columns, 2)
-        sides = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-        half = int(np.clip(min(sides) * 0.4, 2, 11))
-        start = grid.astype(np.float32).reshape(-1, 1, 2)
-        moved = cv2.cornerSubPix(image.astype(np.float32), start, (half, half), (-1, -1), _REFINEMENT)
-        grid = moved.reshape(self.rows, self.columns, 2).astype(np.float64)
-        pixels = _from_top_left(grey, grid).reshape(-1, 2)
-        return TargetView(pixels, self.points_mm, self.indices, corner_quality(image, pixels))
+        pixels = _from_top_left(grey, part).reshape(-1, 2)
+        seen = np.isfinite(pixels[:, 0])
+        pixels, indices = pixels[seen], self.indices[seen]
+        return TargetView(pixels, self.points_at(indices), indices, corner_quality(image, pixels))
+
+
+def _by_lattice(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+    from uwlts.targets.detection import find_board
+
+    return find_board(grey, columns, rows)
+
+
+def _by_sectors(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+    # What OpenCV draws at random is the same for every image, whatever came before it.
+    cv2.setRNGSeed(0)
+    found, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=_SECTOR_FLAGS)
+    return corners.reshape(rows, columns, 2).astype(np.float64) if found else None
+
+
+def _by_squares(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+    cv2.setRNGSeed(0)
+    found, corners = cv2.findChessboardCorners(grey, (columns, rows), flags=_QUAD_FLAGS)
+    return corners.reshape(rows, columns, 2).astype(np.float64) if found else None
+
+
+_DETECTORS = {"lattice": _by_lattice, "sectors": _by_sectors, "squares": _by_squares}
+"""Ways to the corners (rows, columns, 2), NaN where one is not seen, or None."""
+_NEARLY_WHOLE = 0.8  # of the corners; where fewer are seen the next way is tried
+
+
+def _refined(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Corners moved to the saddles of the grey levels, in a window that stays within the squares around them.
+
+    Those that leave the window, or do not lie between four squares, are NaN.
+    """
+    from uwlts.targets.detection import without_doubtful
+
+    sides = [np.nanmin(np.linalg.norm(np.diff(grid, axis=axis), axis=2)) for axis in (0, 1)]
+    half = int(np.clip(min(sides) * 0.4, 2, 11))
+    seen, refined = np.isfinite(grid[..., 0]), grid.copy()
+    start, grey = grid[seen].astype(np.float32).reshape(-1, 1, 2), image.astype(np.float32)
+    moved = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), _REFINEMENT)
+    moved[np.abs(moved - start).max(axis=2) > half] = np.nan
+    refined[seen] = moved[:, 0]
+    return without_doubtful(cv2.GaussianBlur(grey, (0, 0), 1.0), refined)
 
 
 def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """The grid (rows, columns, 2) turned so that it follows the frame of `ChessboardTarget`."""
-    along, across = np.diff(grid, axis=1).mean((0, 1)), np.diff(grid, axis=0).mean((0, 1))
+    along, across = (np.nanmean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))
     if along[0] * across[1] < along[1] * across[0]:
         grid = grid[:, ::-1]
     rows, columns = grid.shape[:2]
     if (rows + columns) % 2:
         centres = (grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4
-        u, v = np.rint(centres).astype(int).transpose(2, 0, 1)
-        even = np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0
+        known = np.isfinite(centres[..., 0])
+        u, v = np.rint(centres[known]).astype(int).T
+        even = (np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0)[known]
         levels = grey[v, u]
         return grid if levels[even].mean() < levels[~even].mean() else grid[::-1, ::-1]
     # A square board has four turns that look alike, another board two.
     turned = [np.rot90(grid, turn) for turn in (range(4) if rows == columns else (0, 2))]
-    return max(turned, key=lambda each: np.diff(each, axis=1)[..., 0].mean())
+    return max(turned, key=lambda each: np.nanmean(np.diff(each, axis=1)[..., 0]))

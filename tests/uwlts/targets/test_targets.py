@@ -439,6 +439,78 @@ def test_chessboard_corners_and_their_order(quad):
     assert view.quality["sharpness"].min() > 0.15
 
 
+def board_in(quad, *, size=(640, 512)):
+    """BOARD photographed, and the pixels (N, 2) of its inner corners in the order of its indices."""
+    texture, first = chess_texture(40)
+    homography = texture_pose(texture, quad)
+    return photograph_texture(texture, homography, size=size), mapped(homography, first + BOARD.indices * 40.0)
+
+
+def true_places(view, corners):
+    """Distances (N,) of found corners from the true ones (columns * rows, 2) of the same numbers."""
+    numbers = view.indices[:, 1] * BOARD.columns + view.indices[:, 0]
+    return np.linalg.norm(view.pixels - corners[numbers], axis=1)
+
+
+@pytest.mark.parametrize("quad", QUADS.values(), ids=QUADS)
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+def test_a_board_partly_outside_the_image_gives_the_corners_in_view(quad, side):
+    image, corners = board_in(quad)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # A quarter of the board is cut off; what is left has one side of the board's length, which tells the rows from the
+    # columns, unless the cut is oblique to the board. Then it may be refused, but never numbered wrongly.
+    near, far = np.rint(0.75 * low + 0.25 * high).astype(int), np.rint(0.25 * low + 0.75 * high).astype(int)
+    cut = {
+        "left": np.s_[:, near[0] :],
+        "right": np.s_[:, : far[0]],
+        "top": np.s_[near[1] :],
+        "bottom": np.s_[: far[1]],
+    }[side]
+    offset = {"left": (near[0], 0), "top": (0, near[1])}.get(side, (0, 0))
+    try:
+        view = BOARD.detect(np.ascontiguousarray(image[cut]))
+    except TargetError:
+        assert quad is QUADS["oblique"]
+        return
+    assert 15 <= len(view.pixels) < len(corners)
+    assert true_places(view, corners - offset).max() < 0.3
+
+
+def test_a_stripe_across_a_board_costs_the_corners_beneath_it_only():
+    image, corners = board_in(QUADS["upright"])
+    across = np.abs(np.arange(640) - 300 - 0.1 * np.arange(512)[:, None])
+    lit = np.clip(image + 400 * np.exp(-((across / 5) ** 2) / 2), 0, 255).astype(np.uint8)
+    view = BOARD.detect(lit)
+    clear = np.abs(corners[:, 0] - 300 - 0.1 * corners[:, 1]) > 30
+    assert len(view.pixels) >= clear.sum()
+    assert true_places(view, corners).max() < 0.5
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(7, 5), (8, 4), (6, 4), (9, 5), (8, 6)])
+def test_a_board_of_other_size_is_refused(columns, rows):
+    image, _ = board_in(QUADS["upright"])
+    with pytest.raises(TargetError, match=f"no chessboard of {columns} x {rows} inner corners"):
+        ChessboardTarget(columns=columns, rows=rows, square_mm=12.0).detect(image)
+
+
+def test_an_image_gives_the_same_corners_whatever_came_before():
+    images = [board_in(quad)[0] for quad in QUADS.values()]
+    images.append(cv2.GaussianBlur(images[0], (0, 0), 4))
+    first = [BOARD.detect(image).pixels for image in images]
+    cv2.setRNGSeed(7)
+    again = [BOARD.detect(image).pixels for image in reversed(images)]
+    for one, other in zip(first, reversed(again), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_squares_that_are_not_square_have_two_sides():
+    board = parse_target({"kind": "chessboard", "columns": 8, "rows": 5, "square_mm": [12.0, 11.5]})
+    view = board.detect(board_in(QUADS["upright"])[0])
+    np.testing.assert_allclose(view.points_mm[:, :2], view.indices * [12.0, 11.5])
+    assert board.spacing_mm == 11.5
+    assert np.ptp(board.extent_mm, axis=0).tolist() == [84.0, 46.0]
+
+
 def test_sixteen_bit_chessboard():
     texture, first = chess_texture(40)
     homography = texture_pose(texture, QUADS["upright"])

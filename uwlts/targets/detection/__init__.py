@@ -1,5 +1,6 @@
 """Detection of circles, lattices of circles, and corners in images."""
 
+from uwlts.targets.detection.chessboard_lattice import count_seen, find_board, why_no_chessboard, without_doubtful
 from uwlts.targets.detection.corners import corner_quality, eight_bit
 from uwlts.targets.detection.ellipses import Ellipses, find_circles, mark_strength
 from uwlts.targets.detection.lattice import Lattice, detect_lattice, label_lattice
@@ -8,9 +9,13 @@ __all__ = [
     "Ellipses",
     "Lattice",
     "corner_quality",
+    "count_seen",
     "detect_lattice",
     "eight_bit",
+    "find_board",
     "find_circles",
     "label_lattice",
     "mark_strength",
+    "why_no_chessboard",
+    "without_doubtful",
 ]

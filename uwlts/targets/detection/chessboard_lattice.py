@@ -1,0 +1,345 @@
+"""Corners of a chessboard that is seen in whole or in part, by growing a lattice over saddle points of the grey levels."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from uwlts.targets.detection.lattice import STEPS, TOLERANCE, agreeing
+
+_SCALES = (1.0, 0.5, 0.25)
+"""Sizes at which an image is searched: where it is blurred or large, corners are sharper at a smaller one."""
+_SIGMA, _RING_PX, _RING = 1.5, 6.0, 24
+"""Blur before derivatives, radius of the circle about a corner, and the places on it; px of the scaled image."""
+_LEAST_SHARE, _LEAST_IN_PHASE = 0.7, 0.9
+"""Of the variation around a corner that comes twice a turn, as two dark and two bright sectors do; how well that of
+a circle of 0.6 times the radius goes with it."""
+_LEAST_CONTRAST = 2.0  # grey levels around a corner
+_EDGE_SHARE, _EDGE_BESIDE, _EDGE_PLACES = 0.4, 0.12, (0.25, 0.5, 0.75)
+"""An edge between neighbours has this share of their contrast, so far beside it in its lengths, at these places."""
+_MOST_RATIO = 4.0  # between the contrasts of neighbours
+_OPPOSITE = -0.5  # cosine between the phases of neighbours at most; they are opposite but for perspective
+_NEIGHBOURS, _MOST_SEEDS = 24, 40
+_SEED_SINE = 0.3  # of the angle between the two edges that a lattice grows from
+_CLEAR_OF_RIM_PX = _RING_PX + 6.0  # of the scaled image; a corner so far inside would have been found
+_LARGEST_RESIDUAL = 1 / 30  # of a square's side, rms
+_ALTERNATING = 0.9  # share of neighbouring squares of which the one that should be is the darker
+_IN_SQUARE, _UNLIKE = 0.3, 0.6
+"""Where the four squares around a corner are looked at, in their sides; how much opposite ones may differ, over the
+difference between dark and bright."""
+
+
+@dataclass(frozen=True)
+class _Corners:
+    """Candidates: places (N, 2), contrast (N,) and phase (N,) of the sectors around them, and the blurred image."""
+
+    pixels: np.ndarray
+    contrast: np.ndarray
+    phase: np.ndarray
+    grey: np.ndarray
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> "_Corners":
+        grey = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SIGMA)
+        along_x, along_y = (cv2.Scharr(grey, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
+        xx, xy = (cv2.Scharr(along_x, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
+        saddle = np.maximum(xy * xy - xx * cv2.Scharr(along_y, cv2.CV_32F, 0, 1), 0.0)
+        side = 2 * int(np.ceil(2 * _SIGMA)) + 1
+        highest = (saddle == cv2.dilate(saddle, np.ones((side, side)))) & (saddle > 0)
+        rim = int(_RING_PX) + 2
+        highest[:rim], highest[-rim:], highest[:, :rim], highest[:, -rim:] = False, False, False, False
+        pixels = np.argwhere(highest)[:, ::-1].astype(np.float64)
+        outer, inner = _harmonics(grey, pixels, _RING_PX), _harmonics(grey, pixels, 0.6 * _RING_PX)
+        power = np.abs(outer[:, 1:]) ** 2
+        share = power[:, 1] / np.maximum(power.sum(axis=1), 1e-9)
+        in_phase = np.cos(np.angle(outer[:, 2]) - np.angle(inner[:, 2]))
+        contrast = 2.0 * np.abs(outer[:, 2])
+        good = (share > _LEAST_SHARE) & (in_phase > _LEAST_IN_PHASE) & (contrast > _LEAST_CONTRAST)
+        return cls(pixels[good], contrast[good], np.angle(outer[good, 2]), grey)
+
+    def edges(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Least difference (K,) of the grey levels left and right of the ways between corners (K,), with its sign.
+
+        Over the smaller contrast of both ends; zero where the sign changes on the way, or where the corners' sectors
+        are none of neighbours.
+        """
+        at, way = self.pixels[start], self.pixels[end] - self.pixels[start]
+        across = _EDGE_BESIDE * np.stack([-way[:, 1], way[:, 0]], axis=1)
+        places = [at + share * way for share in _EDGE_PLACES]
+        steps = np.stack([_levels(self.grey, each + across) - _levels(self.grey, each - across) for each in places])
+        contrasts = self.contrast[[start, end]]
+        neighbours = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
+        neighbours &= contrasts.max(axis=0) < _MOST_RATIO * contrasts.min(axis=0)
+        neighbours &= np.cos(self.phase[start] - self.phase[end]) < _OPPOSITE
+        return np.where(neighbours, np.sign(steps[0]) * np.abs(steps).min(axis=0) / contrasts.min(axis=0), 0.0)
+
+    def seeds(self, tree: KDTree) -> Iterator[tuple[int, np.ndarray]]:
+        """Corners with an edge to neighbours two ways, and the steps (2, 2) to these; the clearest corners first."""
+        _, near = tree.query(self.pixels, k=min(_NEIGHBOURS + 1, len(self.pixels)))
+        ends = near[:, 1:]
+        starts = np.repeat(np.arange(len(ends)), ends.shape[1])
+        edges = self.edges(starts, ends.ravel()).reshape(ends.shape)
+        sides = [sign * edges > _EDGE_SHARE for sign in (1, -1)]
+        number = sum(side.sum(axis=1).clip(max=2) for side in sides)
+        both = np.flatnonzero(sides[0].any(axis=1) & sides[1].any(axis=1))
+        for corner in sorted(both.tolist(), key=lambda c: (-number[c], -self.contrast[c])):
+            first, second = (self.pixels[ends[corner, side[corner].argmax()]] - self.pixels[corner] for side in sides)
+            turn = first[0] * second[1] - first[1] * second[0]
+            if abs(turn) > _SEED_SINE * np.linalg.norm(first) * np.linalg.norm(second):
+                yield corner, np.stack([first, second] if turn > 0 else [second, first])
+
+    def grown(self, seed: int, steps: np.ndarray, tree: KDTree) -> dict[tuple[int, int], int]:
+        """Places {(i, j): corner} of the piece of lattice around a seed.
+
+        It grows along the edges between neighbours and, where these are at an end, over one corner that is not seen.
+        """
+        places, where, step_of = {(0, 0): seed}, {seed: (0, 0)}, {seed: steps}
+        reach, frontier = 1, [seed]
+        while frontier:
+            asked = []
+            for corner in frontier:
+                step_of[corner] = self._steps_at(where[corner], places, step_of[corner])
+                i, j = where[corner]
+                for di, dj in STEPS:
+                    if (place := (i + reach * di, j + reach * dj)) not in places:
+                        step = (di + dj) * step_of[corner][abs(dj)]
+                        asked.append((corner, place, self.pixels[corner] + reach * step, np.linalg.norm(step)))
+            frontier = []
+            if asked:
+                away, found = tree.query(np.array([at for _, _, at, _ in asked]), k=min(4, len(self.pixels)))
+                away = away / np.array([[length] for *_, length in asked])
+                for ask, rank in sorted(zip(*np.nonzero(away < TOLERANCE), strict=True), key=lambda at: away[at]):
+                    (corner, place, _, _), other = asked[ask], int(found[ask, rank])
+                    if place not in places and other not in where and self._belong(corner, other, reach):
+                        places[place], where[other], step_of[other] = other, place, step_of[corner]
+                        frontier.append(other)
+            if frontier:
+                reach = 1
+            elif reach == 1:
+                reach, frontier = 2, list(where)
+        return places
+
+    def _belong(self, corner: int, other: int, reach: int) -> bool:
+        """Whether two corners may be one or two steps apart."""
+        if reach == 1:
+            return bool(abs(self.edges(np.array([corner]), np.array([other]))[0]) > _EDGE_SHARE)
+        contrasts = self.contrast[[corner, other]]
+        alike = np.cos(self.phase[corner] - self.phase[other]) > -_OPPOSITE
+        return bool(alike and contrasts.max() < _MOST_RATIO * contrasts.min())
+
+    def _steps_at(self, place: tuple[int, int], places: dict[tuple[int, int], int], usual: np.ndarray) -> np.ndarray:
+        """Steps (2, 2) along i and j at a place: half the way between both neighbours, or that to one, or as usual."""
+        (i, j), steps = place, usual.copy()
+        here = self.pixels[places[place]]
+        for axis, (after, before) in enumerate((((i + 1, j), (i - 1, j)), ((i, j + 1), (i, j - 1)))):
+            ways = [self.pixels[places[after]] - here] if after in places else []
+            ways += [here - self.pixels[places[before]]] if before in places else []
+            if ways:
+                steps[axis] = np.mean(ways, axis=0)
+        return steps
+
+
+def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+    """Corners (rows, columns, 2), NaN where one is not seen, of a board in a grey image (H, W); None without one.
+
+    Of a board that is partly outside the image those in view are numbered from the sides that are inside; None where
+    these do not tell the place. To a pixel or so; which of the board's half turns is seen is left open.
+    """
+    best = None
+    for scale in _SCALES:
+        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+        if min(small.shape) < 8 * _RING_PX:
+            break
+        corners = _Corners.of(small)
+        if len(corners.pixels) < 4:
+            continue
+        tree, tried, found = KDTree(corners.pixels), set(), {}
+        for number, (seed, steps) in enumerate(corners.seeds(tree)):
+            if number >= _MOST_SEEDS or len(found) >= columns * rows:
+                break
+            if seed not in tried:
+                piece = corners.grown(seed, steps, tree)
+                tried.update(piece.values())
+                found = max(found, piece, key=len)
+        board = _board(_piece(found, corners), columns, rows, small.shape)
+        if board is not None and (best is None or count_seen(board) > count_seen(best)):
+            best = (board + 0.5) / scale - 0.5
+        if best is not None and count_seen(best) == columns * rows:
+            break
+    return best
+
+
+def count_seen(board: np.ndarray) -> int:
+    """Number of corners that are seen, of a board (rows, columns, 2) with NaN for the others."""
+    return int(np.isfinite(board[..., 0]).sum())
+
+
+def _piece(places: dict[tuple[int, int], int], corners: _Corners) -> np.ndarray:
+    """Corners (J, I, 2) in their places, NaN where there is none, without doubtful ones."""
+    indices, pixels = np.array(list(places)).reshape(-1, 2), corners.pixels[list(places.values())]
+    if len(indices) == 0:
+        return np.empty((0, 0, 2))
+    indices = indices - indices.min(axis=0)
+    piece = np.full((*(indices.max(axis=0) + 1)[::-1], 2), np.nan)
+    piece[indices[:, 1], indices[:, 0]] = pixels
+    return _trimmed(without_doubtful(corners.grey, piece))
+
+
+def without_doubtful(grey: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Corners (J, I, 2) without those that differ from their neighbours or do not lie between four squares."""
+    piece = piece.copy()
+    there = np.argwhere(np.isfinite(piece[..., 0]))
+    doubtful = np.delete(there, agreeing(piece[tuple(there.T)], there), axis=0)
+    piece[tuple(doubtful.T)] = np.nan
+    piece[_square_contrast(grey, piece) == 0] = np.nan
+    return piece
+
+
+def _square_contrast(grey: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Difference (J, I) between the dark and the bright squares around a corner.
+
+    Zero where opposite ones are unlike, as on a board's rim or where a stripe crosses, and where nothing is known.
+    """
+    down, right = (_steps(piece, axis) for axis in (0, 1))
+    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    places = np.stack([piece + _IN_SQUARE * (x * right + y * down) for x, y in signs])
+    known = np.isfinite(places).all(axis=(0, 3))
+    levels = _levels(grey, places[:, known].reshape(-1, 2)).reshape(4, -1)
+    difference = np.abs(levels[0] + levels[2] - levels[1] - levels[3]) / 2
+    unlike = np.maximum(np.abs(levels[0] - levels[2]), np.abs(levels[1] - levels[3]))
+    contrast = np.zeros(piece.shape[:2])
+    contrast[known] = np.where(unlike < _UNLIKE * difference, difference, 0.0)
+    return contrast
+
+
+def _steps(piece: np.ndarray, axis: int) -> np.ndarray:
+    """Steps (J, I, 2) from one corner to the next: the mean of those on both sides, or the one that is there."""
+    ways = np.diff(piece, axis=axis)
+    none = np.full_like(np.take(piece, [0], axis=axis), np.nan)
+    before, after = np.concatenate([none, ways], axis=axis), np.concatenate([ways, none], axis=axis)
+    return np.where(np.isnan(before), after, np.where(np.isnan(after), before, (before + after) / 2))
+
+
+def _trimmed(piece: np.ndarray) -> np.ndarray:
+    """The piece without empty rows and columns around it."""
+    there = np.isfinite(piece[..., 0])
+    if not there.any():
+        return np.empty((0, 0, 2))
+    down, right = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    return piece[down[0] : down[-1] + 1, right[0] : right[-1] + 1]
+
+
+def _board(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:
+    """The board of which a piece (J, I, 2) is seen; None where it is none, or its place is not told."""
+    boards = []
+    for turned in (piece, np.rot90(piece)):
+        board = _within(_without_strays(turned, columns, rows), columns, rows, shape) if turned.size else None
+        if board is not None:
+            boards.append(board)
+    counts = [count_seen(board) for board in boards]
+    # A piece that fits both ways round belongs to no known place, but for a square board seen as a whole.
+    if not boards or (len(boards) == 2 and counts[0] == counts[1] and not (columns == rows and counts[0] == rows**2)):
+        return None
+    return boards[int(np.argmax(counts))]
+
+
+def _without_strays(piece: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    """The part of a piece (J, I, 2) with most corners that is no larger than the board."""
+    there = np.isfinite(piece[..., 0])
+    height, width = (min(size, most) for size, most in zip(there.shape, (rows, columns), strict=True))
+    starts = product(range(there.shape[0] - height + 1), range(there.shape[1] - width + 1))
+    top, left = max(starts, key=lambda at: there[at[0] : at[0] + height, at[1] : at[1] + width].sum())
+    return _trimmed(piece[top : top + height, left : left + width])
+
+
+def _within(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:
+    """The board with a piece (J, I, 2) at its place; None where the image does not tell it."""
+    offsets = []
+    for axis, size in enumerate((rows, columns)):
+        along = np.moveaxis(piece, axis, 0)
+        missing = size - len(along)
+        if len(along) < 2:
+            return None
+        ends = [_ends(along[0], along[1], shape), _ends(along[-1], along[-2], shape)]
+        if missing and ends[0] == ends[1]:
+            return None
+        offsets.append(missing if missing and ends[1] else 0)
+    board = np.full((rows, columns, 2), np.nan)
+    (down, right), (height, width) = offsets, piece.shape[:2]
+    board[down : down + height, right : right + width] = piece
+    return board
+
+
+def _ends(last: np.ndarray, before: np.ndarray, shape: tuple[int, ...]) -> bool:
+    """Whether a board ends with a row of corners (K, 2): most of the next ones would lie well within the image."""
+    beyond = (2.0 * last - before)[np.isfinite(last[:, 0]) & np.isfinite(before[:, 0])]
+    inside = (beyond > _CLEAR_OF_RIM_PX) & (beyond < np.array(shape[::-1]) - 1 - _CLEAR_OF_RIM_PX)
+    return bool(len(beyond) and inside.all(axis=1).mean() > 0.5)
+
+
+def why_no_chessboard(grey: np.ndarray, board: np.ndarray) -> str | None:
+    """What speaks against corners (rows, columns, 2), NaN where unknown, as those of a chessboard in an image (H, W).
+
+    A homography and a cubic for the lens's distortion must leave less than a thirtieth of a square, and neighbouring
+    squares must be dark and bright in turn, and not go on beyond its sides. None where nothing does.
+    """
+    rows, columns = board.shape[:2]
+    there = np.isfinite(board[..., 0])
+    j, i = np.nonzero(there)
+    flat, pixels = np.stack([i, j], axis=1).astype(np.float64), board[there]
+    homography = cv2.findHomography(flat, pixels)[0] if min(len(set(i)), len(set(j))) > 1 and len(flat) > 5 else None
+    if homography is None:
+        return "too few corners are seen"
+    off = pixels - cv2.perspectiveTransform(flat[:, None], homography)[:, 0]
+    x, y = (2.0 * flat / (columns - 1, rows - 1) - 1.0).T
+    terms = np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
+    if len(flat) > 2 * terms.shape[1]:
+        off = off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0]
+    steps = np.concatenate([np.linalg.norm(np.diff(board, axis=axis), axis=2).ravel() for axis in (0, 1)])
+    share = np.sqrt(np.mean(np.sum(off**2, axis=1))) / np.nanmedian(steps)
+    if not share < _LARGEST_RESIDUAL:
+        return f"its corners lie {100 * share:.0f} % of a square off an even grid"
+    centres = (board[:-1, :-1] + board[1:, 1:] + board[:-1, 1:] + board[1:, :-1]) / 4
+    known = np.isfinite(centres[..., 0])
+    levels = np.full(known.shape, np.nan)
+    levels[known] = _levels(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SIGMA), centres[known])
+    sign = np.where(np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2, -1.0, 1.0)
+    changes = [np.diff(levels, axis=axis) * (sign[1:] if axis == 0 else sign[:, 1:]) for axis in (0, 1)]
+    turns = np.concatenate([each[np.isfinite(each)] for each in changes])
+    if len(turns) and (np.sign(turns) == np.sign(np.median(turns))).mean() < _ALTERNATING:
+        return "its squares are not dark and bright in turn"
+    if _goes_on(grey, board):
+        return f"the board has more corners than {columns} x {rows}"
+    return None
+
+
+def _goes_on(grey: np.ndarray, board: np.ndarray) -> bool:
+    """Whether the pattern goes on beyond a side of a board (rows, columns, 2)."""
+    usual = np.median(_square_contrast(grey, board)[np.isfinite(board[..., 0])])
+    for turn in range(4):
+        turned = np.rot90(board, turn)
+        next_row = 2.0 * turned[:1] - turned[1:2]
+        inside = ((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1)).all(axis=2)[0]
+        further = _square_contrast(grey, np.concatenate([next_row, turned]))[0]
+        if inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5:
+            return True
+    return False
+
+
+def _harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
+    """Fourier coefficients (N, K) of the grey levels on circles about pixels (N, 2)."""
+    angle = 2.0 * np.pi / _RING * np.arange(_RING)
+    places = pixels[:, None] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.fft.rfft(_levels(grey, places.reshape(-1, 2)).reshape(-1, _RING), axis=1) / _RING
+
+
+def _levels(grey: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Grey levels (N,) at places (N, 2) between pixels; those of the rim beyond it."""
+    x, y = np.clip(places, 0.0, np.array(grey.shape[::-1]) - 1.0).T
+    column, row = (np.minimum(each.astype(int), size - 2) for each, size in ((x, grey.shape[1]), (y, grey.shape[0])))
+    dx, dy = x - column, y - row
+    upper = grey[row, column] * (1 - dx) + grey[row, column + 1] * dx
+    return upper * (1 - dy) + (grey[row + 1, column] * (1 - dx) + grey[row + 1, column + 1] * dx) * dy
