@@ -101,7 +101,7 @@ def test_a_board_in_free_poses_calibrates_camera_and_sheet(tmp_path: Path, targe
         "lamp": plain,
         "background": plain,
         "stage": {"free": True},
-        "target": target.model_dump(),
+        "target": target.model_dump(exclude_none=True),
     }
     (folder / "import.toml").write_text(tomli_w.dumps(told))
     imported = import_images(folder, tmp_path / "board.h5")

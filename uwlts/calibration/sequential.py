@@ -90,7 +90,6 @@ class CalibrationOptions:
         single interface; the images in air are taken with the window in place, whose effect goes into the distortion
     poses : as for `solve_camera`
     correct_circles : take out the offset between a circle's image and the image of its centre
-    margin_mm : how far the target reaches beyond its outermost points; half their spacing unless given
     medium_index : replaces the index of the medium of the step images
     same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
     sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
@@ -103,7 +102,6 @@ class CalibrationOptions:
     camera: CameraOptions = CameraOptions()
     stripe: StripeOptions = StripeOptions()
     correct_circles: bool = True
-    margin_mm: float | None = None
     medium_index: float | None = None
     same_water: bool = True
     sizes_known: bool = True
@@ -231,9 +229,8 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     )
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
-    margin = found.target.spacing_mm / 2 if options.margin_mm is None else options.margin_mm
     stripe_points = points_on_target(
-        camera.model, found.stripes, camera.target_poses, extent_mm=found.target.extent_mm, margin_mm=margin
+        camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm
     )
     pose = laser_pose(sensor)
     sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)

@@ -51,14 +51,13 @@ def points_on_target(
     stripes: Sequence[np.ndarray],
     target_poses: np.ndarray,
     *,
-    extent_mm: np.ndarray,
-    margin_mm: float = 0.0,
+    plate_mm: np.ndarray,
 ) -> StripePoints:
     """Points where the camera rays of stripe pixels meet the target's plane (thesis, section 4.8).
 
     ``stripes`` (N, 2) are the pixels (u, v) of each image, ``target_poses`` (F, 4, 4) its ``T_camera_target``. The
-    target is known to fill the convex hull of ``extent_mm`` (V, 2), points (x, y) of its plane, widened by
-    ``margin_mm``: a stripe outside lies elsewhere.
+    target is known to fill the convex hull of ``plate_mm`` (V, 2), points (x, y) of its plane: a stripe outside lies
+    elsewhere.
 
     Raises
     ------
@@ -69,7 +68,7 @@ def points_on_target(
     """
     if not np.isfinite(target_poses).all():
         raise CalibrationError("a pose of the target is not finite")
-    hull = ConvexHull(np.asarray(extent_mm, dtype=np.float64)).equations
+    hull = ConvexHull(np.asarray(plate_mm, dtype=np.float64)).equations
     kept, images = [], []
     for index, (pixels, pose) in enumerate(zip(stripes, target_poses, strict=True)):
         rays = directions(camera, pixels)
@@ -78,7 +77,7 @@ def points_on_target(
             length = normal @ origin / (rays @ normal)
         ahead = np.isfinite(length) & (length > 0)
         points = rays[ahead] * length[ahead, None]
-        on_plate = (points - origin) @ pose[:3, :2] @ hull[:, :2].T + hull[:, 2] <= margin_mm
+        on_plate = (points - origin) @ pose[:3, :2] @ hull[:, :2].T + hull[:, 2] <= 0
         kept.append(points[on_plate.all(axis=1)])
         images.append(np.full(len(kept[-1]), index))
     if not any(map(len, stripes)):

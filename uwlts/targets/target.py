@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from uwlts.model.errors import DescriptionError
-from uwlts.model.sensor import Description
+from uwlts.model.sensor import Description, NotNegative
 
 # A target seen in part is found from about a dozen points, or from this share of a larger one: fewer are too likely to
 # miss the marks or markers that number them.
@@ -62,7 +62,14 @@ class Target(Description, ABC):
     A target type is a subclass with a field ``kind``, whose default is its name in files. Each module of
     `uwlts.targets` is imported with the package, so a class in a module of its own there is known without further
     steps; a class elsewhere is known once its module is imported.
+
+    Attributes
+    ----------
+    margin_mm : how far the flat plate reaches beyond the pattern, where a stripe is of use as well: one number, or
+        [left, top, right, bottom]; half the spacing unless given
     """
+
+    margin_mm: NotNegative | tuple[NotNegative, NotNegative, NotNegative, NotNegative] | None = None
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -115,6 +122,13 @@ class Target(Description, ABC):
         """Corners (4, 2), target frame, of the rectangle that is covered by the pattern: its outermost points."""
         points = self.points_mm[:, :2]
         return rectangle_corners(points.min(axis=0), points.max(axis=0))
+
+    @property
+    def plate_mm(self) -> np.ndarray:
+        """Corners (4, 2), target frame, of the rectangle known to be flat: the pattern and the margin around it."""
+        margin = np.broadcast_to(self.spacing_mm / 2 if self.margin_mm is None else self.margin_mm, 4)
+        corners = self.extent_mm
+        return rectangle_corners(corners.min(axis=0) - margin[:2], corners.max(axis=0) + margin[2:])
 
     def findable(self, in_view: np.ndarray) -> bool:
         """Whether `detect` finds the target if these (N,) of its points are in the image, as in `indices`."""

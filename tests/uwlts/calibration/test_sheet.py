@@ -10,6 +10,7 @@ from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Distortion
 from uwlts.targets import parse_target
+from uwlts.targets.target import rectangle_corners
 
 SENSOR = built_sensor()
 LENS = lens_of(SENSOR)
@@ -31,7 +32,8 @@ POSITIONS = np.arange(11) * 25.0
 def stripe_points(*, positions=POSITIONS, noise_px=0.0, rng=None, margin_mm=4.7, extent=EXTENT):
     _, poses, _ = stage_images(SENSOR, positions=positions)
     stripes = stripes_on_target(SENSOR, poses, noise_px=noise_px, rng=rng)
-    return points_on_target(CAMERA, stripes, poses, extent_mm=extent, margin_mm=margin_mm)
+    plate = rectangle_corners(extent.min(axis=0) - margin_mm, extent.max(axis=0) + margin_mm)
+    return points_on_target(CAMERA, stripes, poses, plate_mm=plate)
 
 
 def angle(first, second):
@@ -124,9 +126,9 @@ def test_pixels_and_poses_must_be_finite():
     _, poses, _ = stage_images(SENSOR, positions=POSITIONS)
     stripes = stripes_on_target(SENSOR, poses)
     with pytest.raises(RangeError, match="finite"):
-        points_on_target(CAMERA, [s * np.nan for s in stripes], poses, extent_mm=EXTENT)
+        points_on_target(CAMERA, [s * np.nan for s in stripes], poses, plate_mm=EXTENT)
     with pytest.raises(CalibrationError, match="pose"):
-        points_on_target(CAMERA, stripes, np.full_like(poses, np.nan), extent_mm=EXTENT)
+        points_on_target(CAMERA, stripes, np.full_like(poses, np.nan), plate_mm=EXTENT)
 
 
 def test_the_object_frame_belongs_to_the_sheet():

@@ -13,7 +13,8 @@ from uwlts.model.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.import_ import import_images
-from uwlts.storage.import_.images import SUFFIXES, grey_values, one_channel, read_image
+from uwlts.storage.import_.channels import one_channel
+from uwlts.storage.import_.images import SUFFIXES, grey_values, read_image
 from uwlts.storage.import_.matching import natural_key, read_rows
 from uwlts.stripe import extract_stripe
 
@@ -23,6 +24,7 @@ SENSOR = {
     "name": "small",
     "camera": {"width_px": WIDTH, "height_px": HEIGHT, "stripe_along": "width"},
 }
+SHAPE = (HEIGHT, WIDTH)
 TOLD = {
     "sensor": SENSOR,
     "medium": "water",
@@ -122,6 +124,53 @@ def test_the_chosen_channel_comes_in(tmp_path: Path, channel: str):
     }
     with Capture(tmp_path / "a.h5") as capture:
         assert np.abs(capture.image(0) - wanted[channel].astype(float)).max() <= (0.51 if channel == "grey" else 0)
+
+
+def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Path):
+    rng = np.random.default_rng(4)
+    red, green, blue = (rng.integers(0, 256, SHAPE, dtype=np.uint8) for _ in range(3))
+    images = {f"{n}.png": np.dstack([blue, green, red]) for n in range(2)}
+    told = TOLD | {"laser": "*.png", "lamp": "*.png", "channel": "red - max(green, blue)", "lamp_channel": "green"}
+    folder = folder_of(tmp_path, images, told)
+    found = import_images(folder, tmp_path / "out.h5")
+    assert (found.laser, found.lamp) == (2, 2)
+    with Capture(tmp_path / "out.h5") as capture:
+        assert capture.laser_on.tolist() == [False, True, False, True]
+        # No light of the laser is 256, so that the sign of what is left is kept.
+        wanted = 256 + red.astype(int) - np.maximum(green, blue)
+        np.testing.assert_array_equal(capture.image(1), wanted)
+        np.testing.assert_array_equal(capture.image(0), green)
+        assert capture.header.saturation_dn == 511
+
+
+@pytest.mark.parametrize(
+    ("formula", "value"),
+    [
+        ("red - 0.5*(green + blue)", 200 - 60),
+        ("-blue + 2*green", 100),
+        ("min(red, green, blue)", 20),
+        ("red/green", 2),
+        ("grey - grey", 0),
+        ("3*red", 255),
+    ],
+)
+def test_formulas_of_channels(formula, value):
+    image = np.empty((2, 3, 3), np.uint8)
+    image[:] = 20, 100, 200
+    np.testing.assert_array_equal(one_channel(image, formula, name="a"), np.full((2, 3), value))
+
+
+@pytest.mark.parametrize(
+    "formula", ["red -", "red - infrared", "red.real", "abs(red)", "1 + 2", "max(red)", "__import__('os')", "red ** 2"]
+)
+def test_what_is_no_formula_of_channels_is_refused(tmp_path: Path, formula):
+    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, TOLD | {"channel": formula})
+    refused(folder, tmp_path, DescriptionError, "channel: .*expected red, green, blue")
+
+
+def test_a_grey_image_has_no_difference_of_colours(tmp_path: Path):
+    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, TOLD | {"channel": "red - green"})
+    refused(folder, tmp_path, ImageError, "l1.png has no colours")
 
 
 def test_colour_without_colours_needs_no_channel():

@@ -511,6 +511,15 @@ def test_squares_that_are_not_square_have_two_sides():
     assert np.ptp(board.extent_mm, axis=0).tolist() == [84.0, 46.0]
 
 
+@pytest.mark.parametrize(
+    ("margin", "corners"),
+    [(None, [(-6, -6), (90, 54)]), (20.0, [(-20, -20), (104, 68)]), ([1.0, 2.0, 3.0, 4.0], [(-1, -2), (87, 52)])],
+)
+def test_the_plate_reaches_beyond_its_pattern(margin, corners):
+    plate = parse_target(BOARD.model_dump() | {"margin_mm": margin}).plate_mm
+    np.testing.assert_allclose(plate[[0, 2]], corners)
+
+
 def test_sixteen_bit_chessboard():
     texture, first = chess_texture(40)
     homography = texture_pose(texture, QUADS["upright"])

@@ -474,9 +474,8 @@ def missing_sheet(state: State) -> list[str]:
     if state.solution is None:
         return []
     target, stripes = state.setting.target, [pose.stripe for pose in state.recorded]
-    extent, margin = target.extent_mm, target.spacing_mm / 2
     try:
-        points = points_on_target(state.camera, stripes, state.poses, extent_mm=extent, margin_mm=margin).points_mm
+        points = points_on_target(state.camera, stripes, state.poses, plate_mm=target.plate_mm).points_mm
         fit_sheet(points, nominal_normal=laser_pose(state.setting.sensor).normal)
     except CalibrationError as error:
         shown = sum(len(stripe) > 0 for stripe in stripes)

@@ -154,7 +154,7 @@ def series_start(
         staged = not free and part.approaching is not None
         for placement in part.placements(free=free):
             pose = seen_by.pose(placement)
-            piece = _evidence(part, placement, seen_by, pose, sensor, options.margin_mm, staged=staged)
+            piece = _evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)
             start.local.append(np.append(pose, np.zeros(2 + len(piece.images()) if staged else 0)))
     return start
@@ -199,7 +199,6 @@ def _evidence(
     seen_by: _Viewpoint,
     pose: np.ndarray,
     sensor: Sensor,
-    margin_mm: float | None,
     *,
     staged: bool,
 ) -> TargetEvidence:
@@ -208,12 +207,10 @@ def _evidence(
     image = np.repeat(numbers, [len(found.stripes[number]) for number in numbers])
     stage_mm = np.array([entry.stage_mm for entry in found.images])
     shifts = stage_mm[image] - stage_mm[placement.image[0]] if staged else np.zeros(len(image))
-    extent = found.target.extent_mm
-    margin = found.target.spacing_mm / 2 if margin_mm is None else margin_mm
     at = seen_by.on_target(pixels, pose, shifts[:, None] * placement.direction(np.empty(0)))
-    hull = ConvexHull(extent).equations
+    hull = ConvexHull(found.target.plate_mm).equations
     with np.errstate(invalid="ignore"):
-        on_target = (at[:, :2] @ hull[:, :2].T + hull[:, 2] <= margin).all(axis=1)
+        on_target = (at[:, :2] @ hull[:, :2].T + hull[:, 2] <= 0).all(axis=1)
     evidence = TargetEvidence(
         view=series.view,
         placement=placement,
@@ -223,7 +220,7 @@ def _evidence(
         across=1 if sensor.camera.stripe_along == "width" else 0,
         sources=series.sources(numbers),
         staged=staged,
-        extent_mm=extent,
+        extent_mm=found.target.extent_mm,
     )
     return evidence.with_stripes(np.flatnonzero(on_target))
 

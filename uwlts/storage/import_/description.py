@@ -11,6 +11,7 @@ from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, load_sensor, merged, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.import_.channels import Channel
 from uwlts.storage.import_.intrinsics import read_intrinsics, with_intrinsics
 from uwlts.targets import parse_target
 
@@ -18,7 +19,6 @@ NAME = "import.toml"
 """File of this name in the folder of the images is read unless another is given."""
 
 Patterns = str | tuple[str, ...]
-Channel = Literal["red", "green", "blue", "grey", "max"]
 
 _OF_THE_HEADER = ("name", "sensor", "intrinsics", "medium", "saturation_dn", "target", "artefact")
 _OF_THE_HEADER += ("provenance", "bits", "aligned")
@@ -51,7 +51,7 @@ class ImportDescription(Description):
 
     ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
     description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
-    name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; ``table`` is a CSV
+    name a ``base``. Images that are both ``laser`` and ``lamp`` show the laser on the lit target. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; ``table`` is a CSV
     file with each image's values.
     """
 

@@ -19,7 +19,8 @@ from uwlts.storage.import_.description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.images import bits_of, grey_values, one_channel, read_image, without_background
+from uwlts.storage.import_.channels import is_formula, one_channel
+from uwlts.storage.import_.images import bits_of, grey_values, read_image, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe.recording import BLACK, WHITE, is_black, shown_stripe, white_share
 
@@ -173,14 +174,15 @@ def import_images(
             for number, row in enumerate(frames):
                 laser_on = row.light == "laser"
                 image, _ = reader.image(row.file, laser_on=laser_on)
-                content.look(image, laser_on=laser_on, name=Path(row.file).name)
-                if row.background is not None:
-                    image = without_background(image, reader.background(row.background), zero_dn=zero)
+                content.look(np.maximum(image, 0), laser_on=laser_on, name=Path(row.file).name)
+                if laser_on and zero:
+                    background = None if row.background is None else reader.background(row.background)
+                    image = without_background(image, background, zero_dn=zero)
                 if laser_on:
                     content.look_for_stripe(image)
                 # An unknown exposure or time is stored as 0; the provenance says so.
                 exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s]).tolist()
-                image = image.astype(dtype, copy=False)
+                image = np.maximum(image, 0).astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
             content.refuse_black()
@@ -196,15 +198,15 @@ def import_images(
 
 
 def _zero_dn(given: ImportDescription, frames: list[ImageRow], bits: int) -> int:
-    """Grey value that stands for no difference; 0 where no background is subtracted."""
-    if all(row.background is None for row in frames):
+    """Grey value that stands for no light of the laser; 0 where nothing is subtracted from what the camera gave."""
+    if all(row.background is None for row in frames) and not is_formula(given.channel):
         return 0
     if given.header is None and bits < 16:
         return 2**bits
-    reason = "16 bits leave no room for its sign: give the bits that the camera used, or leave the background out"
+    reason = "16 bits leave no room for its sign: give the bits that the camera used, or leave both out"
     if given.header is not None:
         reason = "the header is that of a finished capture: leave out one of the two"
-    raise DescriptionError(f"a background is to be subtracted, but {reason}")
+    raise DescriptionError(f"a background or another channel is to be subtracted, but {reason}")
 
 
 class _Reader:
@@ -216,7 +218,7 @@ class _Reader:
         self._kept: tuple[str, np.ndarray] | None = None
 
     def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
-        """Grey image (H, W) and its bits; ImageError where it is not like the others."""
+        """Grey image (H, W), signed where the channel is a formula, and its bits; ImageError if not like the others."""
         given, camera = self._given, self._sensor.camera
         raw = read_image(self._folder / name)
         size, wanted = raw.shape[1::-1], (camera.width_px, camera.height_px)
@@ -229,11 +231,11 @@ class _Reader:
         if self._dtype not in (None, raw.dtype):
             raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self._dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
-        grey = one_channel(raw, channel, name=name)
         # A header has no bits, and grey values that a capture held fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
         self._dtype = raw.dtype
-        return grey_values(grey, bits=bits, aligned=given.aligned, name=name), bits
+        values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
+        return one_channel(values, channel, name=name), bits
 
     def background(self, name: str) -> np.ndarray:
         """Grey image (H, W) without laser, in the laser's channel."""
@@ -248,7 +250,8 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, 
     remarks |= {"bits": bits, "stage": stage_remark(given)}
     remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
     if zero_dn:
-        remarks["background"] = f"subtracted from the laser images, {zero_dn} added"
+        subtracted = "background subtracted from" if any(row.background for row in frames) else "channels mixed in"
+        remarks["laser_images"] = f"{subtracted} the laser images, {zero_dn} added"
     for name, values in (("exposure", [row.exposure_ms for row in frames]), ("time", [row.time_s for row in frames])):
         if any(map(math.isnan, values)):
             remarks[name] = "not known of all images, stored as 0 where it is missing"

@@ -48,8 +48,6 @@ SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"BM": "BMP", b"\xff\xd8\xff": "JPEG"}
 _SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")
-# OpenCV's order of colours.
-_CHANNELS = {"blue": 0, "green": 1, "red": 2}
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -89,25 +87,6 @@ def read_image(path: Path) -> np.ndarray:
     return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
 
 
-def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
-    """Grey image (H, W): red, green or blue of a colour image, its luminance (grey), or the brightest (max).
-
-    ImageError for a colour image where no channel is chosen.
-    """
-    if image.ndim == 2:
-        return image
-    if channel is None:
-        if (image[:, :, :1] == image[:, :, 1:]).all():
-            return np.ascontiguousarray(image[:, :, 0])
-        raise ImageError(
-            f"{name} is a colour image: choose the channel of the laser's colour, channel = 'red', 'green', 'blue', "
-            "or 'grey' or 'max'"
-        )
-    if channel == "grey":
-        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return image.max(axis=2) if channel == "max" else cv2.extractChannel(image, _CHANNELS[channel])
-
-
 def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
     """Bits of the grey values: 8 for a file of 8 bit, else as given; ImageError where that is contradictory or open."""
     if image.dtype == np.uint8:
@@ -120,7 +99,7 @@ def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:
 
 
 def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.ndarray:
-    """Grey values from 0 to 2^bits - 1 of an image (H, W) whose camera put them into the lower or upper bits.
+    """Values from 0 to 2^bits - 1 of an image whose camera put them into the lower or upper bits.
 
     ImageError where there are larger values, or bits below the upper ones are used.
     """
@@ -140,6 +119,7 @@ def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.
     return image
 
 
-def without_background(image: np.ndarray, background: np.ndarray, *, zero_dn: int) -> np.ndarray:
-    """Image minus background (H, W) as uint16, without loss: ``zero_dn`` stands for no difference."""
-    return (image.astype(np.int32) - background + zero_dn).astype(np.uint16)
+def without_background(image: np.ndarray, background: np.ndarray | None, *, zero_dn: int) -> np.ndarray:
+    """Image, less the background if there is one (H, W), as uint16: ``zero_dn`` stands for no light of the laser."""
+    difference = image.astype(np.int32) - (0 if background is None else background)
+    return np.clip(difference + zero_dn, 0, np.iinfo(np.uint16).max).astype(np.uint16)

@@ -19,7 +19,7 @@ POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in ran
 
 _NUMBERS = ("stage_mm", "exposure_ms", "time_s")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
-_LIGHTS = ("laser", "lamp", "ignore")
+_LIGHTS = ("laser", "lamp", "both", "ignore")
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,18 +134,20 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
                 "the table has a column light, and there are patterns laser or lamp: give one of them"
             )
         dark = [row.file for row in known if row.light is None]
-        _refuse_any(dark, "the table does not give the light of ", ": laser, lamp or ignore")
-        laser, lamp, ignored = ([row for row in known if row.light == light] for light in _LIGHTS)
+        _refuse_any(dark, "the table does not give the light of ", ": laser, lamp, both or ignore")
+        laser, lamp = ([row for row in known if row.light in (light, "both")] for light in ("laser", "lamp"))
+        ignored = [row for row in known if row.light == "ignore"]
     else:
         ignored = [row for row in known if _matches(row.file, given.ignore)]
         used = [row for row in known if not _matches(row.file, given.ignore)]
         laser, lamp = ([row for row in used if _matches(row.file, light)] for light in (given.laser, given.lamp))
-    _refuse_any(
-        sorted({row.file for row in laser} & {row.file for row in lamp}),
-        "",
-        " would be both laser and lamp image: narrow the patterns; where the laser is drawn on the lit target, it is a "
-        "laser image, and the image without laser is lamp and background",
-    )
+        lit, under_lamp = {row.file for row in laser}, {row.file for row in lamp}
+        _refuse_any(
+            [] if lit == under_lamp else sorted(lit & under_lamp),
+            "",
+            " would be both laser and lamp image, others only one: narrow the patterns, give both lights the same "
+            "patterns if all images show the laser on the lit target, or name both in a table's column light",
+        )
     if not laser and not lamp:
         raise DescriptionError(
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "

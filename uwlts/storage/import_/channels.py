@@ -1,0 +1,94 @@
+"""Grey images from colour images: one channel, or a formula of channels that leaves the laser's light."""
+
+import ast
+from collections.abc import Callable
+from functools import reduce
+from typing import Annotated
+
+import cv2
+import numpy as np
+from pydantic import AfterValidator
+
+from uwlts.model.errors import ImageError
+
+# OpenCV's order of colours.
+_COLOURS = {"blue": 0, "green": 1, "red": 2}
+_NAMES = (*_COLOURS, "grey")
+_OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
+_FUNCTIONS = {"max": np.maximum, "min": np.minimum}
+_EXPECTED = (
+    "expected red, green, blue, grey, max (the brightest), or a formula of them with + - * /, numbers, max(...) and "
+    "min(...), such as 'red - max(green, blue)'"
+)
+
+
+def _checked(text: str) -> str:
+    if text != "max":
+        _evaluated(text, dict.fromkeys(_NAMES, np.ones(1, np.float32)))
+    return text
+
+
+Channel = Annotated[str, AfterValidator(_checked)]
+"""Name or formula of a channel."""
+
+
+def is_formula(channel: str | None) -> bool:
+    """Whether a channel is calculated from others, so that its values may be below zero and none of the camera's."""
+    return channel is not None and channel not in (*_NAMES, "max")
+
+
+def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
+    """Grey image (H, W): a colour of a colour image, its luminance (grey), the brightest (max), or what a formula gives.
+
+    Of the image's type, or int32 for a formula. ImageError for a colour image where no channel is chosen, and for a
+    formula of colours where the image has none.
+    """
+    if image.ndim == 2:
+        if is_formula(channel):
+            raise ImageError(f"{name} has no colours, so that {channel!r} means nothing: leave the channel out")
+        return image
+    if channel is None:
+        if (image[:, :, :1] == image[:, :, 1:]).all():
+            return np.ascontiguousarray(image[:, :, 0])
+        raise ImageError(
+            f"{name} is a colour image: choose the channel of the laser's colour, channel = 'red', 'green', 'blue', "
+            "'grey' or 'max', or a formula such as 'red - max(green, blue)'"
+        )
+    if channel in _COLOURS:
+        return cv2.extractChannel(image, _COLOURS[channel])
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if channel == "grey":
+        return grey
+    if channel == "max":
+        return image.max(axis=2)
+    values = {colour: image[:, :, place].astype(np.float32) for colour, place in _COLOURS.items()}
+    most = np.iinfo(image.dtype).max
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mixed = _evaluated(channel, values | {"grey": grey.astype(np.float32)})
+    return np.rint(np.clip(np.nan_to_num(mixed), -most, most)).astype(np.int32)
+
+
+def _evaluated(text: str, values: dict[str, np.ndarray]) -> np.ndarray:
+    """What a formula gives; ValueError where it is none of the channels."""
+
+    def value(node: ast.AST) -> np.ndarray | float:
+        match node:
+            case ast.Name(id=name) if name in values:
+                return values[name]
+            case ast.Constant(value=int() | float() as number):
+                return float(number)
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return -value(operand)
+            case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _OPERATORS:
+                return _OPERATORS[type(operator)](value(left), value(right))
+            case ast.Call(func=ast.Name(id=name), args=[_, _, *_] as parts, keywords=[]) if name in _FUNCTIONS:
+                return reduce(_FUNCTIONS[name], map(value, parts))
+        raise ValueError(_EXPECTED)
+
+    try:
+        found = value(ast.parse(text.strip(), mode="eval").body)
+    except (SyntaxError, RecursionError, MemoryError) as error:
+        raise ValueError(_EXPECTED) from error
+    if not isinstance(found, np.ndarray):
+        raise ValueError(_EXPECTED)
+    return found
