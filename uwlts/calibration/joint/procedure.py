@@ -9,7 +9,7 @@ from pydantic import JsonValue
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.joint.consistency import Findings, deviations, findings, understated
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.evidence import BENDS, SHIFT, STRETCH
+from uwlts.calibration.joint.evidence import BENDS, STRETCH
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
 from uwlts.calibration.joint.parameters import Parameters
@@ -67,7 +67,7 @@ class JointProblem:
             return result, findings(result, self.evidence, sensor=self.sensor)
         off = {each.key: abs(each.alone - each.known) for each in of_target}
         priors = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
-        for alike in (BENDS, STRETCH, (SHIFT,)):
+        for alike in (BENDS, STRETCH):
             if any(each.key in alike for each in form):
                 together = sum(off.get(key, 0.0) for key in alike)
                 priors |= {key: replace(priors[key], std=max(priors[key].std, together)) for key in alike}
