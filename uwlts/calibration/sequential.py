@@ -229,9 +229,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     )
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
-    stripe_points = points_on_target(
-        camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm
-    )
+    stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
     pose = laser_pose(sensor)
     sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
     warnings = [*evidence.warnings, *_turn_warnings(camera, sheet, evidence)]

@@ -47,11 +47,7 @@ class SheetSolution:
 
 
 def points_on_target(
-    camera: CameraModel,
-    stripes: Sequence[np.ndarray],
-    target_poses: np.ndarray,
-    *,
-    plate_mm: np.ndarray,
+    camera: CameraModel, stripes: Sequence[np.ndarray], target_poses: np.ndarray, *, plate_mm: np.ndarray
 ) -> StripePoints:
     """Points where the camera rays of stripe pixels meet the target's plane (thesis, section 4.8).
 

@@ -68,7 +68,9 @@ class ChessboardTarget(Target):
             reason = why_no_chessboard(grey, grid)
             if reason is not None:
                 reasons.append(f"of what OpenCV or the own search took for it ({name}), {reason}")
-            elif self.findable(np.isfinite(grid[..., 0]).ravel()) and (part is None or count_seen(grid) > count_seen(part)):
+            elif self.findable(np.isfinite(grid[..., 0]).ravel()) and (
+                part is None or count_seen(grid) > count_seen(part)
+            ):
                 part = grid
             if part is not None and count_seen(part) > _NEARLY_WHOLE * self.columns * self.rows:
                 break

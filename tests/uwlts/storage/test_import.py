@@ -147,7 +147,7 @@ def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Pat
     ("formula", "value"),
     [
         ("red - 0.5*(green + blue)", 200 - 60),
-        ("-blue + 2*green", 100),
+        ("-blue + 2*green", 180),
         ("min(red, green, blue)", 20),
         ("red/green", 2),
         ("grey - grey", 0),

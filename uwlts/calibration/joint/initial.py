@@ -194,13 +194,7 @@ class _Viewpoint:
 
 
 def _evidence(
-    series: Series,
-    placement: Placement,
-    seen_by: _Viewpoint,
-    pose: np.ndarray,
-    sensor: Sensor,
-    *,
-    staged: bool,
+    series: Series, placement: Placement, seen_by: _Viewpoint, pose: np.ndarray, sensor: Sensor, *, staged: bool
 ) -> TargetEvidence:
     found, numbers = series.found, np.unique(placement.image)
     pixels = np.vstack([found.stripes[number] for number in numbers])

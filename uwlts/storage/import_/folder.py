@@ -153,7 +153,7 @@ def import_images(
     matched = match(folder, given, rows)
     frames = planned_frames(given, matched, in_table=rows is not None)
     reader = _Reader(given, sensor, folder)
-    first, bits = reader.image(frames[0].file, laser_on=frames[0].light == "laser")
+    _, bits = reader.image(frames[0].file, laser_on=frames[0].light == "laser")
     zero = _zero_dn(given, frames, bits)
     header = capture_header(
         given,
@@ -164,17 +164,18 @@ def import_images(
         remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
     )
     saturation = header.saturation_dn - zero
-    if saturation > np.iinfo(first.dtype).max:
-        raise DescriptionError(f"saturation_dn is {saturation}; images of {first.dtype} have no such value")
+    if saturation > np.iinfo(reader.dtype).max:
+        raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
     content = _Content(header.sensor.camera.stripe_along, saturation, header.target is not None)
-    dtype = np.dtype(np.uint16) if zero else first.dtype
+    dtype = np.dtype(np.uint16) if zero else reader.dtype
     writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
     try:
         with writer:
             for number, row in enumerate(frames):
                 laser_on = row.light == "laser"
                 image, _ = reader.image(row.file, laser_on=laser_on)
-                content.look(np.maximum(image, 0), laser_on=laser_on, name=Path(row.file).name)
+                seen = np.maximum(image, 0).astype(reader.dtype, copy=False)
+                content.look(seen, laser_on=laser_on, name=Path(row.file).name)
                 if laser_on and zero:
                     background = None if row.background is None else reader.background(row.background)
                     image = without_background(image, background, zero_dn=zero)
@@ -214,7 +215,7 @@ class _Reader:
 
     def __init__(self, given: ImportDescription, sensor: Sensor, folder: Path):
         self._given, self._sensor, self._folder = given, sensor, folder
-        self._dtype: np.dtype | None = None
+        self.dtype: np.dtype = np.dtype(np.void)  # until the first image is read
         self._kept: tuple[str, np.ndarray] | None = None
 
     def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
@@ -223,17 +224,17 @@ class _Reader:
         raw = read_image(self._folder / name)
         size, wanted = raw.shape[1::-1], (camera.width_px, camera.height_px)
         if size != wanted:
-            before = "" if self._dtype is None else " and the images before it"
+            before = "" if self.dtype == np.void else " and the images before it"
             raise ImageError(
                 f"{name} has {size[0]} x {size[1]} pixels; expected {wanted[0]} x {wanted[1]} as the sensor "
-                f"'{self._sensor.name}' has{before}: {_SIZE_ADVICE[self._dtype is None, size == wanted[::-1]]}"
+                f"'{self._sensor.name}' has{before}: {_SIZE_ADVICE[self.dtype == np.void, size == wanted[::-1]]}"
             )
-        if self._dtype not in (None, raw.dtype):
-            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self._dtype}")
+        if self.dtype not in (np.void, raw.dtype):
+            raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
         # A header has no bits, and grey values that a capture held fit in it.
         bits = 8 * raw.itemsize if given.header is not None else bits_of(raw, given.bits, name=name)
-        self._dtype = raw.dtype
+        self.dtype = raw.dtype
         values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
         return one_channel(values, channel, name=name), bits
 
@@ -250,8 +251,9 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, 
     remarks |= {"bits": bits, "stage": stage_remark(given)}
     remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
     if zero_dn:
-        subtracted = "background subtracted from" if any(row.background for row in frames) else "channels mixed in"
-        remarks["laser_images"] = f"{subtracted} the laser images, {zero_dn} added"
+        background = any(row.background is not None for row in frames)
+        name, done = ("background", "subtracted from the laser images, ") if background else ("laser_images", "")
+        remarks[name] = f"{done}{zero_dn} added"
     for name, values in (("exposure", [row.exposure_ms for row in frames]), ("time", [row.time_s for row in frames])):
         if any(map(math.isnan, values)):
             remarks[name] = "not known of all images, stored as 0 where it is missing"
