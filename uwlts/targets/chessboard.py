@@ -78,8 +78,8 @@ class ChessboardTarget(Target):
             raise TargetError(
                 f"found no chessboard of {self.columns} x {self.rows} inner corners"
                 + "".join(f"; {reason}" for reason in reasons)
-                + "; columns and rows count inner corners, not squares, and of a board that is partly in view two sides "
-                "that meet must be"
+                + "; columns and rows count inner corners, not squares; of a board that is partly in view, two sides "
+                "that meet must be in view"
             )
         pixels = _from_top_left(grey, part).reshape(-1, 2)
         seen = np.isfinite(pixels[:, 0])

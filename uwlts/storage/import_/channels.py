@@ -1,7 +1,6 @@
 """Grey images from colour images: one channel, or a formula of channels that leaves the laser's light."""
 
 import ast
-from collections.abc import Callable
 from functools import reduce
 from typing import Annotated
 
@@ -38,7 +37,7 @@ def is_formula(channel: str | None) -> bool:
 
 
 def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndarray:
-    """Grey image (H, W): a colour of a colour image, its luminance (grey), the brightest (max), or what a formula gives.
+    """Grey image (H, W): a colour of an image, its luminance (grey), the brightest (max), or what a formula gives.
 
     Of the image's type, or int32 for a formula. ImageError for a colour image where no channel is chosen, and for a
     formula of colours where the image has none.

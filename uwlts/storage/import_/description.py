@@ -51,8 +51,8 @@ class ImportDescription(Description):
 
     ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
     description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
-    name a ``base``. Images that are both ``laser`` and ``lamp`` show the laser on the lit target. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; ``table`` is a CSV
-    file with each image's values.
+    name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are both
+    ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with each image's values.
     """
 
     header: str | None = None

@@ -1,4 +1,4 @@
-"""Corners of a chessboard that is seen in whole or in part, by growing a lattice over saddle points of the grey levels."""
+"""Corners of a chessboard that is seen in whole or in part: a lattice grown over saddle points of the grey levels."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -78,12 +78,11 @@ class _Corners:
 
     def seeds(self, tree: KDTree) -> Iterator[tuple[int, np.ndarray]]:
         """Corners with an edge to neighbours two ways, and the steps (2, 2) to these; the clearest corners first."""
-        _, near = tree.query(self.pixels, k=min(_NEIGHBOURS + 1, len(self.pixels)))
-        ends = near[:, 1:]
+        ends = np.asarray(tree.query(self.pixels, k=min(_NEIGHBOURS + 1, len(self.pixels)))[1])[:, 1:]
         starts = np.repeat(np.arange(len(ends)), ends.shape[1])
         edges = self.edges(starts, ends.ravel()).reshape(ends.shape)
         sides = [sign * edges > _EDGE_SHARE for sign in (1, -1)]
-        number = sum(side.sum(axis=1).clip(max=2) for side in sides)
+        number = np.sum([side.sum(axis=1).clip(max=2) for side in sides], axis=0)
         both = np.flatnonzero(sides[0].any(axis=1) & sides[1].any(axis=1))
         for corner in sorted(both.tolist(), key=lambda c: (-number[c], -self.contrast[c])):
             first, second = (self.pixels[ends[corner, side[corner].argmax()]] - self.pixels[corner] for side in sides)
@@ -109,8 +108,8 @@ class _Corners:
                         asked.append((corner, place, self.pixels[corner] + reach * step, np.linalg.norm(step)))
             frontier = []
             if asked:
-                away, found = tree.query(np.array([at for _, _, at, _ in asked]), k=min(4, len(self.pixels)))
-                away = away / np.array([[length] for *_, length in asked])
+                nearest = tree.query(np.array([at for _, _, at, _ in asked]), k=min(4, len(self.pixels)))
+                away, found = np.asarray(nearest[0]) / [[length] for *_, length in asked], np.asarray(nearest[1])
                 for ask, rank in sorted(zip(*np.nonzero(away < TOLERANCE), strict=True), key=lambda at: away[at]):
                     (corner, place, _, _), other = asked[ask], int(found[ask, rank])
                     if place not in places and other not in where and self._belong(corner, other, reach):
@@ -322,7 +321,7 @@ def _goes_on(grey: np.ndarray, board: np.ndarray) -> bool:
     for turn in range(4):
         turned = np.rot90(board, turn)
         next_row = 2.0 * turned[:1] - turned[1:2]
-        inside = ((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1)).all(axis=2)[0]
+        inside = np.all((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1), axis=2)[0]
         further = _square_contrast(grey, np.concatenate([next_row, turned]))[0]
         if inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5:
             return True
