@@ -39,7 +39,9 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = str(ROOT / "tests" / "other_noise")
         os.environ |= {"TEST_NOISE": str(number), "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
         sys.path.insert(0, folder)
-        sys.modules.pop("sitecustomize", None)
+        # A worker process has imported it at its start.
+        if not hasattr(sys.modules.get("sitecustomize"), "change_mitsuba"):
+            sys.modules.pop("sitecustomize", None)
         import sitecustomize
 
         sitecustomize.change_mitsuba()

@@ -211,7 +211,8 @@ def test_noise_is_averaged_over_the_lines(sensor):
     expected = rms * np.sqrt(7 * (MOST_SMOOTH + 1) / count)
     errors = errors_between(noisy.calibration, sensor)[:, 1]
     assert 0.3 * expected < np.std(errors) < 3 * expected
-    assert noisy.calibration.residuals["depth"]["line_excess"] == pytest.approx(1.0, abs=0.1)
+    # 0.99 on average over forty draws, with a standard deviation of 0.043.
+    assert noisy.calibration.residuals["depth"]["line_excess"] == pytest.approx(0.99, abs=0.22)
     assert noisy.warnings == []
 
 

@@ -121,7 +121,9 @@ def test_air_shows_nothing_of_the_distance(window):
 def test_a_step_lost_in_noise_is_refused():
     rng = np.random.default_rng(6)
     low = [step_profile(10.0, height_mm=2.0, count=120)]
-    with pytest.raises((CalibrationError, EvaluationError), match="hardly depends|no two parallel|treads found"):
+    with pytest.raises(
+        (CalibrationError, EvaluationError), match="hardly depends|no two parallel|no two step faces|treads found"
+    ):
         solve_window(AIR, PLATE, steps(PLATE, low, noise_px=1.0, rng=rng, height_mm=2.0))
 
 
