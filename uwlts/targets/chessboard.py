@@ -12,7 +12,6 @@ from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 
 _SECTOR_FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
 _QUAD_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-_REFINEMENT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
 
 class ChessboardTarget(Target):
@@ -56,7 +55,7 @@ class ChessboardTarget(Target):
 
     def detect(self, image: np.ndarray) -> TargetView:
         # Imported late: a description alone does not need the detector.
-        from uwlts.targets.detection import corner_quality, count_seen, eight_bit, why_no_chessboard
+        from uwlts.targets.detection import corner_quality, count_seen, eight_bit, refined, why_no_chessboard
 
         grey = eight_bit(image)
         part, reasons = None, []
@@ -64,7 +63,7 @@ class ChessboardTarget(Target):
             grid = find(grey, self.columns, self.rows)
             if grid is None:
                 continue
-            grid = _refined(image, grid)
+            grid = refined(image, grid)
             reason = why_no_chessboard(grey, grid)
             if reason is not None:
                 reasons.append(f"of what OpenCV or the own search took for it ({name}), {reason}")
@@ -109,23 +108,6 @@ def _by_squares(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
 _DETECTORS = {"lattice": _by_lattice, "sectors": _by_sectors, "squares": _by_squares}
 """Ways to the corners (rows, columns, 2), NaN where one is not seen, or None."""
 _NEARLY_WHOLE = 0.8  # of the corners; where fewer are seen the next way is tried
-
-
-def _refined(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Corners moved to the saddles of the grey levels, in a window that stays within the squares around them.
-
-    Those that leave the window, or do not lie between four squares, are NaN.
-    """
-    from uwlts.targets.detection import without_doubtful
-
-    sides = [np.nanmin(np.linalg.norm(np.diff(grid, axis=axis), axis=2)) for axis in (0, 1)]
-    half = int(np.clip(min(sides) * 0.4, 2, 11))
-    seen, refined = np.isfinite(grid[..., 0]), grid.copy()
-    start, grey = grid[seen].astype(np.float32).reshape(-1, 1, 2), image.astype(np.float32)
-    moved = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), _REFINEMENT)
-    moved[np.abs(moved - start).max(axis=2) > half] = np.nan
-    refined[seen] = moved[:, 0]
-    return without_doubtful(cv2.GaussianBlur(grey, (0, 0), 1.0), refined)
 
 
 def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:

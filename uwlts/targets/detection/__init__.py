@@ -1,6 +1,7 @@
 """Detection of circles, lattices of circles, and corners in images."""
 
-from uwlts.targets.detection.chessboard_lattice import count_seen, find_board, why_no_chessboard, without_doubtful
+from uwlts.targets.detection.chessboard_grid import count_seen, refined, why_no_chessboard
+from uwlts.targets.detection.chessboard_lattice import find_board
 from uwlts.targets.detection.corners import corner_quality, eight_bit
 from uwlts.targets.detection.ellipses import Ellipses, find_circles, mark_strength
 from uwlts.targets.detection.lattice import Lattice, detect_lattice, label_lattice
@@ -16,6 +17,6 @@ __all__ = [
     "find_circles",
     "label_lattice",
     "mark_strength",
+    "refined",
     "why_no_chessboard",
-    "without_doubtful",
 ]

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.targets.detection.lattice import STEPS, TOLERANCE, agreeing
+from uwlts.targets.detection.chessboard_grid import count_seen, levels_at, without_doubtful
+from uwlts.targets.detection.lattice import STEPS, TOLERANCE
 
 _SCALES = (1.0, 0.5, 0.25)
 """Sizes at which an image is searched: where it is blurred or large, corners are sharper at a smaller one."""
@@ -25,11 +26,6 @@ _OPPOSITE = -0.5  # cosine between the phases of neighbours at most; they are op
 _NEIGHBOURS, _MOST_SEEDS = 24, 40
 _SEED_SINE = 0.3  # of the angle between the two edges that a lattice grows from
 _CLEAR_OF_RIM_PX = _RING_PX + 6.0  # of the scaled image; a corner so far inside would have been found
-_LARGEST_RESIDUAL = 1 / 30  # of a square's side, rms
-_ALTERNATING = 0.9  # share of neighbouring squares of which the one that should be is the darker
-_IN_SQUARE, _UNLIKE = 0.3, 0.6
-"""Where the four squares around a corner are looked at, in their sides; how much opposite ones may differ, over the
-difference between dark and bright."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,7 @@ class _Corners:
         at, way = self.pixels[start], self.pixels[end] - self.pixels[start]
         across = _EDGE_BESIDE * np.stack([-way[:, 1], way[:, 0]], axis=1)
         places = [at + share * way for share in _EDGE_PLACES]
-        steps = np.stack([_levels(self.grey, each + across) - _levels(self.grey, each - across) for each in places])
+        steps = np.stack([levels_at(self.grey, each + across) - levels_at(self.grey, each - across) for each in places])
         contrasts = self.contrast[[start, end]]
         neighbours = (np.sign(steps) == np.sign(steps[0])).all(axis=0)
         neighbours &= contrasts.max(axis=0) < _MOST_RATIO * contrasts.min(axis=0)
@@ -171,11 +167,6 @@ def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
     return best
 
 
-def count_seen(board: np.ndarray) -> int:
-    """Number of corners that are seen, of a board (rows, columns, 2) with NaN for the others."""
-    return int(np.isfinite(board[..., 0]).sum())
-
-
 def _piece(places: dict[tuple[int, int], int], corners: _Corners) -> np.ndarray:
     """Corners (J, I, 2) in their places, NaN where there is none, without doubtful ones."""
     indices, pixels = np.array(list(places)).reshape(-1, 2), corners.pixels[list(places.values())]
@@ -185,41 +176,6 @@ def _piece(places: dict[tuple[int, int], int], corners: _Corners) -> np.ndarray:
     piece = np.full((*(indices.max(axis=0) + 1)[::-1], 2), np.nan)
     piece[indices[:, 1], indices[:, 0]] = pixels
     return _trimmed(without_doubtful(corners.grey, piece))
-
-
-def without_doubtful(grey: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Corners (J, I, 2) without those that differ from their neighbours or do not lie between four squares."""
-    piece = piece.copy()
-    there = np.argwhere(np.isfinite(piece[..., 0]))
-    doubtful = np.delete(there, agreeing(piece[tuple(there.T)], there), axis=0)
-    piece[tuple(doubtful.T)] = np.nan
-    piece[_square_contrast(grey, piece) == 0] = np.nan
-    return piece
-
-
-def _square_contrast(grey: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Difference (J, I) between the dark and the bright squares around a corner.
-
-    Zero where opposite ones are unlike, as on a board's rim or where a stripe crosses, and where nothing is known.
-    """
-    down, right = (_steps(piece, axis) for axis in (0, 1))
-    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    places = np.stack([piece + _IN_SQUARE * (x * right + y * down) for x, y in signs])
-    known = np.isfinite(places).all(axis=(0, 3))
-    levels = _levels(grey, places[:, known].reshape(-1, 2)).reshape(4, -1)
-    difference = np.abs(levels[0] + levels[2] - levels[1] - levels[3]) / 2
-    unlike = np.maximum(np.abs(levels[0] - levels[2]), np.abs(levels[1] - levels[3]))
-    contrast = np.zeros(piece.shape[:2])
-    contrast[known] = np.where(unlike < _UNLIKE * difference, difference, 0.0)
-    return contrast
-
-
-def _steps(piece: np.ndarray, axis: int) -> np.ndarray:
-    """Steps (J, I, 2) from one corner to the next: the mean of those on both sides, or the one that is there."""
-    ways = np.diff(piece, axis=axis)
-    none = np.full_like(np.take(piece, [0], axis=axis), np.nan)
-    before, after = np.concatenate([none, ways], axis=axis), np.concatenate([ways, none], axis=axis)
-    return np.where(np.isnan(before), after, np.where(np.isnan(after), before, (before + after) / 2))
 
 
 def _trimmed(piece: np.ndarray) -> np.ndarray:
@@ -279,66 +235,8 @@ def _ends(last: np.ndarray, before: np.ndarray, shape: tuple[int, ...]) -> bool:
     return bool(len(beyond) and inside.all(axis=1).mean() > 0.5)
 
 
-def why_no_chessboard(grey: np.ndarray, board: np.ndarray) -> str | None:
-    """What speaks against corners (rows, columns, 2), NaN where unknown, as those of a chessboard in an image (H, W).
-
-    A homography and a cubic for the lens's distortion must leave less than a thirtieth of a square, and neighbouring
-    squares must be dark and bright in turn, and not go on beyond its sides. None where nothing does.
-    """
-    rows, columns = board.shape[:2]
-    there = np.isfinite(board[..., 0])
-    j, i = np.nonzero(there)
-    flat, pixels = np.stack([i, j], axis=1).astype(np.float64), board[there]
-    homography = cv2.findHomography(flat, pixels)[0] if min(len(set(i)), len(set(j))) > 1 and len(flat) > 5 else None
-    if homography is None:
-        return "too few corners are seen"
-    off = pixels - cv2.perspectiveTransform(flat[:, None], homography)[:, 0]
-    x, y = (2.0 * flat / (columns - 1, rows - 1) - 1.0).T
-    terms = np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
-    if len(flat) > 2 * terms.shape[1]:
-        off = off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0]
-    steps = np.concatenate([np.linalg.norm(np.diff(board, axis=axis), axis=2).ravel() for axis in (0, 1)])
-    share = np.sqrt(np.mean(np.sum(off**2, axis=1))) / np.nanmedian(steps)
-    if not share < _LARGEST_RESIDUAL:
-        return f"its corners lie {100 * share:.0f} % of a square off an even grid"
-    centres = (board[:-1, :-1] + board[1:, 1:] + board[:-1, 1:] + board[1:, :-1]) / 4
-    known = np.isfinite(centres[..., 0])
-    levels = np.full(known.shape, np.nan)
-    levels[known] = _levels(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SIGMA), centres[known])
-    sign = np.where(np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2, -1.0, 1.0)
-    changes = [np.diff(levels, axis=axis) * (sign[1:] if axis == 0 else sign[:, 1:]) for axis in (0, 1)]
-    turns = np.concatenate([each[np.isfinite(each)] for each in changes])
-    if len(turns) and (np.sign(turns) == np.sign(np.median(turns))).mean() < _ALTERNATING:
-        return "its squares are not dark and bright in turn"
-    if _goes_on(grey, board):
-        return f"the board has more corners than {columns} x {rows}"
-    return None
-
-
-def _goes_on(grey: np.ndarray, board: np.ndarray) -> bool:
-    """Whether the pattern goes on beyond a side of a board (rows, columns, 2)."""
-    usual = np.median(_square_contrast(grey, board)[np.isfinite(board[..., 0])])
-    for turn in range(4):
-        turned = np.rot90(board, turn)
-        next_row = 2.0 * turned[:1] - turned[1:2]
-        inside = np.all((next_row > 0) & (next_row < np.array(grey.shape[::-1]) - 1), axis=2)[0]
-        further = _square_contrast(grey, np.concatenate([next_row, turned]))[0]
-        if inside.sum() > 2 and (further[inside] > usual / 2).mean() > 0.5:
-            return True
-    return False
-
-
 def _harmonics(grey: np.ndarray, pixels: np.ndarray, radius: float) -> np.ndarray:
     """Fourier coefficients (N, K) of the grey levels on circles about pixels (N, 2)."""
     angle = 2.0 * np.pi / _RING * np.arange(_RING)
     places = pixels[:, None] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.fft.rfft(_levels(grey, places.reshape(-1, 2)).reshape(-1, _RING), axis=1) / _RING
-
-
-def _levels(grey: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Grey levels (N,) at places (N, 2) between pixels; those of the rim beyond it."""
-    x, y = np.clip(places, 0.0, np.array(grey.shape[::-1]) - 1.0).T
-    column, row = (np.minimum(each.astype(int), size - 2) for each, size in ((x, grey.shape[1]), (y, grey.shape[0])))
-    dx, dy = x - column, y - row
-    upper = grey[row, column] * (1 - dx) + grey[row, column + 1] * dx
-    return upper * (1 - dy) + (grey[row + 1, column] * (1 - dx) + grey[row + 1, column + 1] * dx) * dy
+    return np.fft.rfft(levels_at(grey, places.reshape(-1, 2)).reshape(-1, _RING), axis=1) / _RING

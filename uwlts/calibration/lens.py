@@ -1,0 +1,274 @@
+"""A lens from images of a target alone: the model that predicts best, without doubtful points and images.
+
+Misses of the points of one image go together where the model is not perfect. So a model is chosen by how well it
+predicts images that it was not calibrated from, an image is judged by how far it moves the parameters, and the
+uncertainties follow from what leaving out one image after the other does (the delete-one-group jackknife).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
+from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.target_images import TargetImage
+from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.calibration import CameraModel
+from uwlts.model.errors import CalibrationError
+
+_DISTORTIONS = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2", "k3"))
+_FOLDS = 5
+_WORSE = 2.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
+_LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
+_OUTLIER = 5.0  # robust standard deviations
+_REJECTIONS = 3  # rounds in which points are left out
+_MOVED = 3.0  # standard uncertainties by which one image may move a parameter
+_FEWEST_IMAGES, _LARGEST_LEFT_OUT = 5, 0.2
+
+Distortion = Literal["auto"] | tuple[str, ...]
+Pixels = Literal["auto", "square", "free"]
+
+
+@dataclass(frozen=True)
+class LensCandidate:
+    """A lens model, and how well it predicts images that it was not calibrated from.
+
+    ``rms_px`` is the root mean square miss of their points, NaN where the images do not determine the model; ``worse``
+    the mean difference of the squares from the best model's, over its standard error (0 for the best).
+    """
+
+    options: CameraOptions
+    rms_px: float
+    worse: float
+
+    @property
+    def name(self) -> str:
+        """The coefficients and the pixels in words."""
+        coefficients = " ".join(self.options.distortion) or "no distortion"
+        return f"{coefficients}, {'square' if self.options.square_pixels else 'free'} pixels"
+
+    def parameters(self) -> int:
+        """Number of parameters that are estimated."""
+        return len(self.options.distortion) + (3 if self.options.square_pixels else 4)
+
+
+@dataclass(frozen=True, eq=False)
+class LensCalibration:
+    """A calibrated lens and what it rests on.
+
+    Attributes
+    ----------
+    solution : for the images used, in their order; its covariance is the one of independent points
+    used : numbers (F,) of the images used, among those given
+    left_out : number of an image left out, and the reason
+    moved : (F,); how far leaving out each image used moves a parameter at most, in its standard uncertainties
+    rejected_share : share of the points that were left out, of the images used
+    candidates : models compared; only the one used if it was given
+    covariance : (P, P); of the parameters, with the misses of an image taken to go together
+    """
+
+    solution: CameraSolution
+    used: np.ndarray
+    left_out: dict[int, str]
+    moved: np.ndarray
+    rejected_share: float
+    candidates: list[LensCandidate]
+    options: CameraOptions
+    covariance: np.ndarray
+
+    def std(self) -> dict[str, float]:
+        """Standard uncertainty of every estimated parameter."""
+        return dict(zip(self.solution.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+
+def calibrate_lens(
+    images: Sequence[TargetImage],
+    *,
+    width_px: int,
+    height_px: int,
+    poses: Poses = "free",
+    approaching: bool = True,
+    distortion: Distortion = "auto",
+    pixels: Pixels = "auto",
+    circle_diameter_mm: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> LensCalibration:
+    """Calibrate a lens from images of a flat target.
+
+    Parameters
+    ----------
+    distortion, pixels : what is estimated; "auto" chooses by prediction of images left out
+    progress : called with the number of models tried and of all
+
+    Other parameters are those of `solve_camera`.
+
+    Raises CalibrationError: no model is determined by the images, or they contradict each other.
+    """
+
+    def solved(
+        chosen: Sequence[TargetImage], options: CameraOptions, start: CameraSolution | None = None, *, circles: bool
+    ) -> CameraSolution:
+        return solve_camera(
+            chosen,
+            width_px=width_px,
+            height_px=height_px,
+            poses=poses,
+            approaching=approaching,
+            options=options,
+            start=start,
+            circle_diameter_mm=circle_diameter_mm if circles else None,
+        )
+
+    tried = _candidates(distortion, pixels, square=poses == "stage")
+    images = list(images)
+    first = solved(images, CameraOptions(("k1", "k2") if distortion == "auto" else distortion), circles=True)
+    count = sum(len(image.points_mm) for image in images)
+    images = [_without_outliers(image, keep) for image, keep in zip(images, _inliers(first), strict=True)]
+    if len(tried) > 1:
+        first = solved(images, CameraOptions(("k1", "k2") if distortion == "auto" else distortion), circles=True)
+        candidates = _compared(_centred(images, first), tried, lambda i, o: solved(i, o, circles=False), progress)
+        options = _chosen(candidates).options
+    else:
+        options = tried[0]
+        candidates = []
+    for _ in range(_REJECTIONS):
+        solution = solved(images, options, circles=True)
+        keep = _inliers(solution)
+        if all(inside.all() for inside in keep):
+            break
+        images = [_without_outliers(image, inside) for image, inside in zip(images, keep, strict=True)]
+    used, left_out = list(range(len(images))), {}
+    while True:
+        chosen = [images[number] for number in used]
+        solution = solved(chosen, options, circles=True)
+        changes = _changes(_centred(chosen, solution), solution, lambda i, s: solved(i, options, s, circles=False))
+        std = np.sqrt(np.diag(solution.covariance))
+        usual = np.maximum(std, MAD_TO_STD * np.sqrt(len(used)) * np.nanmedian(np.abs(changes), axis=0))
+        moved = np.nanmax(np.abs(changes) / usual, axis=1)
+        worst = int(np.argmax(moved))
+        enough = len(used) > max(_FEWEST_IMAGES, (1 - _LARGEST_LEFT_OUT) * len(images))
+        if moved[worst] <= _MOVED or not enough:
+            break
+        name = solution.parameters[int(np.nanargmax(np.abs(changes[worst]) / usual))]
+        left_out[used[worst]] = f"it alone moves {name} by {moved[worst]:.1f} standard uncertainties"
+        del used[worst]
+    # Delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
+    known = changes[np.isfinite(changes).all(axis=1)]
+    jackknife = np.sqrt((len(known) - 1) / len(known) * np.sum(known**2, axis=0)) if len(known) > 1 else std
+    larger = np.maximum(jackknife / std, 1.0)
+    return LensCalibration(
+        solution=solution,
+        used=np.array(used),
+        left_out=left_out,
+        moved=moved,
+        rejected_share=1.0 - sum(len(image.points_mm) for image in images) / count,
+        candidates=candidates,
+        options=options,
+        covariance=solution.covariance * np.outer(larger, larger),
+    )
+
+
+def _candidates(distortion: Distortion, pixels: Pixels, *, square: bool) -> list[CameraOptions]:
+    sets = _DISTORTIONS if distortion == "auto" else (distortion,)
+    shapes = {"auto": (True,) if square else (True, False), "square": (True,), "free": (False,)}[pixels]
+    return [CameraOptions(names, square_pixels=shape) for names in sets for shape in shapes]
+
+
+def _inliers(solution: CameraSolution) -> list[np.ndarray]:
+    """Points (N,) of each image within five robust standard deviations of all."""
+    misses = [np.linalg.norm(residuals, axis=1) for residuals in solution.residuals_px]
+    # The median of a distance in two coordinates is 1.1774 of one coordinate's standard deviation.
+    limit = _OUTLIER * np.median(np.concatenate(misses)) / 1.1774
+    return [each <= limit for each in misses]
+
+
+def _without_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
+    return replace(image, points_mm=image.points_mm[keep], pixels=image.pixels[keep])
+
+
+def _centred(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:
+    """The images with the offsets of circles taken out."""
+    if solution.bias_px is None:
+        return list(images)
+    return [replace(i, pixels=i.pixels - bias) for i, bias in zip(images, solution.bias_px, strict=True)]
+
+
+def _compared(
+    images: list[TargetImage],
+    tried: list[CameraOptions],
+    solve: Callable[[Sequence[TargetImage], CameraOptions], CameraSolution],
+    progress: Callable[[int, int], None],
+) -> list[LensCandidate]:
+    """The models, each calibrated without every fifth image and tried on these."""
+    folds = min(_FOLDS, len(images))
+    squares = np.full((len(tried), len(images)), np.nan)
+    for number, options in enumerate(tried):
+        try:
+            for fold in range(folds):
+                rest = [image for place, image in enumerate(images) if place % folds != fold]
+                model = solve(rest, options).model
+                for place in range(fold, len(images), folds):
+                    squares[number, place] = _mean_square_miss(model, images[place])
+        except CalibrationError:
+            squares[number] = np.nan
+        progress(number + 1, len(tried))
+    means = squares.mean(axis=1)
+    if np.isnan(means).all():
+        raise CalibrationError(
+            "no lens model is determined by four fifths of the images: take more images, tilted differently, that fill "
+            "the image, or give distortion and pixels"
+        )
+    best = int(np.nanargmin(means))
+    found = []
+    for options, mean, each in zip(tried, means, squares, strict=True):
+        apart = each - squares[best]
+        error = float(np.std(apart, ddof=1)) / np.sqrt(len(apart))
+        small = not mean - means[best] > _LEAST_GAIN * means[best]
+        found.append(LensCandidate(options, float(np.sqrt(mean)), 0.0 if small else float(np.mean(apart)) / error))
+    return found
+
+
+def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
+    """Mean square distance of an image's points from where the model sees them, in the pose that fits them best."""
+    matrix, coefficients = model.matrix(), np.array([*model.distortion.model_dump().values()])
+    found, rotation, shift = cv2.solvePnP(image.points_mm, image.pixels, matrix, coefficients)
+    if not found:
+        raise CalibrationError("no pose of the target explains one of its images")
+    rotation, shift = cv2.solvePnPRefineLM(image.points_mm, image.pixels, matrix, coefficients, rotation, shift)
+    seen = cv2.projectPoints(image.points_mm, rotation, shift, matrix, coefficients)[0].reshape(-1, 2)
+    return float(np.mean(np.sum((image.pixels - seen) ** 2, axis=1)))
+
+
+def _chosen(candidates: list[LensCandidate]) -> LensCandidate:
+    """The model with the fewest parameters among those as good as the best."""
+    good = [each for each in candidates if np.isfinite(each.rms_px) and each.worse <= _WORSE]
+    return min(good, key=lambda each: (each.parameters(), each.rms_px))
+
+
+def _changes(
+    images: list[TargetImage],
+    solution: CameraSolution,
+    solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
+) -> np.ndarray:
+    """How far (F, P) leaving out each image moves the parameters; NaN where the others determine none."""
+    values = _values(solution)
+    changes = np.full((len(images), len(values)), np.nan)
+    for number in range(len(images)):
+        rest = [image for place, image in enumerate(images) if place != number]
+        start = replace(solution, target_poses=np.delete(solution.target_poses, number, axis=0))
+        try:
+            changes[number] = _values(solve(rest, start)) - values
+        except CalibrationError:
+            continue
+    return changes
+
+
+def _values(solution: CameraSolution) -> np.ndarray:
+    """The estimated parameters (P,)."""
+    model = solution.model
+    known = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
+    known |= model.distortion.model_dump()
+    return np.array([known[name] for name in solution.parameters])
