@@ -31,6 +31,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
         WRITES | METHOD | {"joint", "live", "camera", "stage", "port", "resume"},
         {"stripe", "method"},
     ),
+    "uwlts camera": ("uwlts.calibrate_camera", WRITES, set()),
     "uwlts refresh": ("uwlts.refresh", WRITES | METHOD, {"stripe"}),
     "uwlts polynomials": ("uwlts.calibrate_polynomials", WRITES | METHOD, {"stripe"}),
     "uwlts design": ("uwlts.design", set(), set()),

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from uwlts.calibration.calibrate import calibrate
     from uwlts.calibration.joint.refresh import Refreshed, refresh
     from uwlts.calibration.model_comparison.comparison import Comparison, compare_models
+    from uwlts.calibration.photographs import CameraCalibration, calibrate_camera, write_camera
     from uwlts.calibration.polynomial import PolynomialResult, calibrate_polynomials
     from uwlts.doctor import Finding, examine
     from uwlts.hardware.guided.recording import GuidedRecording, record_guided
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from uwlts.model.sensor import Sensor
     from uwlts.optics.nominal import nominal
     from uwlts.report import plot
+    from uwlts.report.camera_page import write_camera_page
     from uwlts.report.campaign_page import Report, write_report
     from uwlts.report.certificate import check_certificate
     from uwlts.report.certificate_page import write_certificate
@@ -43,6 +45,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Calibration",
+    "CameraCalibration",
     "Capture",
     "Comparison",
     "Error",
@@ -63,6 +66,7 @@ __all__ = [
     "Truth",
     "Verification",
     "calibrate",
+    "calibrate_camera",
     "calibrate_polynomials",
     "check_certificate",
     "compare_models",
@@ -87,6 +91,8 @@ __all__ = [
     "verify",
     "watch",
     "write_calibration",
+    "write_camera",
+    "write_camera_page",
     "write_certificate",
     "write_cloud",
     "write_evaluation",
@@ -96,6 +102,7 @@ __all__ = [
 
 _MODULES = {
     "Calibration": "uwlts.model.calibration",
+    "CameraCalibration": "uwlts.calibration.photographs",
     "Capture": "uwlts.storage.capture",
     "Comparison": "uwlts.calibration.model_comparison.comparison",
     "Error": "uwlts.model.errors",
@@ -116,6 +123,7 @@ _MODULES = {
     "Truth": "uwlts.storage.truth",
     "Verification": "uwlts.measurement.verification",
     "calibrate": "uwlts.calibration.calibrate",
+    "calibrate_camera": "uwlts.calibration.photographs",
     "calibrate_polynomials": "uwlts.calibration.polynomial",
     "check_certificate": "uwlts.report.certificate",
     "compare_models": "uwlts.calibration.model_comparison.comparison",
@@ -140,6 +148,8 @@ _MODULES = {
     "verify": "uwlts.measurement.verification",
     "watch": "uwlts.hardware.live_view",
     "write_calibration": "uwlts.storage.calibration_file",
+    "write_camera": "uwlts.calibration.photographs",
+    "write_camera_page": "uwlts.report.camera_page",
     "write_certificate": "uwlts.report.certificate_page",
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",

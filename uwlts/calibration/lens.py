@@ -23,8 +23,8 @@ _DISTORTIONS = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2"
 _FOLDS = 5
 _WORSE = 2.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
-_OUTLIER = 5.0  # robust standard deviations
-_REJECTIONS = 3  # rounds in which points are left out
+_SOFT, _OUTLIER = 2.0, 5.0  # robust standard deviations from where a point counts less, and not at all
+_LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
 _MOVED = 3.0  # standard uncertainties by which one image may move a parameter
 _FEWEST_IMAGES, _LARGEST_LEFT_OUT = 5, 0.2
 
@@ -62,9 +62,9 @@ class LensCalibration:
     Attributes
     ----------
     solution : for the images used, in their order; its covariance is the one of independent points
-    used : numbers (F,) of the images used, among those given
+    used, images : numbers (F,) of the images used, among those given, and these without their outliers
     left_out : number of an image left out, and the reason
-    moved : (F,); how far leaving out each image used moves a parameter at most, in its standard uncertainties
+    moved : (F,); how far leaving out each image used moves a parameter at most, in its standard deviations without it
     rejected_share : share of the points that were left out, of the images used
     candidates : models compared; only the one used if it was given
     covariance : (P, P); of the parameters, with the misses of an image taken to go together
@@ -72,6 +72,7 @@ class LensCalibration:
 
     solution: CameraSolution
     used: np.ndarray
+    images: list[TargetImage]
     left_out: dict[int, str]
     moved: np.ndarray
     rejected_share: float
@@ -123,48 +124,58 @@ def calibrate_lens(
         )
 
     tried = _candidates(distortion, pixels, square=poses == "stage")
-    images = list(images)
-    first = solved(images, CameraOptions(("k1", "k2") if distortion == "auto" else distortion), circles=True)
-    count = sum(len(image.points_mm) for image in images)
-    images = [_without_outliers(image, keep) for image, keep in zip(images, _inliers(first), strict=True)]
+    usual = CameraOptions(("k1", "k2")) if len(tried) > 1 else tried[0]
+
+    def inliers(options: CameraOptions) -> list[np.ndarray]:
+        """Points (N,) of each image near to where the lens sees them, found without trust in any of them."""
+        plain = solved(images, options, circles=True)
+        robust = solved(images, replace(options, soft_limit_px=_SOFT * _scatter(plain)), plain, circles=True)
+        return _inliers(robust)
+
+    candidates: list[LensCandidate] = []
+    options = usual
     if len(tried) > 1:
-        first = solved(images, CameraOptions(("k1", "k2") if distortion == "auto" else distortion), circles=True)
-        candidates = _compared(_centred(images, first), tried, lambda i, o: solved(i, o, circles=False), progress)
+        good = [
+            _without_outliers(image, inside)
+            for image, inside in zip(images, inliers(usual), strict=True)
+            if inside.mean() >= 1 - _LARGEST_REJECTED
+        ]
+        start = solved(good, usual, circles=True)
+        candidates = _compared(_centred(good, start), tried, lambda i, o: solved(i, o, circles=False), progress)
         options = _chosen(candidates).options
-    else:
-        options = tried[0]
-        candidates = []
-    for _ in range(_REJECTIONS):
-        solution = solved(images, options, circles=True)
-        keep = _inliers(solution)
-        if all(inside.all() for inside in keep):
-            break
-        images = [_without_outliers(image, inside) for image, inside in zip(images, keep, strict=True)]
-    used, left_out = list(range(len(images))), {}
+    keep = inliers(options)
+    doubtful = [number for number, inside in enumerate(keep) if inside.mean() < 1 - _LARGEST_REJECTED]
+    left_out = {
+        number: f"{100 * (1 - keep[number].mean()):.0f} % of its points do not lie where the others' lens sees them"
+        for number in doubtful
+    }
+    used = [number for number in range(len(images)) if number not in left_out]
+    cleaned = [_without_outliers(image, inside) for image, inside in zip(images, keep, strict=True)]
     while True:
-        chosen = [images[number] for number in used]
+        chosen = [cleaned[number] for number in used]
         solution = solved(chosen, options, circles=True)
-        changes = _changes(_centred(chosen, solution), solution, lambda i, s: solved(i, options, s, circles=False))
-        std = np.sqrt(np.diag(solution.covariance))
-        usual = np.maximum(std, MAD_TO_STD * np.sqrt(len(used)) * np.nanmedian(np.abs(changes), axis=0))
-        moved = np.nanmax(np.abs(changes) / usual, axis=1)
+        centred = _centred(chosen, solution)
+        changes, others_std = _changes(centred, solution, lambda i, s: solved(i, options, s, circles=False))
+        unit = np.maximum(others_std, MAD_TO_STD * np.sqrt(len(used)) * np.nanmedian(np.abs(changes), axis=0))
+        moved = np.nanmax(np.abs(changes) / unit, axis=1, initial=0.0)
         worst = int(np.argmax(moved))
         enough = len(used) > max(_FEWEST_IMAGES, (1 - _LARGEST_LEFT_OUT) * len(images))
         if moved[worst] <= _MOVED or not enough:
             break
-        name = solution.parameters[int(np.nanargmax(np.abs(changes[worst]) / usual))]
+        name = solution.parameters[int(np.nanargmax(np.abs(changes[worst]) / unit[worst]))]
         left_out[used[worst]] = f"it alone moves {name} by {moved[worst]:.1f} standard uncertainties"
         del used[worst]
     # Delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
-    known = changes[np.isfinite(changes).all(axis=1)]
+    std, known = np.sqrt(np.diag(solution.covariance)), changes[np.isfinite(changes).all(axis=1)]
     jackknife = np.sqrt((len(known) - 1) / len(known) * np.sum(known**2, axis=0)) if len(known) > 1 else std
     larger = np.maximum(jackknife / std, 1.0)
     return LensCalibration(
         solution=solution,
         used=np.array(used),
+        images=chosen,
         left_out=left_out,
         moved=moved,
-        rejected_share=1.0 - sum(len(image.points_mm) for image in images) / count,
+        rejected_share=float(1.0 - np.mean(np.concatenate([keep[number] for number in used]))),
         candidates=candidates,
         options=options,
         covariance=solution.covariance * np.outer(larger, larger),
@@ -177,12 +188,16 @@ def _candidates(distortion: Distortion, pixels: Pixels, *, square: bool) -> list
     return [CameraOptions(names, square_pixels=shape) for names in sets for shape in shapes]
 
 
+def _scatter(solution: CameraSolution) -> float:
+    """Robust standard deviation of one coordinate of the misses."""
+    # The median of a distance in two coordinates is 1.1774 of one coordinate's standard deviation.
+    return float(np.median(np.linalg.norm(np.vstack(solution.residuals_px), axis=1))) / 1.1774
+
+
 def _inliers(solution: CameraSolution) -> list[np.ndarray]:
     """Points (N,) of each image within five robust standard deviations of all."""
-    misses = [np.linalg.norm(residuals, axis=1) for residuals in solution.residuals_px]
-    # The median of a distance in two coordinates is 1.1774 of one coordinate's standard deviation.
-    limit = _OUTLIER * np.median(np.concatenate(misses)) / 1.1774
-    return [each <= limit for each in misses]
+    limit = _OUTLIER * _scatter(solution)
+    return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
 
 
 def _without_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
@@ -252,18 +267,22 @@ def _changes(
     images: list[TargetImage],
     solution: CameraSolution,
     solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
-) -> np.ndarray:
-    """How far (F, P) leaving out each image moves the parameters; NaN where the others determine none."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """How far (F, P) leaving out each image moves the parameters, and their standard deviations (F, P) without it.
+
+    NaN where the other images determine none.
+    """
     values = _values(solution)
-    changes = np.full((len(images), len(values)), np.nan)
+    changes, std = np.full((2, len(images), len(values)), np.nan)
     for number in range(len(images)):
         rest = [image for place, image in enumerate(images) if place != number]
         start = replace(solution, target_poses=np.delete(solution.target_poses, number, axis=0))
         try:
-            changes[number] = _values(solve(rest, start)) - values
+            without = solve(rest, start)
         except CalibrationError:
             continue
-    return changes
+        changes[number], std[number] = _values(without) - values, np.sqrt(np.diag(without.covariance))
+    return changes, std
 
 
 def _values(solution: CameraSolution) -> np.ndarray:

@@ -137,6 +137,45 @@ def _finish(out: Path, lines: Iterable[str], warnings: Iterable[str]) -> None:
 
 
 @app.command
+def camera(
+    folder: Path,
+    *,
+    target: Path | None = None,
+    out: Path,
+    channel: str | None = None,
+    distortion: Coefficients | Literal["auto"] = "auto",
+    pixels: Literal["auto", "square", "free"] = "auto",
+    overwrite: Overwrite = False,
+) -> None:
+    """Calibrate a camera alone, from photographs of a target that is held differently in each.
+
+    Writes the camera as ROS CameraInfo (YAML), and a page with all images beside it, those left out with the reason.
+
+    Example: uwlts camera photographs --target board.toml --out camera.yaml
+
+    Args:
+        folder: Folder of PNG, TIFF, BMP or JPEG images.
+        target: Description of the target (TOML); target.toml or import.toml in the folder unless given.
+        out: File to write; `uwlts import` reads it as intrinsics.
+        channel: Channel of colour images, or a formula of channels; their luminance unless given.
+        distortion: Distortion coefficients to estimate; auto: those that predict images left out best.
+        pixels: Whether pixels are square or free to be not; auto: as distortion.
+    """
+    page = out.with_suffix(".html")
+    for path in (out, page):
+        refuse_unsuitable(path, overwrite=overwrite)
+    with progress_bar("calibrating") as progress:
+        found = uwlts.calibrate_camera(
+            folder, target=target, channel=channel, distortion=distortion, pixels=pixels, progress=any_stage(progress)
+        )
+    uwlts.write_camera(out, found, overwrite=overwrite)
+    uwlts.write_camera_page(page, found, overwrite=overwrite)
+    show(found.lines())
+    warn(*found.warnings)
+    print(f"wrote {out} and {page}")
+
+
+@app.command
 def refresh(
     calibration: Path,
     *,

@@ -1,6 +1,21 @@
 """Images of any camera and program turned into a capture."""
 
+from uwlts.storage.import_.channels import Channel, one_channel
+from uwlts.storage.import_.description import NAME as DESCRIPTION_NAME
 from uwlts.storage.import_.folder import Imported, import_images
+from uwlts.storage.import_.images import read_image
 from uwlts.storage.import_.intrinsics import KnownCamera, read_intrinsics, with_intrinsics
+from uwlts.storage.import_.matching import image_files
 
-__all__ = ["Imported", "KnownCamera", "import_images", "read_intrinsics", "with_intrinsics"]
+__all__ = [
+    "DESCRIPTION_NAME",
+    "Channel",
+    "Imported",
+    "KnownCamera",
+    "image_files",
+    "import_images",
+    "one_channel",
+    "read_image",
+    "read_intrinsics",
+    "with_intrinsics",
+]

@@ -114,17 +114,22 @@ def _refuse_any(names: list[str], before: str, after: str) -> None:
         raise DescriptionError(f"{before}{', '.join(names[:3])}{after}")
 
 
+def image_files(folder: Path) -> list[str]:
+    """Paths of the images in a folder and below it, in natural order; ImageError where there are none."""
+    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+    files = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
+    if not files:
+        raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(SUFFIXES)}")
+    return sorted(files, key=natural_key)
+
+
 def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -> Matched:
     """Sort a folder's images by what they are; ``rows`` are those of a table.
 
     ImageError where the folder holds no image. DescriptionError where no image is known to be anything, one is two
     things, a named file is missing, or it is open which background belongs to which image.
     """
-    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
-    files = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
-    files.sort(key=natural_key)
-    if not files:
-        raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(SUFFIXES)}")
+    files = image_files(folder)
     known = [ImageRow(name) for name in files] if rows is None else rows
     missing = [row.file for row in known if not (folder / row.file).is_file()]
     _refuse_any(missing, "the table names ", f", which {folder} does not hold")

@@ -1,0 +1,74 @@
+"""`uwlts camera`: a folder of photographs becomes a camera that `uwlts import` reads, and a page with every image."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from tests.system.in_process import uwlts
+from tests.system.test_imported_calibration import CENTRE, CHESSBOARD, SIZE, F, photographs, poses
+from uwlts.storage.import_ import read_intrinsics
+
+TARGET = 'kind = "chessboard"\ncolumns = 9\nrows = 6\nsquare_mm = 15.0\n'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Photographs of a chessboard, one with a stripe across, one of nothing, one truncated, one of another size."""
+    folder, rng = tmp_path_factory.mktemp("photographs"), np.random.default_rng(2)
+    for number, pose in enumerate(poses(CHESSBOARD)):
+        plain, lasered = photographs(CHESSBOARD, *pose, rng)
+        cv2.imwrite(str(folder / f"board{number}.png"), lasered if number == 3 else plain)
+    cv2.imwrite(str(folder / "nothing.png"), np.full(SIZE[::-1], 90, np.uint8))
+    cv2.imwrite(str(folder / "small.png"), np.full((100, 200), 90, np.uint8))
+    (folder / "truncated.png").write_bytes((folder / "board0.png").read_bytes()[:5000])
+    return folder
+
+
+def test_photographs_give_the_camera_and_name_what_was_left_out(folder: Path, tmp_path: Path):
+    (tmp_path / "board.toml").write_text(TARGET)
+    out = tmp_path / "camera.yaml"
+    done = uwlts("camera", str(folder), "--target", str(tmp_path / "board.toml"), "--out", str(out))
+    assert done.returncode == 0, done.stderr
+    known, estimated = read_intrinsics(out), yaml.safe_load(out.read_text())["estimated"]
+    std = dict(zip(estimated["parameters"], estimated["standard_uncertainties"], strict=True))
+    assert known.size_px == SIZE and "f" in std
+    # Drawn without distortion; four standard uncertainties.
+    assert known.fx_px == known.fy_px == pytest.approx(F, abs=4 * std["f"])
+    assert (known.cx_px, known.cy_px) == (
+        pytest.approx(CENTRE[0], abs=4 * std["cx"]),
+        pytest.approx(CENTRE[1], abs=4 * std["cy"]),
+    )
+    assert std["f"] < 3e-3 * F
+    assert estimated["images"] == [f"board{number}.png" for number in range(8)]
+    for name, reason in {
+        "nothing.png": "found no chessboard of 9 x 6 inner corners",
+        "small.png": "has 200 x 100 pixels, the first image",
+        "truncated.png": "truncated or damaged",
+    }.items():
+        assert reason in estimated["left_out"][name] and f"warning: {name}: " in done.stderr
+    page = out.with_suffix(".html").read_text()
+    assert page.count("<img") == 8 + 2, "every image that can be read is shown"
+    # A second time it refuses to replace what it wrote.
+    again = uwlts("camera", str(folder), "--target", str(tmp_path / "board.toml"), "--out", str(out))
+    assert again.returncode != 0 and "exists" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("target", "message"),
+    [
+        (None, "no description of the target"),
+        (TARGET.replace("9", "7"), "the target was found in 0 of 11 images"),
+        ('kind = "chess"', "kind is one of"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_refused(folder: Path, tmp_path: Path, target: str | None, message: str):
+    words = ["camera", str(folder), "--out", str(tmp_path / "camera.yaml")]
+    if target is not None:
+        (tmp_path / "board.toml").write_text(target)
+        words += ["--target", str(tmp_path / "board.toml")]
+    done = uwlts(*words)
+    assert done.returncode != 0 and message in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "camera.yaml").exists()

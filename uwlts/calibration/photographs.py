@@ -1,0 +1,224 @@
+"""A camera calibrated from a folder of photographs of a target, without a laser."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from uwlts.calibration.lens import Distortion, LensCalibration, Pixels, calibrate_lens
+from uwlts.calibration.target_images import TargetImage
+from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError
+from uwlts.model.library import read_table
+from uwlts.storage.files import written_aside
+from uwlts.storage.import_ import DESCRIPTION_NAME, image_files, one_channel, read_image
+from uwlts.targets import Target, parse_target
+
+_FEWEST_IMAGES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """One image file: the points (N, 2) of the target found, or the reason why it was left out.
+
+    Of images used, ``misses_px`` (N, 2) are found minus calculated pixels, and ``moved`` is how far leaving it out
+    moves a parameter at most, in standard uncertainties.
+    """
+
+    name: str
+    pixels: np.ndarray
+    reason: str | None
+    misses_px: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
+    moved: float = np.nan
+
+    def rms_px(self) -> float:
+        """Root mean square distance between found and calculated pixels."""
+        return float(np.sqrt(np.mean(np.sum(self.misses_px**2, axis=1))))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A camera calibrated from photographs.
+
+    Attributes
+    ----------
+    folder : where the photographs lie
+    lens : the lens and what it rests on
+    photographs : all image files in natural order
+    warnings : what may be wrong
+    """
+
+    folder: Path
+    target: Target
+    lens: LensCalibration
+    photographs: list[Photograph]
+    warnings: list[str]
+
+    def lines(self) -> list[str]:
+        """The result, as text."""
+        lens, model = self.lens, self.lens.solution.model
+        used = len(lens.used)
+        std = lens.std()
+        values = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
+        values |= model.distortion.model_dump()
+        lines = [f"{used} of {len(self.photographs)} images used, {lens.solution.rms_px():.3f} px rms"]
+        lines += [f"{100 * lens.rejected_share:.1f} % of their points left out as outliers"]
+        if lens.candidates:
+            lines.append("models, misses of images that each was not calibrated from:")
+            lines += [
+                f"  {each.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == lens.options else "")
+                for each in lens.candidates
+            ]
+        for name in lens.solution.parameters:
+            digits = 3 if name in ("f", "fx", "fy", "cx", "cy") else 6
+            unit = " px" if digits == 3 else ""
+            lines.append(f"{name} = {values[name]:.{digits}f} +- {std[name]:.{digits}f}{unit}")
+        return lines
+
+
+def calibrate_camera(
+    folder: str | Path,
+    *,
+    target: str | Path | None = None,
+    channel: str | None = None,
+    distortion: Distortion = "auto",
+    pixels: Pixels = "auto",
+    progress: Callable[[str, int, int], None] | None = None,
+) -> CameraCalibration:
+    """Calibrate a camera from photographs of a target, held differently in each.
+
+    Parameters
+    ----------
+    folder : str or Path
+        PNG, TIFF, BMP or JPEG images, in it or in folders below it. Those that do not show the target are named with
+        the reason.
+    target : str or Path, optional
+        TOML file of the target's description, or with a table [target]; target.toml or import.toml in the folder
+        unless given.
+    channel : str, optional
+        Channel of colour images, or a formula of channels; their luminance unless given.
+    distortion : "auto" or tuple of str
+        Coefficients among k1, k2, p1, p2, k3 to estimate; auto: those that predict images left out best.
+    pixels : {"auto", "square", "free"}
+        Whether one focal length or two are estimated.
+    progress : callable, optional
+        Called with the name of the stage, the number of images or models done, and the number in all.
+
+    Returns
+    -------
+    CameraCalibration
+        Its uncertainties take the misses of one image to go together.
+
+    Raises
+    ------
+    DescriptionError
+        No target is described, or wrongly.
+    ImageError
+        The folder holds no images.
+    CalibrationError
+        The target is found in fewer than four images, or these do not determine a camera.
+    """
+    folder = Path(folder)
+    described = _described_target(folder, target)
+    report = progress or (lambda stage, done, total: None)
+    names = image_files(folder)
+    found: list[TargetImage] = []
+    places: list[int] = []
+    photographs: list[Photograph] = []
+    size: tuple[int, int] | None = None
+    for number, name in enumerate(names):
+        pixels_found, reason = np.empty((0, 2)), None
+        try:
+            raw = read_image(folder / name)
+            size = size or (raw.shape[1], raw.shape[0])
+            if (raw.shape[1], raw.shape[0]) != size:
+                raise ImageError(
+                    f"it has {raw.shape[1]} x {raw.shape[0]} pixels, the first image {size[0]} x {size[1]}"
+                )
+            grey = one_channel(raw, channel or "grey", name=name)
+            view = described.detect(np.clip(grey, 0, None).astype(raw.dtype))
+            pixels_found = view.pixels
+            found.append(TargetImage(view.points_mm, view.pixels))
+            places.append(number)
+        except (ImageError, TargetError, CalibrationError) as error:
+            reason = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
+        photographs.append(Photograph(name, pixels_found, reason))
+        report("target", number + 1, len(names))
+    if len(found) < _FEWEST_IMAGES or size is None:
+        reasons = "; ".join(f"{each.name}: {each.reason}" for each in photographs if each.reason)
+        raise CalibrationError(
+            f"the target was found in {len(found)} of {len(names)} images, at least {_FEWEST_IMAGES} are needed"
+            + (f": {reasons[:600]}" if reasons else "")
+        )
+    lens = calibrate_lens(
+        found,
+        width_px=size[0],
+        height_px=size[1],
+        distortion=distortion,
+        pixels=pixels,
+        circle_diameter_mm=described.circle_diameter_mm,
+        progress=lambda done, total: report("lens", done, total),
+    )
+    for place, image, misses, moved in zip(lens.used, lens.images, lens.solution.residuals_px, lens.moved, strict=True):
+        number = places[place]
+        photographs[number] = Photograph(names[number], image.pixels, None, misses, float(moved))
+    warnings = []
+    for place, reason in lens.left_out.items():
+        name = names[places[place]]
+        photographs[places[place]] = Photograph(name, found[place].pixels, reason)
+        warnings.append(f"{name}: left out, {reason}")
+    warnings += [f"{each.name}: {each.reason}" for each in photographs if not len(each.pixels)]
+    return CameraCalibration(folder, described, lens, photographs, warnings)
+
+
+def _described_target(folder: Path, path: str | Path | None) -> Target:
+    """The target in a file, or in one of the folder's own."""
+    if not folder.is_dir():
+        raise ImageError(f"no folder at {folder}")
+    known = [folder / "target.toml", folder / DESCRIPTION_NAME] if path is None else [Path(path)]
+    there = next((each for each in known if each.is_file()), None)
+    if there is None:
+        raise DescriptionError(
+            f"no description of the target at {' or '.join(map(str, known))}: write one, such as "
+            'kind = "chessboard", columns = 9, rows = 6 (inner corners), square_mm = 15.0, each on a line'
+        )
+    table = read_table(there)
+    inner = table.get("target", table)
+    if not isinstance(inner, dict):
+        raise DescriptionError(f"{there}: target is {inner!r}; expected a table")
+    return parse_target(inner)
+
+
+def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
+    """Write a camera as YAML in the form of ROS CameraInfo, which `uwlts import` reads as ``intrinsics``.
+
+    Raises OutputError: the file exists and ``overwrite`` is not given, or cannot be written.
+    """
+    lens, model = camera.lens, camera.lens.solution.model
+
+    def matrix(rows: list[list[float]]) -> dict[str, object]:
+        return {"rows": len(rows), "cols": len(rows[0]), "data": [float(value) for row in rows for value in row]}
+
+    known = model.distortion
+    projection = np.column_stack([model.matrix(), np.zeros(3)]).tolist()
+    content = {
+        "image_width": model.width_px,
+        "image_height": model.height_px,
+        "camera_name": camera.folder.resolve().name,
+        "camera_matrix": matrix(model.matrix().tolist()),
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": matrix([[known.k1, known.k2, known.p1, known.p2, known.k3]]),
+        "rectification_matrix": matrix(np.eye(3).tolist()),
+        "projection_matrix": matrix(projection),
+        "estimated": {
+            "parameters": list(lens.solution.parameters),
+            "standard_uncertainties": [float(value) for value in lens.std().values()],
+            "covariance": lens.covariance.tolist(),
+            "rms_px": lens.solution.rms_px(),
+            "images": [each.name for each in camera.photographs if each.reason is None],
+            "left_out": {each.name: each.reason for each in camera.photographs if each.reason is not None},
+        },
+    }
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")

@@ -1,0 +1,90 @@
+"""Page of a camera's calibration from photographs: the lens models, the images used, and pictures of those left out."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from markupsafe import Markup
+
+import uwlts
+from uwlts.calibration.photographs import CameraCalibration, Photograph
+from uwlts.report.page_toolkit import BLUE, MISSING, RED, new_figure, plain_text, png_data_uri, render_page, svg_of
+from uwlts.report.page_toolkit import write_page as write_text
+from uwlts.storage.import_ import read_image
+
+_THUMBNAIL_PX = 420
+_MOST_PICTURES = 12
+_ARROWS_PX = 0.02  # length of the usual arrow, as a share of the image's width
+
+
+def write_camera_page(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
+    """Write the page of a camera's calibration; OutputError if that fails."""
+    lens = camera.lens
+    left_out = [each for each in camera.photographs if each.reason is not None]
+    used = sorted(_used(camera), key=Photograph.rms_px, reverse=True)
+    rows = [
+        [each.name, "used", str(len(each.pixels)), f"{each.rms_px():.3f}", f"{each.moved:.1f}"]
+        if each.reason is None
+        else [each.name, each.reason, str(len(each.pixels)), MISSING, MISSING]
+        for each in camera.photographs
+    ]
+    models = [
+        [each.name, str(each.parameters()), f"{each.rms_px:.4f}", "taken" if each.options == lens.options else ""]
+        for each in lens.candidates
+    ]
+    text = render_page(
+        "uwlts.report",
+        "camera.html.j2",
+        name=camera.folder.resolve().name,
+        software=f"uwlts {uwlts.__version__}",
+        summary=[line for line in camera.lines() if not line.startswith(("  ", "models"))],
+        models=models,
+        rows=rows,
+        misses=_misses(camera),
+        pictures=[
+            (each.name, each.reason or "used", _thumbnail(camera, each)) for each in (left_out + used)[:_MOST_PICTURES]
+        ],
+    )
+    write_text(path, text, overwrite=overwrite)
+
+
+def _used(camera: CameraCalibration) -> list[Photograph]:
+    return [each for each in camera.photographs if each.reason is None]
+
+
+def _misses(camera: CameraCalibration) -> Markup:
+    """Misses of all points over the image, enlarged, and of each image."""
+    model = camera.lens.solution.model
+    used = _used(camera)
+    places = np.vstack([each.pixels for each in used])
+    misses = np.vstack([each.misses_px for each in used])
+    usual = float(np.sqrt(np.mean(np.sum(misses**2, axis=1))))
+    figure, (over, each_image) = new_figure(10.5, 4.4, columns=2)
+    scale = usual / (_ARROWS_PX * model.width_px)
+    arrows = over.quiver(*places.T, *misses.T, angles="xy", scale_units="xy", scale=scale, width=0.002, color=BLUE)
+    over.quiverkey(arrows, 0.88, 1.04, usual, f"{usual:.2g} px", labelpos="E")
+    over.set(xlim=(0, model.width_px), ylim=(model.height_px, 0), aspect="equal", xlabel="u / px", ylabel="v / px")
+    over.set_title("found minus calculated")
+    each_image.barh(range(len(used)), [each.rms_px() for each in used], color=BLUE)
+    each_image.set_yticks(range(len(used)), [plain_text(Path(each.name).stem) for each in used], fontsize=7)
+    each_image.invert_yaxis()
+    each_image.set(xlabel="rms distance / px", title="by image")
+    return svg_of(figure)
+
+
+def _thumbnail(camera: CameraCalibration, photograph: Photograph) -> str | None:
+    """The image, brightened, with the points found; None where it cannot be read."""
+    try:
+        image = read_image(camera.folder / photograph.name)
+    except uwlts.Error:
+        return None
+    grey = image if image.ndim == 2 else image.max(axis=2)
+    factor = min(1.0, _THUMBNAIL_PX / grey.shape[1])
+    small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
+    low, high = np.percentile(small, [1, 98])
+    bright = np.clip((small - low) / max(high - low, 1.0), 0, 1) ** 0.6 * 255
+    drawn = cv2.cvtColor(bright.astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    colour = tuple(int(RED[place : place + 2], 16) for place in (5, 3, 1))
+    for u, v in (photograph.pixels + 0.5) * factor - 0.5:
+        cv2.circle(drawn, (round(float(u)), round(float(v))), 3, colour, 1, cv2.LINE_AA)
+    return png_data_uri(cv2.imencode(".png", drawn)[1].tobytes())
