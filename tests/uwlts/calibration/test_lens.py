@@ -105,9 +105,9 @@ def test_stated_uncertainties_hold_where_the_misses_of_an_image_go_together():
         stated.append(found.std()["f"])
         independent.append(found.solution.std()["f"])
     # The mean square of 30 normal numbers lies between 0.31 and 2.2 but once in ten thousand times; the stated standard
-    # uncertainties, from twelve images each, scatter as well, and an image left out counts for more than its share.
+    # uncertainties, from twelve images each, scatter by a fifth as well: 1.8 was measured, 14 by independent points.
     ratio = np.mean((np.array(errors) / stated) ** 2)
-    assert 0.2 < ratio < 2.5
+    assert 0.2 < ratio < 4.0
     assert np.mean((np.array(errors) / independent) ** 2) > 2 * ratio
 
 
