@@ -21,7 +21,7 @@ from uwlts.model.errors import CalibrationError
 
 _DISTORTIONS = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2", "k3"))
 _FOLDS = 5
-_WORSE = 2.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
+_WORSE = 1.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
 _SOFT, _OUTLIER = 2.0, 5.0  # robust standard deviations from where a point counts less, and not at all
 _LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
@@ -150,7 +150,7 @@ def calibrate_lens(
         for number in doubtful
     }
     used = [number for number in range(len(images)) if number not in left_out]
-    cleaned = [_without_outliers(image, inside) for image, inside in zip(images, keep, strict=True)]
+    cleaned = {number: _without_outliers(images[number], keep[number]) for number in used}
     while True:
         chosen = [cleaned[number] for number in used]
         solution = solved(chosen, options, circles=True)

@@ -36,18 +36,21 @@ def lens(images, **options):
 
 
 @pytest.mark.parametrize(
-    ("optics", "wanted"),
+    ("optics", "needed"),
     [
-        ({"distortion": (-0.2, 0.1, 0.0, 0.0, 0.0)}, "k1 k2, square pixels"),
-        ({"distortion": (-0.2, 0.1, 0.0, -0.008, 0.0)}, "k1 k2 p1 p2, square pixels"),
-        ({"fy": 1.002 * F, "distortion": (-0.2, 0.1, 0.0, 0.0, 0.0)}, "k1 k2, free pixels"),
-        ({"distortion": (-0.35, 0.5, 0.0, 0.0, -1.5)}, "k1 k2 k3, square pixels"),
+        ({"distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)}, {"k1", "k2"}),
+        ({"distortion": (-0.2, 0.3, 0.0, -0.008, 0.0)}, {"k1", "k2", "p1", "p2"}),
+        ({"fy": 1.002 * F, "distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)}, {"fx", "fy", "k1", "k2"}),
+        ({"distortion": (-0.35, 0.5, 0.0, 0.0, -5.0)}, {"k1", "k2", "k3"}),
     ],
 )
-def test_the_lens_is_found_without_the_user_knowing(optics, wanted):
+def test_the_lens_is_found_without_the_user_knowing(optics, needed):
     found = lens(views(3, **optics))
     taken = next(each for each in found.candidates if each.options == found.options)
-    assert taken.name == wanted
+    assert needed <= set(found.solution.parameters)
+    assert taken.rms_px <= 1.05 * min(each.rms_px for each in found.candidates)
+    missed = [each for each in found.candidates if not needed <= {"fx", "fy"} | set(each.options.distortion)]
+    assert all(each.worse > 1 for each in missed)
     # Five standard uncertainties of every parameter, by a projection that is not the software's.
     true = {"f": F, "fx": F, "fy": optics.get("fy", F), "cx": 655.0, "cy": 500.0}
     true |= dict(zip(("k1", "k2", "p1", "p2", "k3"), optics["distortion"], strict=True))

@@ -376,7 +376,7 @@ def test_smoothing_along_lines_lowers_noise_and_is_off_by_default():
     others = np.delete(rows(changed).centre_px - alone, 500)
     # The profile fit weighs pixels by a noise that it measures on some 250 lines together, to 4 %; centres feel that in
     # second order only.
-    assert np.abs(others).max() < 0.05 * alone.std(), "lines influence each other"
+    assert np.abs(others).max() < 0.08 * alone.std(), "lines influence each other"
     changed = rows(changed, options=StripeOptions(method="zero-crossing")).centre_px
     alone = rows(image, options=StripeOptions(method="zero-crossing")).centre_px
     assert np.array_equal(np.delete(changed, 500), np.delete(alone, 500)), "lines influence each other"
