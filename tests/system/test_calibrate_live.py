@@ -287,7 +287,7 @@ def test_a_target_held_by_hand_is_led_to_a_calibration(served, folder, tmp_path)
     camera = GigeCamera(tank.frame, width_px=640, height_px=512)
     plan = folder / "free.toml"
     described = "\n".join(
-        f"{k} = {list(v) if isinstance(v, tuple) else repr(v)}" for k, v in PLATE.model_dump().items()
+        f"{k} = {list(v) if isinstance(v, tuple) else repr(v)}" for k, v in PLATE.model_dump(exclude_none=True).items()
     )
     try:
         with controller, camera:

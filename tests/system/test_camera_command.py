@@ -22,7 +22,10 @@ def folder(tmp_path_factory) -> Path:
         plain, lasered = photographs(CHESSBOARD, *pose, rng)
         cv2.imwrite(str(folder / f"board{number}.png"), lasered if number == 3 else plain)
     cv2.imwrite(str(folder / "nothing.png"), np.full(SIZE[::-1], 90, np.uint8))
-    cv2.imwrite(str(folder / "small.png"), np.full((100, 200), 90, np.uint8))
+    cv2.imwrite(
+        str(folder / "a-large.png"),
+        cv2.resize(photographs(CHESSBOARD, *poses(CHESSBOARD)[0], rng)[0], None, fx=2, fy=2),
+    )
     (folder / "truncated.png").write_bytes((folder / "board0.png").read_bytes()[:5000])
     return folder
 
@@ -45,7 +48,7 @@ def test_photographs_give_the_camera_and_name_what_was_left_out(folder: Path, tm
     assert estimated["images"] == [f"board{number}.png" for number in range(8)]
     for name, reason in {
         "nothing.png": "found no chessboard of 9 x 6 inner corners",
-        "small.png": "has 200 x 100 pixels, the first image",
+        "a-large.png": f"pixels, most images have {SIZE[0]} x {SIZE[1]}",
         "truncated.png": "truncated or damaged",
     }.items():
         assert reason in estimated["left_out"][name] and f"warning: {name}: " in done.stderr
@@ -54,6 +57,13 @@ def test_photographs_give_the_camera_and_name_what_was_left_out(folder: Path, tm
     # A second time it refuses to replace what it wrote.
     again = uwlts("camera", str(folder), "--target", str(tmp_path / "board.toml"), "--out", str(out))
     assert again.returncode != 0 and "exists" in again.stderr
+
+
+def test_a_channel_that_is_none_is_refused(folder: Path, tmp_path: Path):
+    (folder / "target.toml").write_text(TARGET)
+    done = uwlts("camera", str(folder), "--out", str(tmp_path / "camera.yaml"), "--channel", "infrared")
+    (folder / "target.toml").unlink()
+    assert done.returncode != 0 and "channel is 'infrared': expected red, green" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """A camera calibrated from a folder of photographs of a target, without a laser."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from uwlts.calibration.target_images import TargetImage
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.model.library import read_table
 from uwlts.storage.files import written_aside
-from uwlts.storage.import_ import DESCRIPTION_NAME, image_files, one_channel, read_image
+from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel, read_image
 from uwlts.targets import Target, parse_target
 
 _FEWEST_IMAGES = 4
@@ -113,7 +114,7 @@ def calibrate_camera(
     Raises
     ------
     DescriptionError
-        No target is described, or wrongly.
+        No target is described, or wrongly, or ``channel`` is none.
     ImageError
         The folder holds no images.
     CalibrationError
@@ -123,33 +124,34 @@ def calibrate_camera(
     described = _described_target(folder, target)
     report = progress or (lambda stage, done, total: None)
     names = image_files(folder)
-    found: list[TargetImage] = []
-    places: list[int] = []
-    photographs: list[Photograph] = []
-    size: tuple[int, int] | None = None
+    try:
+        wanted = checked_channel(channel or "grey")
+    except ValueError as error:
+        raise DescriptionError(f"channel is {channel!r}: {error}") from error
+    seen: dict[int, tuple[tuple[int, int], TargetImage]] = {}
+    reasons = dict.fromkeys(names, "")
     for number, name in enumerate(names):
-        pixels_found, reason = np.empty((0, 2)), None
         try:
             raw = read_image(folder / name)
-            size = size or (raw.shape[1], raw.shape[0])
-            if (raw.shape[1], raw.shape[0]) != size:
-                raise ImageError(
-                    f"it has {raw.shape[1]} x {raw.shape[0]} pixels, the first image {size[0]} x {size[1]}"
-                )
-            grey = one_channel(raw, channel or "grey", name=name)
+            grey = one_channel(raw, wanted, name=name)
             view = described.detect(np.clip(grey, 0, None).astype(raw.dtype))
-            pixels_found = view.pixels
-            found.append(TargetImage(view.points_mm, view.pixels))
-            places.append(number)
+            seen[number] = (raw.shape[1], raw.shape[0]), TargetImage(view.points_mm, view.pixels)
         except (ImageError, TargetError, CalibrationError) as error:
-            reason = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
-        photographs.append(Photograph(name, pixels_found, reason))
+            reasons[name] = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
         report("target", number + 1, len(names))
-    if len(found) < _FEWEST_IMAGES or size is None:
-        reasons = "; ".join(f"{each.name}: {each.reason}" for each in photographs if each.reason)
+    # An image of another camera is the odd one out.
+    size = Counter(own for own, _ in seen.values()).most_common(1)[0][0] if seen else (0, 0)
+    for number, ((width, height), _) in list(seen.items()):
+        if (width, height) != size:
+            reasons[names[number]] = f"it has {width} x {height} pixels, most images have {size[0]} x {size[1]}"
+            del seen[number]
+    found, places = [image for _, image in seen.values()], list(seen)
+    photographs = [Photograph(name, np.empty((0, 2)), reason) for name, reason in reasons.items()]
+    if len(found) < _FEWEST_IMAGES:
+        said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items() if reason)
         raise CalibrationError(
             f"the target was found in {len(found)} of {len(names)} images, at least {_FEWEST_IMAGES} are needed"
-            + (f": {reasons[:600]}" if reasons else "")
+            + (f": {said[:600]}" if said else "")
         )
     lens = calibrate_lens(
         found,

@@ -66,7 +66,7 @@ class ChessboardTarget(Target):
             grid = refined(image, grid)
             reason = why_no_chessboard(grey, grid)
             if reason is not None:
-                reasons.append(f"of what OpenCV or the own search took for it ({name}), {reason}")
+                reasons.append(f"{reason} (as found by {name})")
             elif self.findable(np.isfinite(grid[..., 0]).ravel()) and (
                 part is None or count_seen(grid) > count_seen(part)
             ):
@@ -105,7 +105,7 @@ def _by_squares(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
     return corners.reshape(rows, columns, 2).astype(np.float64) if found else None
 
 
-_DETECTORS = {"lattice": _by_lattice, "sectors": _by_sectors, "squares": _by_squares}
+_DETECTORS = {"its saddle points": _by_lattice, "OpenCV's sectors": _by_sectors, "OpenCV's squares": _by_squares}
 """Ways to the corners (rows, columns, 2), NaN where one is not seen, or None."""
 _NEARLY_WHOLE = 0.8  # of the corners; where fewer are seen the next way is tried
 

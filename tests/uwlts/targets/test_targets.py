@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from uwlts.model.errors import DescriptionError, ImageError, TargetError
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, parse_target
-from uwlts.targets.detection import detect_lattice, find_circles, label_lattice
+from uwlts.targets.detection import detect_lattice, find_circles, label_lattice, refined, why_no_chessboard
 from uwlts.targets.detection.blobs import _ellipse_like
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
@@ -501,6 +501,14 @@ def test_an_image_gives_the_same_corners_whatever_came_before():
     again = [BOARD.detect(image).pixels for image in reversed(images)]
     for one, other in zip(first, reversed(again), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_grid_without_neighbours_is_none():
+    grid = np.full((BOARD.rows, BOARD.columns, 2), np.nan)
+    grid[np.arange(5), np.arange(5)] = 40.0 * np.arange(5)[:, None] + 60.0
+    image = np.full((300, 400), 90, np.uint8)
+    assert not np.isfinite(refined(image, grid)).any()
+    assert why_no_chessboard(image, grid) == "too few corners are seen"
 
 
 def test_squares_that_are_not_square_have_two_sides():

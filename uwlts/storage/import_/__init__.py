@@ -1,6 +1,6 @@
 """Images of any camera and program turned into a capture."""
 
-from uwlts.storage.import_.channels import Channel, one_channel
+from uwlts.storage.import_.channels import Channel, checked_channel, one_channel
 from uwlts.storage.import_.description import NAME as DESCRIPTION_NAME
 from uwlts.storage.import_.folder import Imported, import_images
 from uwlts.storage.import_.images import read_image
@@ -12,6 +12,7 @@ __all__ = [
     "Channel",
     "Imported",
     "KnownCamera",
+    "checked_channel",
     "image_files",
     "import_images",
     "one_channel",

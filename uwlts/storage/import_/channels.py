@@ -21,13 +21,14 @@ _EXPECTED = (
 )
 
 
-def _checked(text: str) -> str:
+def checked_channel(text: str) -> str:
+    """The name or formula of a channel; ValueError where it is none."""
     if text != "max":
         _evaluated(text, dict.fromkeys(_NAMES, np.ones(1, np.float32)))
     return text
 
 
-Channel = Annotated[str, AfterValidator(_checked)]
+Channel = Annotated[str, AfterValidator(checked_channel)]
 """Name or formula of a channel."""
 
 

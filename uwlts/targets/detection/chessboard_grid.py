@@ -37,7 +37,8 @@ def why_no_chessboard(grey: np.ndarray, board: np.ndarray) -> str | None:
     there = np.isfinite(board[..., 0])
     j, i = np.nonzero(there)
     flat, pixels = np.stack([i, j], axis=1).astype(np.float64), board[there]
-    homography = cv2.findHomography(flat, pixels)[0] if min(len(set(i)), len(set(j))) > 1 and len(flat) > 5 else None
+    sides, several = _sides(board), min(len(set(i)), len(set(j))) > 1 and len(flat) > 5
+    homography = cv2.findHomography(flat, pixels)[0] if several and len(sides) else None
     if homography is None:
         return "too few corners are seen"
     off = pixels - cv2.perspectiveTransform(flat[:, None], homography)[:, 0]
@@ -45,8 +46,7 @@ def why_no_chessboard(grey: np.ndarray, board: np.ndarray) -> str | None:
     terms = np.stack([x**a * y**b for a in range(4) for b in range(4 - a)], axis=1)
     if len(flat) > 2 * terms.shape[1]:
         off = off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0]
-    steps = np.concatenate([np.linalg.norm(np.diff(board, axis=axis), axis=2).ravel() for axis in (0, 1)])
-    share = np.sqrt(np.mean(np.sum(off**2, axis=1))) / np.nanmedian(steps)
+    share = np.sqrt(np.mean(np.sum(off**2, axis=1))) / np.median(sides)
     if not share < _LARGEST_RESIDUAL:
         return f"its corners lie {100 * share:.0f} % of a square off an even grid"
     centres = (board[:-1, :-1] + board[1:, 1:] + board[:-1, 1:] + board[1:, :-1]) / 4
@@ -82,14 +82,15 @@ def refined(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
     Grey levels are cut off near the middle between dark and bright, so that only the squares' edges count, not what
     light and noise do within them. Corners that leave the window, or do not lie between four squares, are NaN.
     """
-    sides = [np.nanmin(np.linalg.norm(np.diff(grid, axis=axis), axis=2)) for axis in (0, 1)]
-    half = int(np.clip(_WINDOW_SHARE * min(sides), _LEAST_WINDOW, _LARGEST_WINDOW))
+    found, sides = np.full_like(grid, np.nan), _sides(grid)
+    if not len(sides):
+        return found
+    half = int(np.clip(_WINDOW_SHARE * sides.min(), _LEAST_WINDOW, _LARGEST_WINDOW))
     rim = half + 3
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SMOOTHING)
     levels = _square_levels(smooth, grid)
     dark, bright = np.sort((levels[:2] + levels[2:]) / 2, axis=0)
     smooth = cv2.copyMakeBorder(smooth, rim, rim, rim, rim, cv2.BORDER_REPLICATE)
-    found = np.full_like(grid, np.nan)
     for place in np.argwhere(bright > dark):
         at = tuple(place)
         column, row = nearest = np.rint(grid[at]).astype(int)
@@ -101,6 +102,12 @@ def refined(image: np.ndarray, grid: np.ndarray) -> np.ndarray:
         if np.abs(moved - start).max() < half:
             found[at] = moved[0, 0] - rim + nearest
     return without_doubtful(smooth[rim:-rim, rim:-rim], found)
+
+
+def _sides(grid: np.ndarray) -> np.ndarray:
+    """Lengths (N,) of all sides of squares of which both corners are seen, px."""
+    lengths = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)])
+    return lengths[np.isfinite(lengths)]
 
 
 def count_seen(board: np.ndarray) -> int:
