@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
-from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
 from uwlts.calibration.target_images import TargetImage
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import CameraModel
@@ -66,7 +66,7 @@ class LensCalibration:
     left_out : number of an image left out, and the reason
     moved : (F,); how far leaving out each image used moves a parameter at most, in its standard deviations without it
     rejected_share : share of the points that were left out, of the images used
-    candidates : models compared; only the one used if it was given
+    candidates : models compared; none if the model was given
     covariance : (P, P); of the parameters, with the misses of an image taken to go together
     """
 
@@ -79,6 +79,12 @@ class LensCalibration:
     candidates: list[LensCandidate]
     options: CameraOptions
     covariance: np.ndarray
+
+    def values(self) -> dict[str, float]:
+        """Every estimated parameter."""
+        model = self.solution.model
+        intrinsics = Intrinsics(self.options, width_px=model.width_px, height_px=model.height_px)
+        return dict(zip(intrinsics.names, intrinsics.from_model(model).tolist(), strict=True))
 
     def std(self) -> dict[str, float]:
         """Standard uncertainty of every estimated parameter."""
@@ -133,29 +139,27 @@ def calibrate_lens(
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
-    options = usual
+    options, keep = usual, inliers(usual)
     if len(tried) > 1:
-        good = [
-            _without_outliers(image, inside)
-            for image, inside in zip(images, inliers(usual), strict=True)
-            if inside.mean() >= 1 - _LARGEST_REJECTED
-        ]
+        good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
         start = solved(good, usual, circles=True)
         candidates = _compared(_centred(good, start), tried, lambda i, o: solved(i, o, circles=False), progress)
         options = _chosen(candidates).options
-    keep = inliers(options)
-    doubtful = [number for number, inside in enumerate(keep) if inside.mean() < 1 - _LARGEST_REJECTED]
+    if options != usual:
+        keep = inliers(options)
     left_out = {
-        number: f"{100 * (1 - keep[number].mean()):.0f} % of its points do not lie where the others' lens sees them"
-        for number in doubtful
+        number: f"{100 * (1 - inside.mean()):.0f} % of its points do not lie where the others' lens sees them"
+        for number, inside in enumerate(keep)
+        if not _fits(inside)
     }
+    intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
     used = [number for number in range(len(images)) if number not in left_out]
     cleaned = {number: _without_outliers(images[number], keep[number]) for number in used}
     while True:
         chosen = [cleaned[number] for number in used]
         solution = solved(chosen, options, circles=True)
         centred = _centred(chosen, solution)
-        changes, others_std = _changes(centred, solution, lambda i, s: solved(i, options, s, circles=False))
+        changes, others_std = _changes(centred, solution, intrinsics, lambda i, s: solved(i, options, s, circles=False))
         unit = np.maximum(others_std, MAD_TO_STD * np.sqrt(len(used)) * np.nanmedian(np.abs(changes), axis=0))
         moved = np.nanmax(np.abs(changes) / unit, axis=1, initial=0.0)
         worst = int(np.argmax(moved))
@@ -198,6 +202,11 @@ def _inliers(solution: CameraSolution) -> list[np.ndarray]:
     """Points (N,) of each image within five robust standard deviations of all."""
     limit = _OUTLIER * _scatter(solution)
     return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
+
+
+def _fits(inside: np.ndarray) -> bool:
+    """Whether an image has enough points (N,) within the limit to be one of the target."""
+    return bool(inside.mean() >= 1 - _LARGEST_REJECTED)
 
 
 def _without_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
@@ -248,7 +257,7 @@ def _compared(
 
 def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
     """Mean square distance of an image's points from where the model sees them, in the pose that fits them best."""
-    matrix, coefficients = model.matrix(), np.array([*model.distortion.model_dump().values()])
+    matrix, coefficients = model.matrix(), model.coefficients()
     found, rotation, shift = cv2.solvePnP(image.points_mm, image.pixels, matrix, coefficients)
     if not found:
         raise CalibrationError("no pose of the target explains one of its images")
@@ -266,13 +275,14 @@ def _chosen(candidates: list[LensCandidate]) -> LensCandidate:
 def _changes(
     images: list[TargetImage],
     solution: CameraSolution,
+    intrinsics: Intrinsics,
     solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
 ) -> tuple[np.ndarray, np.ndarray]:
     """How far (F, P) leaving out each image moves the parameters, and their standard deviations (F, P) without it.
 
     NaN where the other images determine none.
     """
-    values = _values(solution)
+    values = intrinsics.from_model(solution.model)
     changes, std = np.full((2, len(images), len(values)), np.nan)
     for number in range(len(images)):
         rest = [image for place, image in enumerate(images) if place != number]
@@ -281,13 +291,6 @@ def _changes(
             without = solve(rest, start)
         except CalibrationError:
             continue
-        changes[number], std[number] = _values(without) - values, np.sqrt(np.diag(without.covariance))
+        changes[number] = intrinsics.from_model(without.model) - values
+        std[number] = np.sqrt(np.diag(without.covariance))
     return changes, std
-
-
-def _values(solution: CameraSolution) -> np.ndarray:
-    """The estimated parameters (P,)."""
-    model = solution.model
-    known = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
-    known |= model.distortion.model_dump()
-    return np.array([known[name] for name in solution.parameters])

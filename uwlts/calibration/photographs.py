@@ -56,27 +56,6 @@ class CameraCalibration:
     photographs: list[Photograph]
     warnings: list[str]
 
-    def lines(self) -> list[str]:
-        """The result, as text."""
-        lens, model = self.lens, self.lens.solution.model
-        used = len(lens.used)
-        std = lens.std()
-        values = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
-        values |= model.distortion.model_dump()
-        lines = [f"{used} of {len(self.photographs)} images used, {lens.solution.rms_px():.3f} px rms"]
-        lines += [f"{100 * lens.rejected_share:.1f} % of their points left out as outliers"]
-        if lens.candidates:
-            lines.append("models, misses of images that each was not calibrated from:")
-            lines += [
-                f"  {each.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == lens.options else "")
-                for each in lens.candidates
-            ]
-        for name in lens.solution.parameters:
-            digits = 3 if name in ("f", "fx", "fy", "cx", "cy") else 6
-            unit = " px" if digits == 3 else ""
-            lines.append(f"{name} = {values[name]:.{digits}f} +- {std[name]:.{digits}f}{unit}")
-        return lines
-
 
 def calibrate_camera(
     folder: str | Path,

@@ -161,6 +161,8 @@ def camera(
         distortion: Distortion coefficients to estimate; auto: those that predict images left out best.
         pixels: Whether pixels are square or free to be not; auto: as distortion.
     """
+    from uwlts.report.camera_page import camera_lines
+
     page = out.with_suffix(".html")
     for path in (out, page):
         refuse_unsuitable(path, overwrite=overwrite)
@@ -170,7 +172,7 @@ def camera(
         )
     uwlts.write_camera(out, found, overwrite=overwrite)
     uwlts.write_camera_page(page, found, overwrite=overwrite)
-    show(found.lines())
+    show(camera_lines(found))
     warn(*found.warnings)
     print(f"wrote {out} and {page}")
 

@@ -7,6 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 import uwlts
+from uwlts.calibration.intrinsics import DISTORTION
 from uwlts.calibration.photographs import CameraCalibration, Photograph
 from uwlts.report.page_toolkit import BLUE, MISSING, RED, new_figure, plain_text, png_data_uri, render_page, svg_of
 from uwlts.report.page_toolkit import write_page as write_text
@@ -37,7 +38,7 @@ def write_camera_page(path: str | Path, camera: CameraCalibration, *, overwrite:
         "camera.html.j2",
         name=camera.folder.resolve().name,
         software=f"uwlts {uwlts.__version__}",
-        summary=[line for line in camera.lines() if not line.startswith(("  ", "models"))],
+        summary=_summary(camera),
         models=models,
         rows=rows,
         misses=_misses(camera),
@@ -46,6 +47,32 @@ def write_camera_page(path: str | Path, camera: CameraCalibration, *, overwrite:
         ],
     )
     write_text(path, text, overwrite=overwrite)
+
+
+def camera_lines(camera: CameraCalibration) -> list[str]:
+    """The result, as text."""
+    taken = camera.lens.options
+    models = [
+        f"  {each.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
+        for each in camera.lens.candidates
+    ]
+    return _summary(camera) + (
+        ["models, misses of images that each was not calibrated from:", *models] if models else []
+    )
+
+
+def _summary(camera: CameraCalibration) -> list[str]:
+    """Images used, misses, and the parameters with their standard uncertainties."""
+    lens = camera.lens
+    lines = [
+        f"{len(lens.used)} of {len(camera.photographs)} images used, {lens.solution.rms_px():.3f} px rms",
+        f"{100 * lens.rejected_share:.1f} % of their points left out as outliers",
+    ]
+    std = lens.std()
+    for name, value in lens.values().items():
+        digits, unit = (6, "") if name in DISTORTION else (3, " px")
+        lines.append(f"{name} = {value:.{digits}f} +- {std[name]:.{digits}f}{unit}")
+    return lines
 
 
 def _used(camera: CameraCalibration) -> list[Photograph]:

@@ -1,5 +1,7 @@
 """The chessboard target, seen as a whole or in part."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Literal
 
 import cv2
@@ -92,21 +94,21 @@ def _by_lattice(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
     return find_board(grey, columns, rows)
 
 
-def _by_sectors(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
+def _by_opencv(
+    find: Callable[..., tuple[bool, np.ndarray]], flags: int, grey: np.ndarray, columns: int, rows: int
+) -> np.ndarray | None:
     # What OpenCV draws at random is the same for every image, whatever came before it.
     cv2.setRNGSeed(0)
-    found, corners = cv2.findChessboardCornersSB(grey, (columns, rows), flags=_SECTOR_FLAGS)
+    found, corners = find(grey, (columns, rows), flags=flags)
     return corners.reshape(rows, columns, 2).astype(np.float64) if found else None
 
 
-def _by_squares(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
-    cv2.setRNGSeed(0)
-    found, corners = cv2.findChessboardCorners(grey, (columns, rows), flags=_QUAD_FLAGS)
-    return corners.reshape(rows, columns, 2).astype(np.float64) if found else None
-
-
-_DETECTORS = {"its saddle points": _by_lattice, "OpenCV's sectors": _by_sectors, "OpenCV's squares": _by_squares}
-"""Ways to the corners (rows, columns, 2), NaN where one is not seen, or None."""
+_DETECTORS = {
+    "its saddle points": _by_lattice,
+    "OpenCV's sectors": partial(_by_opencv, cv2.findChessboardCornersSB, _SECTOR_FLAGS),
+    "OpenCV's squares": partial(_by_opencv, cv2.findChessboardCorners, _QUAD_FLAGS),
+}
+"""Detectors of corners (rows, columns, 2), NaN where one is not seen; they return None where they find no board."""
 _NEARLY_WHOLE = 0.8  # of the corners; where fewer are seen the next way is tried
 
 

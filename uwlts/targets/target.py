@@ -130,6 +130,11 @@ class Target(Description, ABC):
         corners = self.extent_mm
         return rectangle_corners(corners.min(axis=0) - margin[:2], corners.max(axis=0) + margin[2:])
 
+    def on_plate(self, places_mm: np.ndarray) -> np.ndarray:
+        """Whether (N,) places (N, 2) in the target's plane lie on the flat plate; False for those that are NaN."""
+        corners = self.plate_mm
+        return ((places_mm >= corners.min(axis=0)) & (places_mm <= corners.max(axis=0))).all(axis=1)
+
     def findable(self, in_view: np.ndarray) -> bool:
         """Whether `detect` finds the target if these (N,) of its points are in the image, as in `indices`."""
         return bool(in_view.sum() >= max(min(_FEWEST_POINTS, len(in_view)), _SMALLEST_SHARE * len(in_view)))

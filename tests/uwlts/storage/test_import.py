@@ -130,8 +130,8 @@ def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Pat
     rng = np.random.default_rng(4)
     red, green, blue = (rng.integers(0, 256, SHAPE, dtype=np.uint8) for _ in range(3))
     images = {f"{n}.png": np.dstack([blue, green, red]) for n in range(2)}
-    told = TOLD | {"laser": "*.png", "lamp": "*.png", "channel": "red - max(green, blue)", "lamp_channel": "green"}
-    folder = folder_of(tmp_path, images, told)
+    both = {"laser": "*.png", "lamp": "*.png", "channel": "red - max(green, blue)", "lamp_channel": "green"}
+    folder = folder_of(tmp_path, images, TOLD | both)
     found = import_images(folder, tmp_path / "out.h5")
     assert (found.laser, found.lamp) == (2, 2)
     with Capture(tmp_path / "out.h5") as capture:

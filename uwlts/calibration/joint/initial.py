@@ -6,7 +6,6 @@ from typing import assert_never
 
 import cv2
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from uwlts.calibration.camera import placement_pose, solve_camera
 from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
@@ -202,9 +201,7 @@ def _evidence(
     stage_mm = np.array([entry.stage_mm for entry in found.images])
     shifts = stage_mm[image] - stage_mm[placement.image[0]] if staged else np.zeros(len(image))
     at = seen_by.on_target(pixels, pose, shifts[:, None] * placement.direction(np.empty(0)))
-    hull = ConvexHull(found.target.plate_mm).equations
-    with np.errstate(invalid="ignore"):
-        on_target = (at[:, :2] @ hull[:, :2].T + hull[:, 2] <= 0).all(axis=1)
+    on_target = found.target.on_plate(at[:, :2])
     evidence = TargetEvidence(
         view=series.view,
         placement=placement,

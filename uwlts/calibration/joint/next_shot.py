@@ -263,12 +263,10 @@ def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
     rows = np.stack([sheet.normal, facing, along])
     centre = pose[:3, :3] @ middle + pose[:3, 3]
     start = np.linalg.solve(rows, np.array([sheet.offset_mm, facing @ centre, along @ centre]))
-    plate = target.plate_mm
-    reach = float(np.ptp(plate, axis=0).sum())
+    reach = float(np.ptp(target.plate_mm, axis=0).sum())
     points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
     at = (points - pose[:3, 3]) @ pose[:3, :3]
-    on_target = ((at[:, :2] >= plate.min(axis=0)) & (at[:, :2] <= plate.max(axis=0))).all(axis=1)
-    return _lines_through(known, known.project(points[on_target]))
+    return _lines_through(known, known.project(points[target.on_plate(at[:, :2])]))
 
 
 def _on_lines(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:

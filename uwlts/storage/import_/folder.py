@@ -174,16 +174,18 @@ def import_images(
             for number, row in enumerate(frames):
                 laser_on = row.light == "laser"
                 image, _ = reader.image(row.file, laser_on=laser_on)
-                seen = np.maximum(image, 0).astype(reader.dtype, copy=False)
-                content.look(seen, laser_on=laser_on, name=Path(row.file).name)
+                unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
+                content.look(unsigned, laser_on=laser_on, name=Path(row.file).name)
                 if laser_on and zero:
-                    background = None if row.background is None else reader.background(row.background)
-                    image = without_background(image, background, zero_dn=zero)
+                    unlit = np.zeros_like(image) if row.background is None else reader.background(row.background)
+                    image = without_background(image, unlit, zero_dn=zero)
+                else:
+                    image = unsigned
                 if laser_on:
                     content.look_for_stripe(image)
                 # An unknown exposure or time is stored as 0; the provenance says so.
                 exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s]).tolist()
-                image = np.maximum(image, 0).astype(dtype, copy=False)
+                image = image.astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
             content.refuse_black()

@@ -119,7 +119,6 @@ def grey_values(image: np.ndarray, *, bits: int, aligned: str, name: str) -> np.
     return image
 
 
-def without_background(image: np.ndarray, background: np.ndarray | None, *, zero_dn: int) -> np.ndarray:
-    """Image, less the background if there is one (H, W), as uint16: ``zero_dn`` stands for no light of the laser."""
-    difference = image.astype(np.int32) - (0 if background is None else background)
-    return np.clip(difference + zero_dn, 0, np.iinfo(np.uint16).max).astype(np.uint16)
+def without_background(image: np.ndarray, background: np.ndarray, *, zero_dn: int) -> np.ndarray:
+    """Image minus background (H, W) of one type, as uint16: ``zero_dn`` stands for no difference; saturates."""
+    return cv2.addWeighted(image, 1.0, background, -1.0, zero_dn, dtype=cv2.CV_16U)

@@ -9,8 +9,8 @@ _SIGMA = 1.5  # blur before squares are compared, px
 _LARGEST_RESIDUAL = 1 / 30  # of a square's side, rms
 _ALTERNATING = 0.9  # share of neighbouring squares of which the one that should be is the darker
 _IN_SQUARE, _UNLIKE = 0.3, 0.6
-"""Where the four squares around a corner are looked at, in their sides; how much opposite ones may differ, over the
-difference between dark and bright."""
+"""Offset at which the four squares around a corner are sampled, in side lengths; largest difference between opposite
+squares, as a share of that between dark and bright ones."""
 _WINDOW_SHARE, _LEAST_WINDOW, _LARGEST_WINDOW = 0.3, 2, 20
 """Half the side of the window in which a corner is refined: as a share of a square's, and its limits in px."""
 _SMOOTHING, _CUT_OFF = 0.8, 0.3  # px; share of the contrast to either side of the middle level

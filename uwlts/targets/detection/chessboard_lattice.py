@@ -140,8 +140,8 @@ class _Corners:
 def find_board(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
     """Corners (rows, columns, 2), NaN where one is not seen, of a board in a grey image (H, W); None without one.
 
-    Of a board that is partly outside the image those in view are numbered from the sides that are inside; None where
-    these do not tell the place. To a pixel or so; which of the board's half turns is seen is left open.
+    If a board is partly outside the image, the corners in view are numbered from the sides that are inside; None if
+    their place is ambiguous. Corners are accurate to about a pixel, and the board may be turned by half a turn.
     """
     best = None
     for scale in _SCALES:
@@ -188,7 +188,7 @@ def _trimmed(piece: np.ndarray) -> np.ndarray:
 
 
 def _board(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The board of which a piece (J, I, 2) is seen; None where it is none, or its place is not told."""
+    """The board (rows, columns, 2) that contains a piece (J, I, 2); None if none does, or its place is ambiguous."""
     boards = []
     for turned in (piece, np.rot90(piece)):
         board = _within(_without_strays(turned, columns, rows), columns, rows, shape) if turned.size else None
@@ -211,7 +211,7 @@ def _without_strays(piece: np.ndarray, columns: int, rows: int) -> np.ndarray:
 
 
 def _within(piece: np.ndarray, columns: int, rows: int, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The board with a piece (J, I, 2) at its place; None where the image does not tell it."""
+    """The board (rows, columns, 2) with a piece (J, I, 2) at its place; None if the place is ambiguous."""
     offsets = []
     for axis, size in enumerate((rows, columns)):
         along = np.moveaxis(piece, axis, 0)
