@@ -10,6 +10,7 @@ import pytest
 from uwlts.calibration.camera import solve_camera
 from uwlts.calibration.evidence import air_evidence
 from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.target_stripes import stripe_on_target
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
@@ -141,3 +142,28 @@ def test_a_board_beside_a_saturated_stripe_is_found(frame: str):
     flat = cv2.findHomography(view.points_mm[:, :2], view.pixels)[0]
     away = cv2.perspectiveTransform(view.points_mm[:, None, :2], flat)[:, 0] - view.pixels
     assert np.sqrt(np.mean(away**2)) < 1.0 and np.linalg.norm(away, axis=1).max() < 3.0
+
+
+@pytest.mark.parametrize("frame", ["frame0014", "frame0016"])
+def test_a_wide_saturated_stripe_is_found_along_its_whole_length(frame: str):
+    image = cv2.imread(str(DATA / "etna" / f"{frame}.png"), cv2.IMREAD_GRAYSCALE)
+    board = ChessboardTarget(columns=7, rows=6, square_mm=10.0, margin_mm=60.0)
+    stripe = stripe_on_target(image, board.detect(image), board, stripe_along="height", saturation=255.0)
+    # By eye the line crosses the plate on every row.
+    across, rows = stripe.pixels.T
+    assert len(rows) > 0.95 * len(image) and len(set(rows)) == len(rows)
+    # It scatters about a smooth curve, of more bends than lens and plate have, no more than by simple methods: the
+    # middle of the pixels above a level, and their centre of mass.
+    scatter = _scatter(rows, across)
+    for level in (128, 200):
+        lit = [
+            np.flatnonzero(image[int(row)] * (np.abs(np.arange(1280) - x) < 40) >= level) for x, row in stripe.pixels
+        ]
+        middle = np.array([0.5 * (pixels[0] + pixels[-1]) for pixels in lit])
+        mass = np.array([np.average(x, weights=image[int(row), x]) for row, x in zip(rows, lit, strict=True)])
+        assert scatter < 1.1 * min(_scatter(rows, middle), _scatter(rows, mass))
+
+
+def _scatter(rows: np.ndarray, across: np.ndarray) -> float:
+    away = across - np.polynomial.Polynomial.fit(rows, across, 8)(rows)
+    return float(np.sqrt(np.mean(away**2)))

@@ -3,25 +3,27 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydantic import ValidationError
 
 from uwlts.calibration.image_quality import why_not_found
 from uwlts.calibration.target_images import TargetImage
+from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
 from uwlts.stripe.recording import shown_stripe
-from uwlts.targets import Target, parse_target
+from uwlts.targets import Target, TargetView, parse_target
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of the step, the number of images done and the number of all."""
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
+_MANY_STRAYS = 0.05  # share of a capture's stripe points from which those left out are worth a warning
 _LOOKED_AT = 15  # images of a capture in which the reason for a missing stripe is sought
 
 
@@ -35,6 +37,7 @@ class AirEvidence:
     stripes: list[np.ndarray]  # (N, 2) each; stripe pixels on the target at the position of the image; may be empty
     warnings: list[str]  # images left out, and why
     no_stripe: str = ""  # why there is no stripe at all; empty where there is one
+    strays: list[int] = field(default_factory=list)  # stripe pixels of each left out as off the curve of the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ def air_evidence(
     if any(target != targets[0] for target in targets):
         raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
     total, done = sum(map(len, captures)), 0
-    images, frames, stripes, warnings = [], [], [], []
+    images, frames, views, stripes, strays, warnings = [], [], [], [], [], []
     reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
@@ -74,7 +77,9 @@ def air_evidence(
                 view = targets[0].detect(image)
                 images.append(TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), number))
                 frames.append((number, frame))
+                views.append(view)
                 stripes.append(np.empty((0, 2)))
+                strays.append(0)
             except (TargetError, CalibrationError) as error:
                 reason = why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
                 reasons[reason] += 1
@@ -84,20 +89,29 @@ def air_evidence(
         for frame, image in capture.frames(laser_on=True):
             here = np.flatnonzero(np.abs(positions - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
             if len(here):
-                place, more = first + int(here[0]), _stripe_of(capture, frame, image, stripe, warnings)
-                stripes[place] = np.vstack([stripes[place], more])
+                place = first + int(here[0])
+                found = _stripe_of(capture, frame, image, stripe, warnings, on=(views[place], targets[0]))
+                stripes[place] = np.vstack([stripes[place], found.pixels])
+                strays[place] += found.strays
             else:
                 warnings.append(
                     f"{capture.path.name}, frame {frame}: stripe left out, no target was found at "
                     f"{capture.stage_mm[frame]:g} mm"
                 )
             done = _report(progress, "target", done, total)
+        astray, kept = sum(strays[first:]), sum(map(len, stripes[first:]))
+        if astray > _MANY_STRAYS * (astray + kept):
+            share = 100 * astray / (astray + kept)
+            warnings.append(
+                f"{capture.path.name}: {share:.0f} % of the stripe on the target was left out, for it lies beside the "
+                "curve of the rest: reflections, a second line, or a plate that is not flat"
+            )
     if not images:
         raise CalibrationError(
             f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
         )
     no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
-    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe)
+    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, strays)
 
 
 def step_evidence(
@@ -126,7 +140,7 @@ def step_evidence(
         wavelength = capture.header.sensor.laser.wavelength_nm
         index = capture.header.medium.refractive_index(wavelength) if medium_index is None else medium_index
         for frame, image in capture.frames(laser_on=True):
-            pixels = _stripe_of(capture, frame, image, stripe, warnings)
+            pixels = _stripe_of(capture, frame, image, stripe, warnings).pixels
             if len(pixels):
                 found.append(StepEvidence(pixels, standard, index, f"{capture.path.name}, frame {frame}"))
             done = _report(progress, "step", done, total)
@@ -175,19 +189,30 @@ def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
 
 
 def _stripe_of(
-    capture: Capture, frame: int, image: np.ndarray, options: StripeOptions, warnings: list[str]
-) -> np.ndarray:
-    """Stripe pixels (N, 2) of an image; none, and a warning, if it shows no stripe of use."""
+    capture: Capture,
+    frame: int,
+    image: np.ndarray,
+    options: StripeOptions,
+    warnings: list[str],
+    *,
+    on: tuple[TargetView, Target] | None = None,
+) -> TargetStripe:
+    """The stripe in an image, of a target as it was seen there if that is given; none, and a warning, if of no use."""
     along, clip = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     try:
-        pixels = extract_stripe(image, stripe_along=along, options=options, saturation=clip).pixels()
-        if len(pixels) >= _FEWEST_LINES:
-            return pixels
-        reason = f"found on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
+        if on is None:
+            found = TargetStripe(
+                extract_stripe(image, stripe_along=along, options=options, saturation=clip).pixels(), 0
+            )
+        else:
+            found = stripe_on_target(image, *on, stripe_along=along, options=options, saturation=clip)
+        if len(found.pixels) >= _FEWEST_LINES:
+            return found
+        reason = f"found on {len(found.pixels)} lines only, at least {_FEWEST_LINES} are of use"
     except ImageError as error:
         reason = str(error)
     warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {reason}")
-    return np.empty((0, 2))
+    return TargetStripe(np.empty((0, 2)), 0)
 
 
 def _report(progress: Progress | None, name: str, done: int, total: int) -> int:

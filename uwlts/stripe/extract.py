@@ -36,6 +36,12 @@ _CLEAR = 3.0
 _SPIKE = 0.85
 """Share of the least height below which three pixels' mean is noise; noise may lower that of a stripe a little."""
 
+_BRIGHT = 0.25
+"""Height over saturation from which something wide is a stripe rather than haze."""
+
+_MANY = 0.25
+"""Lines with a stripe that is too wide, over those with one that is measured, from which a wider window is tried."""
+
 _SEARCHED_BLOCKS = np.array([[-2], [-1], [0], [1], [2]])
 """Blocks that one window covers."""
 
@@ -73,7 +79,7 @@ def extract_stripe(
         If the image, the background, `stripe_along` or `saturation` is not as described, or the lines are shorter
         than two search windows, too short to distinguish stripe and background.
     """
-    half, block = options.half_window_px, options.half_window_px // 2
+    half = options.half_window_px
     _check_image(image, name="image")
     if stripe_along not in ("height", "width"):
         raise ImageError(f'stripe_along is {stripe_along!r}; use "height" (lines are rows) or "width" (columns)')
@@ -102,21 +108,38 @@ def extract_stripe(
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
+    found = _found(profiles, options, clip)
+    # A wider window is taken only where it shows what the narrower one did not.
+    wider, widest = options, min(options.widest_window_px, length // 4)
+    while found.too_wide() and 2 * wider.half_window_px <= widest:
+        wider = wider.doubled()
+        measured = _found(profiles, wider, clip)
+        if not measured.too_wide():
+            found, options = measured, wider
+
+    none = found.status == _NO_STRIPE
+    if none.any():
+        raw = profiles if signal is image else _as_profiles(image, stripe_along=stripe_along)
+        _, low = block_extremes(raw, options.half_window_px // 2)
+        found.status[none & (low.max(axis=0) >= clip)] = _SATURATED
+    if options.end_lines:
+        good = found.status == _OK
+        jump_px = options.half_window_px / 2
+        found.discard(_half_lit(good, found.centre, lines=options.end_lines, jump_px=jump_px), _END)
+    return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
+
+
+def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
+    """The stripe on each of the profiles (N, L), sought with one size of window."""
+    block = options.half_window_px // 2
     high, low = block_extremes(profiles, block)
     # Two blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
     board = np.zeros((high.shape[0] + 4, high.shape[1]), high.dtype)
     contrast = block_contrast(high, low, out=board[2:-2])
-    found = _search(profiles, board, candidates.noise_from_contrast(contrast, block), options)
-
-    none = found.status == _NO_STRIPE
-    if none.any():
-        if signal is not image:
-            _, low = block_extremes(_as_profiles(image, stripe_along=stripe_along), block)
-        found.status[none & (low.max(axis=0) >= clip)] = _SATURATED
-    if options.end_lines:
-        good = found.status == _OK
-        found.discard(_half_lit(good, found.centre, lines=options.end_lines, jump_px=half / 2), _END)
-    return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
+    found = _search(profiles, board, candidates.noise_from_contrast(contrast, block), options, clip)
+    # A plateau wider than the window does not even stick out.
+    found.wide[low.max(axis=0) >= clip] = True
+    return found
 
 
 @dataclass(frozen=True)
@@ -128,11 +151,20 @@ class _Lines:
     width: np.ndarray
     status: np.ndarray
     height: np.ndarray
+    wide: np.ndarray
+    """Whether something bright was too wide to be measured."""
 
     @classmethod
     def empty(cls, count: int) -> _Lines:
         amplitude, width, height = np.full((3, count), np.nan, np.float32)
-        return cls(np.full(count, np.nan), amplitude, width, np.full(count, _NO_STRIPE), height)
+        return cls(
+            np.full(count, np.nan), amplitude, width, np.full(count, _NO_STRIPE), height, np.zeros(count, np.bool_)
+        )
+
+    def too_wide(self) -> bool:
+        """Whether many lines show a stripe that is too wide to be measured."""
+        good = self.status == _OK
+        return int(np.count_nonzero(self.wide & ~good)) > _MANY * int(np.count_nonzero(good))
 
     def enter(self, lines: np.ndarray, peak: PeakWindow, method: str) -> None:
         centre, self.amplitude[lines] = place_centre(method, peak)
@@ -146,7 +178,7 @@ class _Lines:
             values[lines] = np.nan
 
 
-def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: StripeOptions) -> _Lines:
+def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: StripeOptions, clip: float) -> _Lines:
     """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
 
     Under rule `strongest` a line with a stripe is searched once more for a second one. `board` holds the contrasts with
@@ -177,6 +209,9 @@ def _search(profiles: np.ndarray, board: np.ndarray, noise: float, options: Stri
         peak = _centred_windows(profiles, lines, (chosen - 2) * block, fine, options)
         verdict = _judge(peak, profiles.shape[0], fine, options)
         stripe = verdict != _NO_STRIPE
+        if not stripe.all():
+            too_wide = ~peak.closed | (peak.sigma > options.half_window_px / FWHM_PER_SIGMA)
+            found.wide[lines[too_wide & (peak.height >= max(fine, _BRIGHT * clip))]] = True
         status = found.status[lines]
         again = status == _OK
         new = stripe & ~again

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum, StrEnum
 
 import numpy as np
@@ -48,6 +48,9 @@ class StripeOptions:
     half_window_px : int
         Pixels on either side of the centre that may be used: stripe, tails and the background beside them. Stripes
         whose full width at half maximum is at most this are measured. At least 8.
+    widest_window_px : int
+        `half_window_px` and `smoothing_px` are doubled, up to this window, while many lines of an image show a stripe
+        that is too wide to be measured, and bright: a quarter of the saturation or more, which no haze reaches.
     smoothing_px : float
         Sigma of the Gaussian low-pass across the stripe, px, for detection, width and the quadratic fit. The other
         methods place the centre on the unsmoothed profile.
@@ -73,6 +76,7 @@ class StripeOptions:
     method: str = "profile-fit"
     peak: PeakRule = PeakRule.STRONGEST
     half_window_px: int = 16
+    widest_window_px: int = 64
     smoothing_px: float = 1.0
     smoothing_lines: int = 1
     threshold_sigmas: float = 6.0
@@ -87,11 +91,15 @@ class StripeOptions:
             if value not in known:
                 raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in known)}")
         object.__setattr__(self, "peak", PeakRule(self.peak))
-        for name in ("half_window_px", "smoothing_lines", "end_lines"):
+        for name in ("half_window_px", "widest_window_px", "smoothing_lines", "end_lines"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise RangeError(f"{name} is {value!r}; expected a whole number")
-        ranges = {"half_window_px": (8, 512), "smoothing_px": (0.5, self.half_window_px / 4)}
+        ranges = {
+            "half_window_px": (8, 512),
+            "widest_window_px": (8, 512),
+            "smoothing_px": (0.5, self.half_window_px / 4),
+        }
         ranges |= {"smoothing_lines": (1, 101), "end_lines": (0, 100), "threshold_sigmas": (1.0, 1e6)}
         ranges |= {"threshold_floor": (0.0, 1e9), "min_fwhm_px": (0.0, self.half_window_px)}
         ranges |= {"ambiguous_ratio": (0.05, 1.0)}
@@ -100,6 +108,10 @@ class StripeOptions:
                 raise RangeError(f"{name} is {value!r}; expected a number from {low:g} to {high:g}")
         if self.smoothing_lines % 2 == 0:
             raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
+
+    def doubled(self) -> StripeOptions:
+        """The same for stripes twice as wide."""
+        return replace(self, half_window_px=2 * self.half_window_px, smoothing_px=2 * self.smoothing_px)
 
 
 @dataclass(frozen=True)

@@ -240,12 +240,26 @@ def test_anything_at_all_gives_a_status_and_agreeing_fields(dtype, rule, method)
 
 def test_plateau_wider_than_the_window_is_saturated():
     image = grey(gaussian(phases(), sigma=6, amplitude=255 * 8, length=160) + 20)
-    found = rows(image)
+    found = rows(image, options=StripeOptions(widest_window_px=16))
     assert (found.status == StripeStatus.SATURATED).all()
     assert np.isnan(found.centre_px).all()
-    wider = rows(image, options=StripeOptions(half_window_px=32))
-    assert (wider.status == StripeStatus.OK).all()
-    assert np.abs(wider.centre_px - phases()).max() < 0.1
+    for options in (StripeOptions(half_window_px=32), StripeOptions()):
+        wider = rows(image, options=options)
+        assert (wider.status == StripeStatus.OK).all()
+        assert np.abs(wider.centre_px - phases()).max() < 0.1
+
+
+@pytest.mark.parametrize(("height", "sigma", "found"), [(250, 9, True), (2000, 10, True), (40, 9, False)])
+def test_the_window_follows_a_wide_stripe_but_no_haze(height, sigma, found):
+    image = grey(gaussian(phases() + 60, sigma=sigma, amplitude=height, length=280) + 12)
+    assert (rows(image).status == StripeStatus.OK).all() == found
+    # On one line in ten only it is something else in the image.
+    usual = grey(gaussian(phases() + 60, sigma=2, amplitude=100, length=280) + 12)
+    few = np.where(np.arange(len(image))[:, None] % 10 == 0, image, usual)
+    narrow = np.arange(len(image)) % 10 != 0
+    np.testing.assert_array_equal(
+        rows(few).centre_px[narrow], rows(few, options=StripeOptions(widest_window_px=16)).centre_px[narrow]
+    )
 
 
 def test_ten_bit_saturation_is_the_callers():

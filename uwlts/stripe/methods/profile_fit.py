@@ -11,6 +11,8 @@ import math
 import cv2
 import numpy as np
 
+from uwlts.stripe.candidates import count_true
+from uwlts.stripe.methods import quadratic
 from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
 
 _STEPS, _FIRST_STEPS = 5, 2
@@ -28,6 +30,10 @@ _USUAL_CONTRAST, _PRIOR_PIXELS = 0.3, 5.0
 
 _NARROWEST, _WIDENING, _LONGEST_STEP = 0.4, 1.5, 0.5
 """Least sigma in px, its largest ratio to the half-height width's, and the largest change of a parameter at a time."""
+
+_SPECKLED_HALO, _MOSTLY, _PLATEAU = 0.023, 0.5, 5
+"""Noise beside a stripe over its height, and plateau over width and in px, above which its flanks tell less than its
+middle."""
 
 _SAMPLED = 256
 """Lines from which noise and contrast are taken; more would not make the fit better."""
@@ -48,7 +54,9 @@ def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarra
     Nelder, Generalized Linear Models, Ch. 9). As df/dp = f (1, d, d^2) with d = x - c, the equations hold moments of
     f^2 / v up to d^4.
 
-    Saturated pixels get no special care: the contrast gives the top so little weight that it would change little.
+    Saturated pixels get no special care: the contrast gives the top so little weight that it would change little. But
+    where they are most of the stripe, in a halo that has speckle too, the flanks are no Gaussian's: there the parabola
+    of `quadratic` scatters less.
     """
     near = np.rint(peak.middle)
     # About each peak's own pixel the powers of x stay small, and one matrix product sums them for all peaks.
@@ -84,7 +92,14 @@ def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarra
         log_height = log_height + change[0]
         centre = np.minimum(np.maximum(centre + np.sqrt(variance) * change[1], first), last)
         log_sigma = np.minimum(np.maximum(log_sigma + change[2], math.log(_NARROWEST)), widest)
-    return near + centre, None
+    centre = near + centre
+    haloed = np.flatnonzero((noise > _SPECKLED_HALO * peak.height) & (2.0 * half_width > _PLATEAU))
+    if haloed.size:
+        window = peak.window.take(haloed, axis=1)
+        plateau = count_true(window == window.max(axis=0))
+        flat = haloed[plateau > np.maximum(2.0 * _MOSTLY * half_width[haloed], _PLATEAU)]
+        centre[flat] = quadratic.centres(peak.keep(flat), kernel[flat])[0]
+    return centre, None
 
 
 def _pixels(near: np.ndarray, x: np.ndarray, lines: slice = slice(None)) -> np.ndarray:

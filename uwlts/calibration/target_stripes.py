@@ -1,0 +1,159 @@
+"""The stripe on a flat target: one smooth curve in the image, whatever else is bright there."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe
+from uwlts.targets import Target, TargetView
+
+_DEGREE = 4  # bends of lens, window, line optics and plate; more would follow strays
+_TRIALS = 300  # parabolas through three points; with half the points astray one in eight is free of them
+_BEYOND = 0.05  # of the plate's size; so far beyond it distortion may put its border in the image
+_OUTLIER, _LEAST_LIMIT_PX = 5.0, 1.0
+_FEWEST = 20  # points of a curve
+_LOST = 0.05  # share of the lines on the plate that may have no point on the curve without a second look
+
+
+@dataclass(frozen=True, eq=False)
+class TargetStripe:
+    """Stripe pixels (N, 2) on the plate of a target, and the number of those on it that lie beside the curve."""
+
+    pixels: np.ndarray
+    strays: int
+
+
+def stripe_on_target(
+    image: np.ndarray,
+    view: TargetView,
+    target: Target,
+    *,
+    stripe_along: str,
+    saturation: float,
+    options: StripeOptions = StripeOptions(),
+) -> TargetStripe:
+    """Find the stripe on a flat target whose points were seen at the same place.
+
+    The stripe is where most of the points lie on one smooth curve. Where lines show something else it is looked for a
+    second time, near the curve alone. Points beside the curve, as of reflections, are left out; so are those outside
+    the plate. Parameters and errors as of `extract_stripe`.
+    """
+    stripe = extract_stripe(image, stripe_along=stripe_along, saturation=saturation, options=options)
+    # (x across, line) of every point, whichever way the stripe runs.
+    plate = _plate_in_image(view, target)
+    on_plate = _inside(plate, stripe.pixels())
+    lines, across = stripe.lines[on_plate], stripe.centre_px[stripe.lines][on_plate]
+    if len(lines) < _FEWEST:
+        return TargetStripe(stripe.pixels()[on_plate], 0)
+    curve = _Curve.through(lines, across, tolerance_px=max(2.0, 0.25 * float(np.median(stripe.width_px[lines]))))
+    if curve is None:
+        return TargetStripe(np.empty((0, 2)), len(lines))
+    near = curve.holds(lines, across)
+    along_curve = np.arange(len(stripe.status))
+    expected = _inside(plate, _pixels(along_curve, curve.at(along_curve), stripe_along))
+    missing = np.setdiff1d(along_curve[expected], lines[near])
+    strays = int(np.count_nonzero(~near))
+    lines, across = lines[near], across[near]
+    if len(missing) > _LOST * np.count_nonzero(expected):
+        width = float(np.median(stripe.width_px[lines]))
+        more_lines, more_across = _near_curve(image, curve, missing, stripe_along, saturation, options, width)
+        lines, across = np.concatenate([lines, more_lines]), np.concatenate([across, more_across])
+        curve = curve.refined(lines, across)
+        near = curve.holds(lines, across)
+        lines, across = lines[near], across[near]
+    order = np.argsort(lines)
+    return TargetStripe(_pixels(lines[order], across[order], stripe_along), strays)
+
+
+def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndarray:
+    """Image coordinates (N, 2) of places on profile lines."""
+    return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
+
+
+def _plate_in_image(view: TargetView, target: Target) -> np.ndarray:
+    """Corners (4, 2) of the plate in the image, a little beyond it."""
+    homography = cv2.findHomography(view.points_mm[:, :2], view.pixels)[0]
+    plate = target.plate_mm
+    wider = plate + _BEYOND * (plate - plate.mean(axis=0))
+    return cv2.perspectiveTransform(wider[:, None], homography)[:, 0]
+
+
+def _inside(corners: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Whether (N,) pixels (N, 2) are within a convex polygon (V, 2)."""
+    sides = np.roll(corners, -1, axis=0) - corners
+    apart = pixels[:, None] - corners
+    turn = sides[:, 0] * apart[..., 1] - sides[:, 1] * apart[..., 0]
+    return np.all(turn >= 0, axis=1) | np.all(turn <= 0, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """A polynomial of a place across the stripe over the line's number, and how far off its points lie at most."""
+
+    polynomial: np.polynomial.Polynomial
+    limit_px: float
+
+    @classmethod
+    def through(cls, lines: np.ndarray, across: np.ndarray, *, tolerance_px: float) -> "_Curve | None":
+        """The curve on which most points lie; None where too few do."""
+        middle, half = 0.5 * (lines.max() + lines.min()), max(0.5 * np.ptp(lines), 1.0)
+        powers = ((lines - middle) / half)[:, None] ** np.arange(3)
+        rng = np.random.default_rng(0)
+        best = np.zeros(len(lines), bool)
+        for chosen in np.sort(rng.random((_TRIALS, len(lines))).argpartition(3, axis=1)[:, :3], axis=1):
+            if np.ptp(lines[chosen]) < 0.1 * half:
+                continue
+            parabola, _, rank, _ = np.linalg.lstsq(powers[chosen], across[chosen], rcond=None)
+            near = np.abs(across - powers @ parabola) <= tolerance_px
+            if rank == 3 and near.sum() > best.sum():
+                best = near
+        if best.sum() < _FEWEST:
+            return None
+        fitted = np.polynomial.Polynomial.fit(lines[best], across[best], 2)
+        # Outside the points of a parabola only, the limit must not depend on points that are none of the stripe's.
+        return cls(fitted, tolerance_px).refined(lines, across)
+
+    def refined(self, lines: np.ndarray, across: np.ndarray) -> "_Curve":
+        """The curve of full degree through the points near this one, found anew until they stay the same."""
+        curve, near = self, self.holds(lines, across)
+        for _ in range(10):
+            polynomial = np.polynomial.Polynomial.fit(lines[near], across[near], _DEGREE)
+            apart = np.abs(across[near] - polynomial(lines[near]))
+            limit = max(_OUTLIER * MAD_TO_STD * float(np.median(apart)), _LEAST_LIMIT_PX)
+            curve = _Curve(polynomial, limit)
+            before, near = near, curve.holds(lines, across)
+            if (near == before).all():
+                break
+        return curve
+
+    def at(self, lines: np.ndarray) -> np.ndarray:
+        return self.polynomial(lines)
+
+    def holds(self, lines: np.ndarray, across: np.ndarray) -> np.ndarray:
+        """Whether points lie on it."""
+        return np.abs(across - self.at(lines)) <= self.limit_px
+
+
+def _near_curve(
+    image: np.ndarray,
+    curve: _Curve,
+    lines: np.ndarray,
+    stripe_along: str,
+    saturation: float,
+    options: StripeOptions,
+    width_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lines among ``lines`` (M,) with a stripe in a band about the curve, and the place of its centre."""
+    while options.half_window_px < min(width_px, options.widest_window_px):
+        options = options.doubled()
+    profiles = image if stripe_along == "height" else image.T
+    start = np.rint(curve.at(np.arange(len(profiles)))).astype(int) - 2 * options.half_window_px
+    columns = start[:, None] + np.arange(4 * options.half_window_px + 1)
+    band = np.take_along_axis(profiles, columns.clip(0, profiles.shape[1] - 1), axis=1)
+    found: Stripe = extract_stripe(band, stripe_along="height", saturation=saturation, options=options)
+    good = lines[found.status[lines] == StripeStatus.OK]
+    across = found.centre_px[good] + start[good]
+    inside = (across >= 0) & (across <= profiles.shape[1] - 1)
+    return good[inside], across[inside]
