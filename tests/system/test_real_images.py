@@ -1,6 +1,7 @@
 """Import, target detection and stripe extraction on real images that others took (tests/data/README.md)."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,8 @@ import pytest
 from uwlts.calibration.camera import solve_camera
 from uwlts.calibration.evidence import air_evidence
 from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.lens import LensChoice
+from uwlts.calibration.sequential import CalibrationOptions, gather, solve
 from uwlts.calibration.target_stripes import stripe_on_target
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
@@ -134,7 +137,7 @@ def test_dots_under_strong_distortion_are_numbered(number, points, columns_rows,
 
 @pytest.mark.parametrize("frame", ["frame0014", "frame0016"])
 def test_a_board_beside_a_saturated_stripe_is_found(frame: str):
-    image = cv2.imread(str(DATA / "etna" / f"{frame}.png"), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(DATA / "etna" / f"{frame}.jpg"), cv2.IMREAD_GRAYSCALE)
     view = ChessboardTarget(columns=7, rows=6, square_mm=10.0).detect(image)
     assert len(view.pixels) == 42
     # The lens's distortion leaves less than half a pixel of a flat board's homography; a corner that is not one lies a
@@ -146,7 +149,7 @@ def test_a_board_beside_a_saturated_stripe_is_found(frame: str):
 
 @pytest.mark.parametrize("frame", ["frame0014", "frame0016"])
 def test_a_wide_saturated_stripe_is_found_along_its_whole_length(frame: str):
-    image = cv2.imread(str(DATA / "etna" / f"{frame}.png"), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(DATA / "etna" / f"{frame}.jpg"), cv2.IMREAD_GRAYSCALE)
     board = ChessboardTarget(columns=7, rows=6, square_mm=10.0, margin_mm=60.0)
     stripe = stripe_on_target(image, board.detect(image), board, stripe_along="height", saturation=255.0)
     # By eye the line crosses the plate on every row.
@@ -162,6 +165,48 @@ def test_a_wide_saturated_stripe_is_found_along_its_whole_length(frame: str):
         middle = np.array([0.5 * (pixels[0] + pixels[-1]) for pixels in lit])
         mass = np.array([np.average(x, weights=image[int(row), x]) for row, x in zip(rows, lit, strict=True)])
         assert scatter < 1.1 * min(_scatter(rows, middle), _scatter(rows, mass))
+
+
+ETNA = """
+medium = "air"
+laser = "frame*.jpg"
+lamp = "frame*.jpg"
+[stage]
+free = true
+[sensor]
+base = "thesis"
+name = "etna"
+camera = { stripe_along = "height", window = { mounted = false } }
+laser = { origin_mm = [-120.0, 0.0, 0.0], axis = [0.53, 0.0, 0.848] }
+[target]
+kind = "chessboard"
+columns = 7
+rows = 6
+square_mm = 10.0
+margin_mm = 60.0
+"""
+
+
+@pytest.mark.slow
+def test_a_folder_of_photographs_calibrates_camera_and_sheet(tmp_path: Path):
+    """Board and stripe in one image, poses free: all of it, and halves that agree within what is stated."""
+    (tmp_path / "import.toml").write_text(ETNA)
+    import_images(DATA / "etna", tmp_path / "etna.h5", description=tmp_path / "import.toml")
+    options = CalibrationOptions(poses="free", lens=LensChoice())
+    with Capture(tmp_path / "etna.h5") as capture:
+        evidence = gather([capture], [], options=options)
+    air = evidence.air
+    assert len(air.images) == 16 and min(map(len, air.stripes)) > 700
+    halves = [np.arange(start, 16, 2) for start in (0, 1)]
+    chosen = [replace(evidence, air=air.only(half, [air.images[n] for n in half])) for half in halves]
+    whole, *parts = (solve(each, options=options) for each in (evidence, *chosen))
+    # The robot's poses, which no calibration has seen, agree best with 2350 to 2380 px.
+    assert whole.camera.model.fx_px == pytest.approx(2365, abs=2.5 * whole.camera.std()["f"])
+    assert 0.005 < np.degrees(whole.sheet.normal_std_rad) < 2.0
+    focal = [part.camera.model.fx_px for part in parts]
+    assert abs(focal[0] - focal[1]) < 3 * np.hypot(*(part.camera.std()["f"] for part in parts))
+    one, other = (np.array(part.calibration.sheet.normal) for part in parts)
+    assert np.arccos(one @ other) < 3 * np.hypot(*(part.sheet.normal_std_rad for part in parts))
 
 
 def _scatter(rows: np.ndarray, across: np.ndarray) -> float:

@@ -8,6 +8,7 @@ from uwlts.calibration.camera import Poses
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.procedure import calibrate_jointly
+from uwlts.calibration.lens import Distortion, LensChoice, Pixels
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
@@ -29,7 +30,8 @@ def calibrate(
     unknown_sizes: bool = False,
     refractions: Literal[1, 2] = 2,
     poses: Poses = "stage-normal",
-    distortion: tuple[str, ...] = ("k1", "k2"),
+    distortion: Distortion = "auto",
+    pixels: Pixels = "auto",
     index: float | None = None,
     stripe: StripeOptions = StripeOptions(),
     progress: Progress | None = None,
@@ -59,8 +61,11 @@ def calibrate(
     poses : {"stage-normal", "stage", "free"}
         stage-normal: one target pose, moved by the stage along the target's normal. stage: the same in a free
         direction, as always in the joint method. free: every image has a pose of its own.
-    distortion : tuple of str
-        The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0.
+    distortion : "auto" or tuple of str
+        The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0. auto: those that predict images of the
+        target left out best; jointly k1 and k2, with what the description says of p1 and p2.
+    pixels : {"auto", "square", "free"}
+        Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the captures.
     stripe : StripeOptions, optional
@@ -93,7 +98,8 @@ def calibrate(
     options = CalibrationOptions(
         refractions=refractions,
         poses=poses,
-        camera=CameraOptions(distortion=distortion),
+        camera=CameraOptions(("k1", "k2") if distortion == "auto" else distortion, square_pixels=pixels != "free"),
+        lens=LensChoice(distortion, pixels),
         stripe=stripe,
         medium_index=index,
         same_water=not new_water,

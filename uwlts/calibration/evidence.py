@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import ValidationError
@@ -38,6 +38,22 @@ class AirEvidence:
     warnings: list[str]  # images left out, and why
     no_stripe: str = ""  # why there is no stripe at all; empty where there is one
     strays: list[int] = field(default_factory=list)  # stripe pixels of each left out as off the curve of the others
+    captures: list[str] = field(default_factory=list)  # their names
+
+    def names(self) -> list[str]:
+        """The images, as captures and frames."""
+        return [f"{self.captures[capture]}, frame {frame}" for capture, frame in self.frames]
+
+    def only(self, chosen: np.ndarray, images: list[TargetImage]) -> "AirEvidence":
+        """The images of some numbers, with their points replaced."""
+        some = chosen.tolist()
+        return replace(
+            self,
+            images=images,
+            frames=[self.frames[n] for n in some],
+            stripes=[self.stripes[n] for n in some],
+            strays=[self.strays[n] for n in some],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +127,7 @@ def air_evidence(
             f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
         )
     no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
-    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, strays)
+    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, strays, _file_names(captures))
 
 
 def step_evidence(
@@ -160,8 +176,12 @@ def no_stripe_in(captures: Sequence[Capture]) -> str:
     return f"no stripe in any of the {count} {where}: {reason}"
 
 
+def _file_names(captures: Sequence[Capture]) -> list[str]:
+    return [capture.path.name for capture in captures]
+
+
 def _names(captures: Sequence[Capture]) -> str:
-    return ", ".join(capture.path.name for capture in captures)
+    return ", ".join(_file_names(captures))
 
 
 def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:

@@ -33,6 +33,14 @@ Pixels = Literal["auto", "square", "free"]
 
 
 @dataclass(frozen=True)
+class LensChoice:
+    """What of a lens is estimated; "auto" chooses by prediction of images left out."""
+
+    distortion: Distortion = "auto"
+    pixels: Pixels = "auto"
+
+
+@dataclass(frozen=True)
 class LensCandidate:
     """A lens model, and how well it predicts images that it was not calibrated from.
 
@@ -47,8 +55,7 @@ class LensCandidate:
     @property
     def name(self) -> str:
         """The coefficients and the pixels in words."""
-        coefficients = " ".join(self.options.distortion) or "no distortion"
-        return f"{coefficients}, {'square' if self.options.square_pixels else 'free'} pixels"
+        return _name(self.options)
 
     def parameters(self) -> int:
         """Number of parameters that are estimated."""
@@ -64,8 +71,10 @@ class LensCalibration:
     solution : for the images used, in their order; its covariance is the one of independent points
     used, images : numbers (F,) of the images used, among those given, and these without their outliers
     left_out : number of an image left out, and the reason
-    moved : (F,); how far leaving out each image used moves a parameter at most, in its standard deviations without it
+    moved : (F,); how far leaving out each image used moves a parameter at most, in its standard deviations without it;
+        NaN if without it nothing is determined
     rejected_share : share of the points that were left out, of the images used
+    without : (F,); the solutions from all images used but one, None where they determine none
     candidates : models compared; none if the model was given
     covariance : (P, P); of the parameters, with the misses of an image taken to go together
     """
@@ -75,10 +84,16 @@ class LensCalibration:
     images: list[TargetImage]
     left_out: dict[int, str]
     moved: np.ndarray
+    without: list[CameraSolution | None]
     rejected_share: float
     candidates: list[LensCandidate]
     options: CameraOptions
     covariance: np.ndarray
+
+    @property
+    def name(self) -> str:
+        """The lens model in words."""
+        return _name(self.options)
 
     def values(self) -> dict[str, float]:
         """Every estimated parameter."""
@@ -98,8 +113,7 @@ def calibrate_lens(
     height_px: int,
     poses: Poses = "free",
     approaching: bool = True,
-    distortion: Distortion = "auto",
-    pixels: Pixels = "auto",
+    choice: LensChoice = LensChoice(),
     circle_diameter_mm: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> LensCalibration:
@@ -107,7 +121,8 @@ def calibrate_lens(
 
     Parameters
     ----------
-    distortion, pixels : what is estimated; "auto" chooses by prediction of images left out
+    choice : what is estimated. Models are compared with a free direction of the stage, for a wrong one can look like
+        another lens; their pixels are square then
     progress : called with the number of models tried and of all
 
     Other parameters are those of `solve_camera`.
@@ -116,21 +131,26 @@ def calibrate_lens(
     """
 
     def solved(
-        chosen: Sequence[TargetImage], options: CameraOptions, start: CameraSolution | None = None, *, circles: bool
+        chosen: Sequence[TargetImage],
+        options: CameraOptions,
+        start: CameraSolution | None = None,
+        *,
+        circles: bool,
+        freer: bool = False,
     ) -> CameraSolution:
         return solve_camera(
             chosen,
             width_px=width_px,
             height_px=height_px,
-            poses=poses,
+            poses="stage" if freer and poses != "free" else poses,
             approaching=approaching,
             options=options,
             start=start,
             circle_diameter_mm=circle_diameter_mm if circles else None,
         )
 
-    tried = _candidates(distortion, pixels, square=poses == "stage")
-    usual = CameraOptions(("k1", "k2")) if len(tried) > 1 else tried[0]
+    tried = _candidates(choice, square=poses != "free")
+    usual = tried[0] if len(tried) == 1 else CameraOptions(("k1", "k2"), square_pixels=choice.pixels != "free")
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
         """Points (N,) of each image near to where the lens sees them, found without trust in any of them."""
@@ -140,11 +160,13 @@ def calibrate_lens(
 
     candidates: list[LensCandidate] = []
     options, keep = usual, inliers(usual)
-    if len(tried) > 1:
-        good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
-        start = solved(good, usual, circles=True)
-        candidates = _compared(_centred(good, start), tried, lambda i, o: solved(i, o, circles=False), progress)
-        options = _chosen(candidates).options
+    good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
+    if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
+        start = solved(good, usual, circles=True, freer=usual.square_pixels)
+        candidates = _compared(
+            _centred(good, start), tried, lambda i, o: solved(i, o, circles=False, freer=o.square_pixels), progress
+        )
+        options = _chosen(candidates, usual)
     if options != usual:
         keep = inliers(options)
     left_out = {
@@ -159,26 +181,32 @@ def calibrate_lens(
         chosen = [cleaned[number] for number in used]
         solution = solved(chosen, options, circles=True)
         centred = _centred(chosen, solution)
-        changes, others_std = _changes(centred, solution, intrinsics, lambda i, s: solved(i, options, s, circles=False))
+        without = _without_one(centred, solution, lambda i, s: solved(i, options, s, circles=False))
+        values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
+        changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
+        others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])
+        if not np.isfinite(changes).any():
+            moved = np.full(len(used), np.nan)
+            break
         unit = np.maximum(others_std, MAD_TO_STD * np.sqrt(len(used)) * np.nanmedian(np.abs(changes), axis=0))
         moved = np.nanmax(np.abs(changes) / unit, axis=1, initial=0.0)
-        worst = int(np.argmax(moved))
+        moved[np.isnan(changes).all(axis=1)] = np.nan
+        worst = int(np.nanargmax(moved))
         enough = len(used) > max(_FEWEST_IMAGES, (1 - _LARGEST_LEFT_OUT) * len(images))
         if moved[worst] <= _MOVED or not enough:
             break
         name = solution.parameters[int(np.nanargmax(np.abs(changes[worst]) / unit[worst]))]
         left_out[used[worst]] = f"it alone moves {name} by {moved[worst]:.1f} standard uncertainties"
         del used[worst]
-    # Delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
     std, known = np.sqrt(np.diag(solution.covariance)), changes[np.isfinite(changes).all(axis=1)]
-    jackknife = np.sqrt((len(known) - 1) / len(known) * np.sum(known**2, axis=0)) if len(known) > 1 else std
-    larger = np.maximum(jackknife / std, 1.0)
+    larger = np.maximum(np.sqrt(np.diag(jackknife(known))) / std, 1.0)
     return LensCalibration(
         solution=solution,
         used=np.array(used),
         images=chosen,
         left_out=left_out,
         moved=moved,
+        without=without,
         rejected_share=float(1.0 - np.mean(np.concatenate([keep[number] for number in used]))),
         candidates=candidates,
         options=options,
@@ -186,9 +214,14 @@ def calibrate_lens(
     )
 
 
-def _candidates(distortion: Distortion, pixels: Pixels, *, square: bool) -> list[CameraOptions]:
-    sets = _DISTORTIONS if distortion == "auto" else (distortion,)
-    shapes = {"auto": (True,) if square else (True, False), "square": (True,), "free": (False,)}[pixels]
+def _name(options: CameraOptions) -> str:
+    coefficients = " ".join(options.distortion) or "no distortion"
+    return f"{coefficients}, {'square' if options.square_pixels else 'free'} pixels"
+
+
+def _candidates(choice: LensChoice, *, square: bool) -> list[CameraOptions]:
+    sets = _DISTORTIONS if choice.distortion == "auto" else (choice.distortion,)
+    shapes = {"auto": (True,) if square else (True, False), "square": (True,), "free": (False,)}[choice.pixels]
     return [CameraOptions(names, square_pixels=shape) for names in sets for shape in shapes]
 
 
@@ -226,7 +259,7 @@ def _compared(
     solve: Callable[[Sequence[TargetImage], CameraOptions], CameraSolution],
     progress: Callable[[int, int], None],
 ) -> list[LensCandidate]:
-    """The models, each calibrated without every fifth image and tried on these."""
+    """The models, each calibrated without every fifth image and tried on these; none if that determines none."""
     folds = min(_FOLDS, len(images))
     squares = np.full((len(tried), len(images)), np.nan)
     for number, options in enumerate(tried):
@@ -241,10 +274,7 @@ def _compared(
         progress(number + 1, len(tried))
     means = squares.mean(axis=1)
     if np.isnan(means).all():
-        raise CalibrationError(
-            "no lens model is determined by four fifths of the images: take more images, tilted differently, that fill "
-            "the image, or give distortion and pixels"
-        )
+        return []
     best = int(np.nanargmin(means))
     found = []
     for options, mean, each in zip(tried, means, squares, strict=True):
@@ -266,31 +296,32 @@ def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
     return float(np.mean(np.sum((image.pixels - seen) ** 2, axis=1)))
 
 
-def _chosen(candidates: list[LensCandidate]) -> LensCandidate:
-    """The model with the fewest parameters among those as good as the best."""
+def _chosen(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
+    """The model with the fewest parameters among those as good as the best; the usual one if none was tried."""
     good = [each for each in candidates if np.isfinite(each.rms_px) and each.worse <= _WORSE]
-    return min(good, key=lambda each: (each.parameters(), each.rms_px))
+    return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual
 
 
-def _changes(
+def _without_one(
     images: list[TargetImage],
     solution: CameraSolution,
-    intrinsics: Intrinsics,
     solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
-) -> tuple[np.ndarray, np.ndarray]:
-    """How far (F, P) leaving out each image moves the parameters, and their standard deviations (F, P) without it.
-
-    NaN where the other images determine none.
-    """
-    values = intrinsics.from_model(solution.model)
-    changes, std = np.full((2, len(images), len(values)), np.nan)
+) -> list[CameraSolution | None]:
+    """The solutions from all images but one; None where they determine none."""
+    found: list[CameraSolution | None] = []
     for number in range(len(images)):
         rest = [image for place, image in enumerate(images) if place != number]
         start = replace(solution, target_poses=np.delete(solution.target_poses, number, axis=0))
         try:
-            without = solve(rest, start)
+            found.append(solve(rest, start))
         except CalibrationError:
-            continue
-        changes[number] = intrinsics.from_model(without.model) - values
-        std[number] = np.sqrt(np.diag(without.covariance))
-    return changes, std
+            found.append(None)
+    return found
+
+
+def jackknife(changes: np.ndarray) -> np.ndarray:
+    """Covariance (P, P) of parameters from their changes (F, P) when one group of observations is left out after other.
+
+    Of the delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
+    """
+    return (len(changes) - 1) / max(len(changes), 1) * changes.T @ changes

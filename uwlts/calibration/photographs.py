@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from uwlts.calibration.lens import Distortion, LensCalibration, Pixels, calibrate_lens
+from uwlts.calibration.lens import Distortion, LensCalibration, LensChoice, Pixels, calibrate_lens
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.model.library import read_table
@@ -136,8 +136,7 @@ def calibrate_camera(
         found,
         width_px=size[0],
         height_px=size[1],
-        distortion=distortion,
-        pixels=pixels,
+        choice=LensChoice(distortion, pixels),
         circle_diameter_mm=described.circle_diameter_mm,
         progress=lambda done, total: report("lens", done, total),
     )

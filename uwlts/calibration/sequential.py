@@ -1,8 +1,10 @@
 """Sequential calibration: camera and sheet from captures in air, then the window's distance from a step."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -12,6 +14,7 @@ import uwlts
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.lens import LensCalibration, LensChoice, calibrate_lens, jackknife
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
 from uwlts.calibration.window import WindowSolution, label_step, solve_window
 from uwlts.model.calibration import Calibration, WindowModel
@@ -40,6 +43,33 @@ def _camera_figures(solution: CameraSolution) -> dict[str, JsonValue]:
         "largest_circle_bias_px": solution.largest_bias_px(),
         "rounds": solution.rounds,
         "stopped": solution.stopped,
+    }
+
+
+def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
+    """Models tried and images used, of ``found`` those alone, as files hold them; None for what is missing."""
+    rms = lens.solution.image_rms_px()
+    columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.strays, strict=True)
+    table: list[JsonValue] = [
+        {
+            "image": name,
+            "points": len(image.pixels),
+            "rms_px": float(miss),
+            "moves": None if np.isnan(moved) else float(moved),
+            "stripe_points": len(stripe),
+            "stripe_strays": astray,
+        }
+        for name, image, miss, moved, stripe, astray in columns
+    ]
+    tried: list[JsonValue] = [
+        {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates
+    ]
+    return {
+        "lens_model": lens.name,
+        "models_tried": tried,
+        "rejected_share": lens.rejected_share,
+        "images_left_out": len(lens.left_out),
+        "image_table": table,
     }
 
 
@@ -77,6 +107,8 @@ def _none_for_nan(values: np.ndarray) -> list[JsonValue]:
     return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
+_FEWEST_LEFT_OUT = 4  # images; of fewer the jackknife says little
+_CLEARLY_LESS = 0.7  # of the misses: so much less with a free direction of the stage is no chance
 _LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger deviations are reported
 
 
@@ -89,6 +121,9 @@ class CalibrationOptions:
     refractions : 2: a pane of glass of known thickness and index; the images in air are taken without the window. 1: a
         single interface; the images in air are taken with the window in place, whose effect goes into the distortion
     poses : as for `solve_camera`
+    camera : camera parameters that are estimated
+    lens : in place of ``camera``: choose the lens from the images, and leave doubtful points and images out. The joint
+        calibration takes only coefficients from it
     correct_circles : take out the offset between a circle's image and the image of its centre
     medium_index : replaces the index of the medium of the step images
     same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
@@ -100,6 +135,7 @@ class CalibrationOptions:
     refractions: Literal[1, 2] = 2
     poses: Poses = "stage-normal"
     camera: CameraOptions = CameraOptions()
+    lens: LensChoice | None = None
     stripe: StripeOptions = StripeOptions()
     correct_circles: bool = True
     medium_index: float | None = None
@@ -217,23 +253,43 @@ def gather(
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
     """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
     sensor, found = evidence.sensor, evidence.air
-    camera = solve_camera(
-        found.images,
+    seen_by = partial(
+        solve_camera,
         width_px=sensor.camera.width_px,
         height_px=sensor.camera.height_px,
-        poses=options.poses,
         approaching=evidence.approaching is not False,
-        options=options.camera,
-        start=start,
         circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
     )
+    of_lens: dict[str, JsonValue] = {}
+    doubts: list[str] = []
+    lens = None
+    if options.lens is None:
+        camera = seen_by(found.images, poses=options.poses, options=options.camera, start=start)
+    else:
+        lens = calibrate_lens(
+            found.images,
+            width_px=sensor.camera.width_px,
+            height_px=sensor.camera.height_px,
+            poses=options.poses,
+            approaching=evidence.approaching is not False,
+            choice=options.lens,
+            circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
+        )
+        camera, names = replace(lens.solution, covariance=lens.covariance), found.names()
+        doubts = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
+        found = found.only(lens.used, lens.images)
+        of_lens = _lens_figures(lens, found)
+        if options.poses == "stage-normal" and lens.options.square_pixels:
+            doubts += _leaning(camera, seen_by(found.images, poses="stage", options=lens.options))
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
     stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
     pose = laser_pose(sensor)
     sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
-    warnings = [*evidence.warnings, *_turn_warnings(camera, sheet, evidence)]
-    figures = {"camera": _camera_figures(camera), "sheet": _sheet_figures(sheet, stripe_points)}
+    if lens is not None:
+        sheet = _by_images(sheet, lens, found)
+    warnings = [*evidence.warnings, *doubts, *_turn_warnings(camera, sheet, evidence)]
+    figures = {"camera": _camera_figures(camera) | of_lens, "sheet": _sheet_figures(sheet, stripe_points)}
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -324,6 +380,37 @@ def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: 
     if options.refractions == 1 and not all(mounted):
         return ["the window was removed in air and is one interface in the medium: its thickness appears nowhere"]
     return []
+
+
+def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> SheetSolution:
+    """The sheet with the uncertainty of its normal as it follows from leaving out one image after the other.
+
+    Camera and poses are those without the image, so that their errors, which the points of one image share, count.
+    """
+    changes, normal = [], np.array(sheet.model.normal)
+    for number, solution in enumerate(lens.without):
+        stripes = [stripe for place, stripe in enumerate(found.stripes) if place != number]
+        if solution is None or not len(found.stripes[number]):
+            continue
+        with suppress(CalibrationError):
+            points = points_on_target(solution.model, stripes, solution.target_poses, plate_mm=found.target.plate_mm)
+            other = fit_sheet(points.points_mm, nominal_normal=normal)
+            changes.append(np.array(other.model.normal) - normal)
+    if len(changes) < _FEWEST_LEFT_OUT:
+        return sheet
+    std = float(np.sqrt(np.linalg.eigvalsh(jackknife(np.array(changes))).max()))
+    return replace(sheet, normal_std_rad=max(sheet.normal_std_rad, std))
+
+
+def _leaning(camera: CameraSolution, freer: CameraSolution) -> list[str]:
+    """What speaks against a stage that moves along the target's normal, as another camera has it."""
+    if freer.stage_tilt_rad is None or freer.sigma_px > _CLEARLY_LESS * camera.sigma_px:
+        return []
+    tilt, f, other_f = np.degrees(freer.stage_tilt_rad), camera.model.fx_px, freer.model.fx_px
+    return [
+        f"the stage moves {tilt:.2f} deg beside the target's normal: with poses 'stage' the points miss by "
+        f"{freer.sigma_px:.3f} in place of {camera.sigma_px:.3f} px, and f is {other_f:.1f} in place of {f:.1f} px"
+    ]
 
 
 def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:

@@ -21,6 +21,7 @@ _LARGEST_REJECTED = 0.2  # outliers are few; where more points leave the plane, 
 _LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this axes are exchanged or signs wrong
 # From here on a normal that lies much closer to where turned images would put it is taken for that.
 _TURNED_IMAGES = np.radians(20)
+_CROSSING = 0.3  # cosine from which it is of use to say where the sheet crosses an axis
 _HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 
@@ -125,8 +126,14 @@ def fit_sheet(
     elif turn > _LARGEST_TURN:
         advice = ": check stripe_along, where the laser stands, and whether the images are turned or mirrored"
     if advice:
+        found = f"the sheet that was found has the normal {np.round(plane.normal, 3).tolist()}"
+        axis = int(np.argmax(np.abs(plane.normal[:2])))
+        if abs(plane.normal[axis]) > _CROSSING:
+            place = plane.normal @ plane.point_mm / plane.normal[axis]
+            found += f" and crosses the camera's {'xy'[axis]} axis at {place:.0f} mm"
         raise CalibrationError(
-            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}"
+            f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}; "
+            + found
         )
     return SheetSolution(
         model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=float(plane.normal @ plane.point_mm)),

@@ -41,7 +41,8 @@ def calibrate(
     out: CalibrationOut,
     refractions: Literal[1, 2] = 2,
     poses: Literal["stage-normal", "stage", "free"] = "stage-normal",
-    distortion: Coefficients = ("k1", "k2"),
+    distortion: Coefficients | Literal["auto"] = "auto",
+    pixels: Literal["auto", "square", "free"] = "auto",
     index: Index = None,
     method: Method = None,
     camera: str | None = None,
@@ -78,7 +79,9 @@ def calibrate(
             through the window. The joint calibration takes this from the captures.
         poses: stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same
             with a free direction, as always in the joint calibration. free: every image has a pose of its own.
-        distortion: Distortion coefficients to estimate; the others stay 0.
+        distortion: Distortion coefficients to estimate; the others stay 0. auto: those that predict images left out
+            best; jointly k1 and k2, with p1 and p2 as far as the description leaves them open.
+        pixels: Whether pixels are square or free to be not; auto: as distortion, with free poses; else square.
         camera: Guided: address of the camera, in place of the plan's.
         stage: Guided: serial port of the stage, in place of the plan's.
         port: Guided: port of the page for the browser; the next free one is taken if it is in use.
@@ -102,7 +105,7 @@ def calibrate(
             stage=stage,
             port=port,
             refractions=refractions,
-            distortion=distortion,
+            distortion=("k1", "k2") if distortion == "auto" else distortion,
             resume=resume,
             overwrite=overwrite,
             report=say,
@@ -121,6 +124,7 @@ def calibrate(
             refractions=refractions,
             poses=poses,
             distortion=distortion,
+            pixels=pixels,
             index=index,
             stripe=stripe_options(method),
             progress=any_stage(progress),

@@ -65,9 +65,23 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
 
 
+_EITHER_OR = (({"baseline_mm", "triangulation_angle_deg"}, {"origin_mm", "axis"}), ({"water"}, {"turbidity"}))
+"""Keys that say the same in two ways: of the laser's place, and of a medium."""
+
+
 def merged(base: Table, changes: Table) -> Table:
-    """A new table: ``base`` with ``changes`` laid over it, tables merged key by key."""
-    result = dict(base)
+    """A new table: ``base`` with ``changes`` laid over it, tables merged key by key.
+
+    What the changes say in another way, as where the laser stands, the base says no longer.
+    """
+    replaced = {
+        key
+        for ways in _EITHER_OR
+        for said, other in (ways, ways[::-1])
+        if said & changes.keys() and not other & changes.keys()
+        for key in other
+    }
+    result = {key: value for key, value in base.items() if key not in replaced}
     for key, value in changes.items():
         below = base.get(key)
         result[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value

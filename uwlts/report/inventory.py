@@ -2,11 +2,13 @@
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.measurement.evaluation import FORMAT as EVALUATION_FORMAT
 from uwlts.measurement.evaluation import EvaluationRecord, read_evaluation
@@ -221,6 +223,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         sheet=("rms_mm", "sheet residual: {:.4f} mm"),
         window=("std_mm", "window: {:.3f} mm standard uncertainty of d"),
     )
+    lines += _image_lines(calibration.figures("camera"))
     if (joint := calibration.joint) is not None:
         lines.append("joint estimate, with standard uncertainties after and before:")
         for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
@@ -228,6 +231,29 @@ def calibration_lines(calibration: Calibration) -> list[str]:
             lines.append(f"  {key.text.replace('_', ' ')}: {value:.6g} ± {std:.2g}{known}")
         scatter = ", ".join(f"{kind} {value:.3f} px" for kind, value in joint.scatter_px.items())
         lines.append(f"scatter: {scatter}; {joint.outlier_count} of {joint.residual_count} residuals left out")
+    return lines
+
+
+def _image_lines(camera: Mapping[str, JsonValue]) -> list[str]:
+    """The lens model, and what each image of the target gave; none where a calibration does not hold that."""
+    table = camera.get("image_table")
+    if not isinstance(table, list):
+        return []
+    tried, share = camera.get("models_tried"), camera.get("rejected_share")
+    best = f", the best of {len(tried)} models" if isinstance(tried, list) and tried else ""
+    lines = [
+        f"lens: {camera.get('lens_model')}{best}",
+        f"images of the target: {len(table)} used, {camera.get('images_left_out')} left out, and "
+        f"{100 * share if isinstance(share, float) else math.nan:.1f} % of the points of those used",
+        "  points  misses/px  moves/sigma  stripe  astray  image",
+    ]
+    for row in table:
+        if isinstance(row, dict):
+            points, rms, moves, stripe, astray, name = (
+                row.get(key) for key in ("points", "rms_px", "moves", "stripe_points", "stripe_strays", "image")
+            )
+            moved = f"{moves:11.2f}" if isinstance(moves, float) else f"{'-':>11}"
+            lines.append(f"  {points:6}  {rms:9.3f}  {moved}  {stripe:6}  {astray:6}  {name}")
     return lines
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.calibration.lens import calibrate_lens
+from uwlts.calibration.lens import LensChoice, calibrate_lens
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.errors import CalibrationError
 
@@ -31,8 +31,9 @@ def views(seed, *, count=20, fx=F, fy=F, distortion=(0.0,) * 5, noise_px=0.1, be
     return images
 
 
-def lens(images, **options):
-    return calibrate_lens(images, width_px=WIDTH, height_px=HEIGHT, **options)
+def lens(images, *, distortion="auto", pixels="auto", **options):
+    choice = LensChoice(distortion, pixels)
+    return calibrate_lens(images, width_px=WIDTH, height_px=HEIGHT, choice=choice, **options)
 
 
 @pytest.mark.parametrize(
