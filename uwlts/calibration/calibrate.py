@@ -113,6 +113,12 @@ def calibrate(
         opened_captures(water) as in_water,
         opened_captures(scan) as scans,
     ):
+        for capture in in_water:
+            if capture.header.medium.kind == "air":
+                raise DescriptionError(
+                    f"{capture.path.name} says that it was taken in air: give it with --air, or correct the medium in "
+                    "its description"
+                )
         match method:
             case "joint":
                 targets = [*in_air, *in_water]

@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -219,7 +220,10 @@ def calibrate_sequentially(
 def gather(
     air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
 ) -> Evidence:
-    """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`."""
+    """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`.
+
+    CalibrationError also where a capture is given twice.
+    """
     sensor = common_sensor([*air, *steps])
     media = {capture.header.medium.kind for capture in air}
     if len(media) > 1 or (steps and media != {"air"}):
@@ -227,6 +231,7 @@ def gather(
             f"the target was seen in {' and '.join(sorted(media))}: take all images of it in air if a step standard "
             "is to find the window, else all in the medium of use"
         )
+    sources = sources_of(air, steps)
     found = air_evidence(air, stripe=options.stripe, progress=progress)
     warnings = [*found.warnings, *_window_warnings(air, steps, options)]
     on_steps: list[StepEvidence] = []
@@ -245,7 +250,7 @@ def gather(
         air=found,
         window=steps[0].header.sensor.camera.window if steps else None,
         steps=on_steps,
-        sources=sources_of(air, steps),
+        sources=sources,
         warnings=warnings,
     )
 
@@ -285,7 +290,9 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         raise CalibrationError(found.no_stripe)
     stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
     pose = laser_pose(sensor)
-    sheet = fit_sheet(stripe_points.points_mm, nominal_normal=pose.normal)
+    sheet = fit_sheet(
+        stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
+    )
     if lens is not None:
         sheet = _by_images(sheet, lens, found)
     warnings = [*evidence.warnings, *doubts, *_turn_warnings(camera, sheet, evidence)]
@@ -427,12 +434,22 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
 
 
 def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, JsonValue]:
-    """Captures, software and date of a calibration, for its provenance."""
-    return {
+    """Captures, software and date of a calibration, for its provenance.
+
+    CalibrationError where one is given twice, so that its noise would count as two independent ones.
+    """
+    kinds = {"air_captures": air, "step_captures": steps, "scan_captures": scans}
+    sources = {kind: [source_of(capture) for capture in captures] for kind, captures in kinds.items()}
+    names: dict[str, str] = {}
+    for source in chain.from_iterable(sources.values()):
+        if source.sha256 in names:
+            raise CalibrationError(f"{names[source.sha256]} and {source.file} are the same capture: give it once")
+        names[source.sha256] = source.file
+    origin: dict[str, JsonValue] = {
         "source": "calibration from captures",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "software": f"uwlts {uwlts.__version__}",
-        "air_captures": [source_of(capture).in_file() for capture in air],
-        "step_captures": [source_of(capture).in_file() for capture in steps],
-        "scan_captures": [source_of(capture).in_file() for capture in scans],
     }
+    for kind, each in sources.items():
+        origin[kind] = [source.in_file() for source in each]
+    return origin

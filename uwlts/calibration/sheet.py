@@ -21,6 +21,7 @@ _LARGEST_REJECTED = 0.2  # outliers are few; where more points leave the plane, 
 _LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this axes are exchanged or signs wrong
 # From here on a normal that lies much closer to where turned images would put it is taken for that.
 _TURNED_IMAGES = np.radians(20)
+_OTHER_UNIT, _LEAST_OFFSET_MM = 5.0, 10.0  # descriptions are rough, but not by this factor
 _CROSSING = 0.3  # cosine from which it is of use to say where the sheet crosses an axis
 _HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
@@ -88,15 +89,19 @@ def points_on_target(
 
 
 def fit_sheet(
-    points_mm: np.ndarray, *, nominal_normal: np.ndarray, largest_rejected: float = _LARGEST_REJECTED
+    points_mm: np.ndarray,
+    *,
+    nominal_normal: np.ndarray,
+    nominal_offset_mm: float | None = None,
+    largest_rejected: float = _LARGEST_REJECTED,
 ) -> SheetSolution:
     """Plane through points (N, 3) by orthogonal distances, without those beyond five robust standard deviations.
 
     The normal is turned to the side of ``nominal_normal`` (3,), a unit vector, all in the camera frame;
     ``largest_rejected`` is the share of the points that may lie elsewhere.
 
-    Raises CalibrationError: the points do not determine a plane, do not lie on one, or its normal is far from the
-    nominal one.
+    Raises CalibrationError: the points do not determine a plane, do not lie on one, its normal is far from the nominal
+    one, or its distance from the camera is so many times ``nominal_offset_mm`` that units were mistaken.
     """
     try:
         robust = fit_robustly(lambda points: fit_plane(points, towards=nominal_normal), points_mm)
@@ -135,6 +140,15 @@ def fit_sheet(
             f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}; "
             + found
         )
+    offset = float(plane.normal @ plane.point_mm)
+    if nominal_offset_mm is not None and abs(nominal_offset_mm) > _LEAST_OFFSET_MM:
+        times = offset / nominal_offset_mm
+        if not 1 / _OTHER_UNIT < times < _OTHER_UNIT:
+            raise CalibrationError(
+                f"the sheet passes the camera at {offset:.1f} mm, by the sensor's description at "
+                f"{nominal_offset_mm:.1f} mm: the target's measures must be in mm (not cm, m or inches), and the "
+                "laser's place that of this sensor"
+            )
     return SheetSolution(
         model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=float(plane.normal @ plane.point_mm)),
         residuals_mm=robust.distances_mm,

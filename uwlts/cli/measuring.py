@@ -142,6 +142,7 @@ def reconstruct(
         cloud = uwlts.reconstruct(opened, known, stripe=stripe_options(method, peak), index=index, progress=progress)
         lit = int(opened.laser_on.sum())
     uwlts.write_cloud(out, cloud, overwrite=overwrite)
+    warn(*cloud.warnings)
     print(f"laser images with a point: {len(set(cloud.frame.tolist()))} of {lit}")
     print(f"profile lines: {_counts(cloud.lines_by_status)}")
     if lost := _counts({name: count for name, count in cloud.rays_by_status.items() if name != "ok"}):

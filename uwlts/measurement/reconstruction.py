@@ -32,11 +32,14 @@ class ScanCloud(PointCloud):
         Number of profile lines by the name of their `StripeStatus`, and ``blurred`` by a joint calibration.
     rays_by_status : dict
         Number of stripe centres by the name of their `RayStatus`.
+    warnings : list of str
+        What speaks against the calibration's being that of the sensor.
     """
 
     stripe: np.ndarray
     lines_by_status: dict[str, int]
     rays_by_status: dict[str, int]
+    warnings: list[str]
 
 
 def reconstruct(
@@ -106,7 +109,7 @@ def reconstruct_stripes(
     RangeError
         The refractive index is none of a medium.
     """
-    check_fits(capture.header, calibration, source=capture.path.name)
+    doubts = check_fits(capture.header, calibration, source=capture.path.name)
     if index is not None and isinstance(calibration, PolynomialCalibration):
         raise CalibrationError(
             "polynomials hold the refraction of the medium they were made in: a refractive index cannot replace it"
@@ -149,6 +152,7 @@ def reconstruct_stripes(
         stripe=sharp[good],
         lines_by_status=lines,
         rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
+        warnings=doubts,
     )
 
 

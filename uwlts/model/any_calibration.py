@@ -13,6 +13,8 @@ AnyCalibration = Calibration | PolynomialCalibration
 # Polynomials hold the refraction they were made with: so much more, as from 20 to 30 degC, moves a point 300 mm away by
 # 0.2 mm.
 _LARGEST_INDEX_CHANGE = 1e-3
+_LARGEST_CHANGE_NM = 5.0  # lasers of one kind differ by less
+_OTHER_LENS = 1.1  # focal lengths of lenses of one kind differ by less
 
 
 def calibration_digest(calibration: AnyCalibration) -> str:
@@ -20,12 +22,14 @@ def calibration_digest(calibration: AnyCalibration) -> str:
     return hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
 
 
-def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> None:
-    """Refuse a calibration that cannot belong to a recording, by its header; ``source`` is its name for messages.
+def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> list[str]:
+    """Refuse a calibration that cannot belong to a recording, by its header, and say what speaks against it otherwise.
 
-    Raises CalibrationError: image size or stripe orientation differ; the recording was made in water and the
-    calibration has no window; or the calibration is one by polynomials and the recording was made in another medium, or
-    with the window on in one and off in the other.
+    ``source`` is the recording's name for messages.
+
+    Raises CalibrationError: image size, stripe orientation, wavelength or camera differ; the recording was made in
+    water and the calibration has no window; or the calibration is one by polynomials and the recording was made in
+    another medium, or with the window on in one and off in the other.
     """
     camera = header.sensor.camera
     model = calibration if isinstance(calibration, PolynomialCalibration) else calibration.camera
@@ -43,6 +47,21 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"in {source} the stripe runs along the image's {camera.stripe_along}, in the calibration along "
             f"its {calibration.stripe_along}"
         )
+    if abs(header.sensor.laser.wavelength_nm - calibration.wavelength_nm) > _LARGEST_CHANGE_NM:
+        raise CalibrationError(
+            f"{source} was taken with a laser of {header.sensor.laser.wavelength_nm:g} nm, the calibration is for "
+            f"{calibration.wavelength_nm:g} nm: it is of another sensor"
+        )
+    other = header.sensor.name != calibration.sensor_name
+    named = f"{source} is by the sensor '{header.sensor.name}', the calibration of '{calibration.sensor_name}'"
+    if other and isinstance(calibration, Calibration):
+        described, found = camera.focal_length_px(), calibration.camera.fx_px
+        # Refraction that is left to the focal length makes it a third longer.
+        if not 1 / _OTHER_LENS < found / described < 1.33 * _OTHER_LENS:
+            raise CalibrationError(
+                f"{named}, and by its description it has a focal length of {described:.0f} px, by the calibration "
+                f"one of {found:.0f} px: calibrate this sensor"
+            )
     if isinstance(calibration, PolynomialCalibration):
         _check_same_refraction(header, calibration, source=source)
     elif header.medium.kind not in ("air", calibration.medium_kind) and calibration.window is None:
@@ -55,6 +74,7 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
             f"{source} was made in air, but the calibration is that of a single viewpoint in water "
             f"({calibration.medium_kind}): its camera holds the refraction; calibrate in air"
         )
+    return [f"{named}: is it the right one?"] if other else []
 
 
 def _check_same_refraction(header: CaptureHeader, calibration: PolynomialCalibration, *, source: str) -> None:

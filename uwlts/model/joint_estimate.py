@@ -10,6 +10,7 @@ from uwlts.model.sensor import Table, Uncertainty, Vector
 
 _Count = Annotated[int, Field(ge=0)]
 _Std = Annotated[FiniteFloat, Field(ge=0)]
+_ROUNDED = 1e-6  # of a correlation; files hold all digits
 _Pair = tuple[FiniteFloat, FiniteFloat]
 
 
@@ -93,6 +94,15 @@ class JointEstimate(_Stored):
             raise ValueError(f"not all of it is of its {count} parameters")
         if any(row[place] < 0 for place, row in enumerate(self.covariance)):
             raise ValueError("a variance is negative")
+        covariance, std = self.covariance_matrix(), np.array(self.std)
+        scale = np.where(std > 0, std, 1.0)
+        correlation = covariance / scale[:, None] / scale
+        if np.abs(correlation - correlation.T).max(initial=0.0) > _ROUNDED:
+            raise ValueError("the covariance is not symmetric: the file was edited, or is damaged")
+        if np.abs(np.diag(correlation) - (std > 0)).max(initial=0.0) > _ROUNDED:
+            raise ValueError("the variances are not the squares of std: the file was edited, or is damaged")
+        if count and np.linalg.eigvalsh(correlation).min() < -_ROUNDED:
+            raise ValueError("the covariance has a negative eigenvalue: the file was edited, or is damaged")
         return self
 
     def std_of(self, key: ParameterKey) -> float | None:

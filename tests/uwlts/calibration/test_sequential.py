@@ -16,6 +16,7 @@ from tests.uwlts.calibration_views import (
     through_window,
 )
 from tests.uwlts.drawn_stripes import coarse_sensor, stripe_image
+from uwlts.calibration.calibrate import calibrate
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.model.errors import CalibrationError, DescriptionError
@@ -185,6 +186,10 @@ def test_contradictory_captures_are_refused(files, air_frames, tmp_path):
 
     with pytest.raises(CalibrationError, match="no capture"):
         calibrate_sequentially([])
+    with Capture(files[0]) as air, pytest.raises(CalibrationError, match=r"air\.h5 and air\.h5 are the same capture"):
+        calibrate_sequentially([air, air])
+    with pytest.raises(DescriptionError, match="says that it was taken in air"):
+        calibrate(water=[files[0]])
     with pytest.raises(CalibrationError, match="describe its target"):
         run(write(tmp_path / "untold.h5", frames=air_frames[:1]))
     with pytest.raises(CalibrationError, match="found in no image"):
@@ -197,7 +202,8 @@ def test_contradictory_captures_are_refused(files, air_frames, tmp_path):
         run(away)
     with pytest.raises(CalibrationError, match="no image with the laser on"):
         run(write(tmp_path / "lamps.h5", frames=air_frames[:5], target=PLATE))
-    with Capture(files[0]) as no_step, pytest.raises(CalibrationError, match="no window"):
+    bare = write(tmp_path / "bare.h5", frames=air_frames[-1:])
+    with Capture(bare) as no_step, pytest.raises(CalibrationError, match="no window"):
         run(files[0], [no_step])
     wet = SENSOR.camera.window.model_copy(update={"mounted": True})
     sensor = SENSOR.model_copy(update={"camera": SENSOR.camera.model_copy(update={"window": wet})})

@@ -122,6 +122,16 @@ def test_undetermined_sheets_are_refused():
         fit_sheet(both, nominal_normal=LASER.normal)
 
 
+def test_measures_in_other_units_are_noticed():
+    normal, rng = np.array([0.6, 0.0, -0.8]), np.random.default_rng(2)
+    points = 120.0 * normal + rng.uniform(-50, 50, (200, 2)) @ np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
+    for nominal in (100.0, 140.0):
+        assert fit_sheet(points, nominal_normal=normal, nominal_offset_mm=nominal).model.offset_mm == pytest.approx(120)
+    for factor in (0.1, 10.0, -1.0):
+        with pytest.raises(CalibrationError, match="measures must be in mm"):
+            fit_sheet(factor * points, nominal_normal=normal, nominal_offset_mm=120.0)
+
+
 def test_pixels_and_poses_must_be_finite():
     _, poses, _ = stage_images(SENSOR, positions=POSITIONS)
     stripes = stripes_on_target(SENSOR, poses)

@@ -200,6 +200,20 @@ def test_another_camera_is_refused(path, camera, message):
         check_fits(capture.header, other, source=path.name)
 
 
+def test_another_sensor_s_calibration_is_noticed(path):
+    other, camera = CALIBRATION.model_copy(update={"sensor_name": "other"}), CALIBRATION.camera
+    assert reconstruct(path, CALIBRATION).warnings == []
+    (warning,) = reconstruct(path, other).warnings
+    assert "the calibration of 'other': is it the right one?" in warning
+    long = camera.model_copy(update={"fx_px": 2 * camera.fx_px, "fy_px": 2 * camera.fy_px})
+    with pytest.raises(
+        CalibrationError, match=r"by its description it has a focal length of \d+ px, by the calibration"
+    ):
+        reconstruct(path, other.model_copy(update={"camera": long}))
+    with pytest.raises(CalibrationError, match="taken with a laser of 635 nm, the calibration is for 520 nm"):
+        reconstruct(path, CALIBRATION.model_copy(update={"wavelength_nm": 520.0}))
+
+
 def test_the_medium_of_the_targets_images_is_kept(tmp_path):
     sensor = built_sensor()
     images, poses, _ = stage_images(sensor, positions=np.arange(4) * 50.0)

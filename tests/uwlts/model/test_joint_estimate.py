@@ -51,6 +51,18 @@ def negative_variance(joint):
     joint["covariance"][0][0] = -1.0
 
 
+def edited(row, column, factor):
+    def damaged(joint):
+        joint["covariance"][row][column] *= factor
+
+    return damaged
+
+
+def impossible_correlation(joint):
+    std = joint["std"]
+    joint["covariance"][0][1] = joint["covariance"][1][0] = 1.5 * std[0] * std[1]
+
+
 @pytest.mark.parametrize(
     ("damaged", "said"),
     [
@@ -58,6 +70,9 @@ def negative_variance(joint):
         (damage(scatter_px=None), "scatter_px: Field required"),
         (damage(values=[1.0]), "not all of it is of its"),
         (damage(covariance=[[1.0]]), "not all of it is of its"),
+        (edited(0, 1, 1.5), "the covariance is not symmetric"),
+        (edited(2, 2, 4.0), "the variances are not the squares of std"),
+        (impossible_correlation, "the covariance has a negative eigenvalue"),
         (damage(strays="many"), "strays: "),
         (damage(covered=[{}]), "covered.0.medium: Field required"),
         (negative_variance, "a variance is negative"),

@@ -66,6 +66,15 @@ def test_base_is_filled_in_and_only_differences_count(tmp_path: Path):
     assert small.model_copy(update={"name": "thesis", "camera": camera}) == thesis
 
 
+def test_the_laser_may_be_placed_in_the_other_way_than_in_the_base(tmp_path: Path):
+    there = "[laser]\norigin_mm = [-120.0, 0.0, 0.0]\naxis = [0.6, 0.0, 0.8]\n"
+    laser = load_sensor(written(tmp_path / "mine.toml", 'base = "thesis"\nname = "mine"\n' + there)).laser
+    assert laser.origin_mm == (-120.0, 0.0, 0.0) and laser.baseline_mm is None
+    both = 'base = "thesis"\nname = "both"\n' + there + "baseline_mm = 100.0\n"
+    with pytest.raises(DescriptionError, match="place the laser by"):
+        load_sensor(written(tmp_path / "both.toml", both))
+
+
 def test_base_of_a_base(tmp_path: Path):
     written(tmp_path / "small.toml", SMALL)
     path = written(tmp_path / "smaller.toml", 'base = "small"\n[camera]\nheight_px = 32\n')

@@ -17,7 +17,6 @@ from uwlts.calibration.target_images import Placement, placements
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError, DescriptionError, EvaluationError
-from uwlts.model.joint_estimate import Origin
 from uwlts.model.parameter_keys import (
     LensParameter,
     MediumIndex,
@@ -119,11 +118,6 @@ def gather_jointly(
     or what it scans. CaptureError: a scan shows no stripe, or an image is damaged.
     """
     sensor, provenance = common_sensor([*targets, *steps, *scans]), sources_of(targets, steps, scans)
-    names: dict[str, str] = {}
-    for source in Origin.model_validate(provenance).captures():
-        if source.sha256 in names:
-            raise CalibrationError(f"{names[source.sha256]} and {source.file} are the same capture: give it once")
-        names[source.sha256] = source.file
     media: dict[str, Medium] = {}
     views: dict[ViewMedium, list[Capture]] = {}
     for capture in targets:

@@ -96,7 +96,12 @@ class SeriesStart:
                 at = seen_by.on_target(piece.pixels, local, moved)
                 points.append((at - moved) @ cv2.Rodrigues(local[:3])[0].T + local[3:6])
         pose, glass = laser_pose(self.sensor), self.sensor.laser.window
-        sheet = fit_sheet(np.vstack(points), nominal_normal=pose.normal, largest_rejected=_LARGEST_REJECTED).model
+        sheet = fit_sheet(
+            np.vstack(points),
+            nominal_normal=pose.normal,
+            nominal_offset_mm=float(pose.normal @ pose.origin_mm),
+            largest_rejected=_LARGEST_REJECTED,
+        ).model
         normal, along = np.array(sheet.normal), sheet.normal @ pose.normal
         middle = camera_from_object(self.sensor)[:3, 3]
         outer = glass.distance_mm + glass.thickness_mm if glass.mounted else 0.0
