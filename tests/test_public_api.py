@@ -18,8 +18,8 @@ HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "op
 
 WRITES = {"out", "overwrite"}
 """Options of commands that write what their function returns."""
-METHOD = {"method"}
-"""The stripe's method, which functions take among their `StripeOptions`."""
+METHOD = {"method", "stripe"}
+"""Settings of the stripe, which functions take as their `stripe`: options, or a dict."""
 LISTENS = {"progress", "report", "warn"}
 """Parameters by which functions show what they do; commands print it."""
 

@@ -14,7 +14,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.optics.window import require_index
 from uwlts.storage.capture import Capture, opened_captures
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeSettings
 
 _Captures = Sequence[Capture | str | Path]
 
@@ -33,7 +33,7 @@ def calibrate(
     distortion: Distortion = "auto",
     pixels: Pixels = "auto",
     index: float | None = None,
-    stripe: StripeOptions = StripeOptions(),
+    stripe: StripeSettings = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate a sensor from captures, open ones or by their paths.
@@ -68,8 +68,8 @@ def calibrate(
         Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the captures.
-    stripe : StripeOptions, optional
-        How stripes are found.
+    stripe : StripeOptions or dict, optional
+        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
     progress : callable, optional
         Called with the name of the stage, the number of images done, and the number in all.
 

@@ -14,7 +14,7 @@ from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
 from uwlts.storage.capture import Capture
-from uwlts.stripe import StripeOptions, extract_stripe, why_no_stripe
+from uwlts.stripe import StripeOptions, StripeSettings, extract_stripe, why_no_stripe
 from uwlts.stripe.recording import shown_stripe
 from uwlts.targets import Target, TargetView, parse_target
 
@@ -67,7 +67,7 @@ class StepEvidence:
 
 
 def air_evidence(
-    captures: Sequence[Capture], *, stripe: StripeOptions = StripeOptions(), progress: Progress | None = None
+    captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: Progress | None = None
 ) -> AirEvidence:
     """Find the target in the images with the laser off, and the stripe in those with it on at the same positions.
 
@@ -134,7 +134,7 @@ def step_evidence(
     captures: Sequence[Capture],
     *,
     medium_index: float | None = None,
-    stripe: StripeOptions = StripeOptions(),
+    stripe: StripeSettings = None,
     progress: Progress | None = None,
 ) -> tuple[list[StepEvidence], list[str]]:
     """Stripes on the step standard in all images with the laser on, and warnings about images left out.
@@ -212,13 +212,14 @@ def _stripe_of(
     capture: Capture,
     frame: int,
     image: np.ndarray,
-    options: StripeOptions,
+    settings: StripeSettings,
     warnings: list[str],
     *,
     on: tuple[TargetView, Target] | None = None,
 ) -> TargetStripe:
     """The stripe in an image, of a target as it was seen there if that is given; none, and a warning, if of no use."""
-    along, clip = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
+    sensor, clip = capture.header.sensor, capture.header.saturation_dn
+    along, options = sensor.camera.stripe_along, StripeOptions.of(sensor, settings)
     try:
         if on is None:
             found = TargetStripe(

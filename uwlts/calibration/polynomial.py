@@ -20,7 +20,7 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeSettings
 
 MOST_SMOOTH = 8
 """Degree of the coefficients over the lines."""
@@ -151,7 +151,7 @@ def calibrate_polynomials(
     target: Sequence[Capture | str | Path],
     *,
     degree: int = 6,
-    stripe: StripeOptions = StripeOptions(),
+    stripe: StripeSettings = None,
     progress: Progress | None = None,
 ) -> PolynomialResult:
     """Calibrate a sensor by polynomials, position to Z and Z to Y for each profile line.

@@ -23,7 +23,7 @@ from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
 from uwlts.storage.capture import Capture, source_of
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeSettings
 
 
 def _camera_figures(solution: CameraSolution) -> dict[str, JsonValue]:
@@ -137,7 +137,7 @@ class CalibrationOptions:
     poses: Poses = "stage-normal"
     camera: CameraOptions = CameraOptions()
     lens: LensChoice | None = None
-    stripe: StripeOptions = StripeOptions()
+    stripe: StripeSettings = None
     correct_circles: bool = True
     medium_index: float | None = None
     same_water: bool = True

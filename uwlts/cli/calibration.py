@@ -14,12 +14,13 @@ from uwlts.cli.options import (
     Index,
     Method,
     Overwrite,
+    Stripe,
     Workers,
     any_stage,
     app,
     say,
     show,
-    stripe_options,
+    stripe_settings,
     warn,
 )
 from uwlts.model.errors import DescriptionError
@@ -45,6 +46,7 @@ def calibrate(
     pixels: Literal["auto", "square", "free"] = "auto",
     index: Index = None,
     method: Method = None,
+    stripe: Stripe = (),
     camera: str | None = None,
     stage: str | None = None,
     port: int = 8080,
@@ -126,7 +128,7 @@ def calibrate(
             distortion=distortion,
             pixels=pixels,
             index=index,
-            stripe=stripe_options(method),
+            stripe=stripe_settings(stripe, method),
             progress=any_stage(progress),
         )
     advice = [] if calibration.joint is None else advice_lines(calibration)
@@ -190,6 +192,7 @@ def refresh(
     index: float | None = None,
     index_std: float | None = None,
     method: Method = None,
+    stripe: Stripe = (),
     overwrite: Overwrite = False,
 ) -> None:
     """Adapt a joint calibration to new water, or water of another temperature, by images of a step in it.
@@ -218,7 +221,7 @@ def refresh(
             step,
             index=index,
             index_std=index_std,
-            stripe=stripe_options(method),
+            stripe=stripe_settings(stripe, method),
             progress=any_stage(progress),
         )
     uwlts.write_calibration(path, result.calibration, overwrite=overwrite)
@@ -228,7 +231,13 @@ def refresh(
 
 @app.command
 def polynomials(
-    *, target: Files, out: CalibrationOut, degree: int = 6, method: Method = None, overwrite: Overwrite = False
+    *,
+    target: Files,
+    out: CalibrationOut,
+    degree: int = 6,
+    method: Method = None,
+    stripe: Stripe = (),
+    overwrite: Overwrite = False,
 ) -> None:
     """Calibrate by polynomials, position to Z and Z to Y for each profile line, completely in the medium of use.
 
@@ -244,7 +253,7 @@ def polynomials(
     refuse_unsuitable(out, overwrite=overwrite)
     with progress_bar("calibrating") as progress:
         result = uwlts.calibrate_polynomials(
-            target, degree=degree, stripe=stripe_options(method), progress=any_stage(progress)
+            target, degree=degree, stripe=stripe_settings(stripe, method), progress=any_stage(progress)
         )
     uwlts.write_calibration(out, result.calibration, overwrite=overwrite)
     _finish(out, polynomial_lines(result.calibration), result.warnings)
@@ -260,6 +269,7 @@ def models(
     poses: Literal["stage", "free"] = "stage",
     index: Index = None,
     method: Method = None,
+    stripe: Stripe = (),
     workers: Workers = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -290,7 +300,7 @@ def models(
             step=step,
             poses=poses,
             index=index,
-            stripe=stripe_options(method),
+            stripe=stripe_settings(stripe, method),
             workers=workers,
             progress=any_stage(progress),
         )

@@ -11,11 +11,12 @@ from uwlts.cli.options import (
     Index,
     Method,
     Overwrite,
+    Stripe,
     Workers,
     app,
     say,
     show,
-    stripe_options,
+    stripe_settings,
     warn,
 )
 from uwlts.runtime.console import progress_bar
@@ -122,7 +123,8 @@ def reconstruct(
     out: Path,
     index: Index = None,
     method: Method = None,
-    peak: Literal["strongest", "first", "last"] = "strongest",
+    stripe: Stripe = (),
+    peak: Literal["strongest", "first", "last"] | None = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Turn a capture into a point cloud.
@@ -134,12 +136,13 @@ def reconstruct(
         calibration: Calibration of the sensor, or one by polynomials.
         out: Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a
             joint calibration its uncertainty.
-        peak: Which of several stripes on a line counts.
+        peak: Which of several stripes on a line counts; the strongest, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
     with uwlts.open_capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
-        cloud = uwlts.reconstruct(opened, known, stripe=stripe_options(method, peak), index=index, progress=progress)
+        settings = stripe_settings(stripe, method, peak)
+        cloud = uwlts.reconstruct(opened, known, stripe=settings, index=index, progress=progress)
         lit = int(opened.laser_on.sum())
     uwlts.write_cloud(out, cloud, overwrite=overwrite)
     warn(*cloud.warnings)

@@ -1,5 +1,6 @@
 """The ``uwlts`` command line itself, and what its commands share."""
 
+import json
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable
@@ -39,12 +40,33 @@ Overwrite = Annotated[bool, Parameter(negative="", help="Replace existing files.
 CalibrationOut = Annotated[Path, Parameter(help="Calibration file to write.")]
 
 
-def stripe_options(method: Method, peak: Literal["strongest", "first", "last"] = "strongest") -> "uwlts.StripeOptions":
-    """Options of finding stripes, with the default method unless one is given."""
-    from uwlts.stripe import PeakRule
+Stripe = Annotated[
+    tuple[str, ...],
+    Parameter(
+        consume_multiple=True,
+        negative="",
+        show_default=False,
+        help="Settings of how the stripe is found, such as half_window_px=32 threshold_sigmas=4, in place of those in "
+        "the sensor's table [stripe] (docs: StripeOptions).",
+    ),
+]
 
-    options = uwlts.StripeOptions
-    return options(method=method or options.method, peak=PeakRule(peak))
+
+def stripe_settings(stripe: Stripe, method: Method, peak: str | None = None) -> dict[str, object]:
+    """Settings of finding stripes that were given on the command line."""
+    from uwlts.model.errors import DescriptionError
+
+    settings: dict[str, object] = {}
+    for setting in stripe:
+        name, equals, value = setting.partition("=")
+        if not (name and equals and value):
+            raise DescriptionError(f"--stripe {setting}: expected NAME=VALUE, such as half_window_px=32")
+        try:
+            settings[name] = json.loads(value)
+        except ValueError:
+            settings[name] = value
+    given: dict[str, object] = {"method": method, "peak": peak}
+    return settings | {name: value for name, value in given.items() if value is not None}
 
 
 def any_stage(progress: Callable[[int, int], None]) -> Callable[[str, int, int], None]:

@@ -17,7 +17,7 @@ from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, opened_capture
 from uwlts.storage.cloud import PointCloud
-from uwlts.stripe import FoundStripes, StripeOptions, find_stripes
+from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +46,7 @@ def reconstruct(
     capture: Capture | str | Path,
     calibration: AnyCalibration | str | Path,
     *,
-    stripe: StripeOptions = StripeOptions(),
+    stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -57,8 +57,8 @@ def reconstruct(
     ----------
     capture : Capture or path
     calibration : Calibration, PolynomialCalibration or path
-    stripe : StripeOptions, optional
-        How stripes are found.
+    stripe : StripeOptions or dict, optional
+        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the capture.
     with_uncertainty : bool, optional

@@ -471,7 +471,11 @@ class Uncertainty(Description):
 
 
 class Sensor(Description):
-    """A complete sensor with the media it is used in. ``more_lasers`` shine further sheets at the same time."""
+    """A complete sensor with the media it is used in.
+
+    ``more_lasers`` shine further sheets at the same time. ``stripe`` holds settings of how the stripe is found in the
+    sensor's images, where they are to differ from the usual ones (`uwlts.stripe.StripeOptions`).
+    """
 
     name: str
     notes: str = ""
@@ -485,6 +489,7 @@ class Sensor(Description):
     volume: Volume
     media: dict[str, Medium]
     uncertainty: Uncertainty = Uncertainty()
+    stripe: Table = {}
 
     def medium(self, name: str) -> Medium:
         """One of the sensor's media; DescriptionError where it has none of this name."""

@@ -9,13 +9,14 @@ for all laser images and says why there is no stripe.
 from uwlts.stripe.extract import extract_stripe
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
-from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeStatus
+from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeSettings, StripeStatus
 
 __all__ = [
     "FoundStripes",
     "PeakRule",
     "Stripe",
     "StripeOptions",
+    "StripeSettings",
     "StripeStatus",
     "extract_stripe",
     "find_stripes",

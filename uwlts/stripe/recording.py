@@ -11,7 +11,7 @@ import numpy as np
 from uwlts.model.errors import CaptureError, ImageError
 from uwlts.model.sensor import CaptureHeader
 from uwlts.stripe.extract import extract_stripe
-from uwlts.stripe.result import StripeOptions, StripeStatus
+from uwlts.stripe.result import StripeOptions, StripeSettings, StripeStatus
 
 BLACK = 0.02
 """Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
@@ -68,19 +68,20 @@ class FoundStripes:
 def find_stripes(
     capture: LaserImages,
     *,
-    options: StripeOptions = StripeOptions(),
+    options: StripeSettings = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
-    ``progress`` is called after each image with the number of images done and the number in all. CaptureError where
-    the recording holds no laser image, or none of them shows a stripe.
+    ``options`` are as for `StripeOptions.of`. ``progress`` is called after each image with the number of images done
+    and the number in all. CaptureError where the recording holds no laser image, or none of them shows a stripe.
     """
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
+    chosen = StripeOptions.of(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
     statuses = np.zeros(len(StripeStatus), int)
     for number, image in capture.frames(laser_on=True):
-        stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)
+        stripe = extract_stripe(image, stripe_along=along, options=chosen, saturation=full_dn)
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))

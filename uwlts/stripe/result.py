@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum, StrEnum
+from typing import Any
 
 import numpy as np
 
-from uwlts.model.errors import RangeError
+from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.model.sensor import Sensor
 from uwlts.stripe.methods import method_names
 
 
@@ -109,9 +112,30 @@ class StripeOptions:
         if self.smoothing_lines % 2 == 0:
             raise RangeError(f"smoothing_lines is {self.smoothing_lines}; use an odd number, 1 for no averaging")
 
+    @classmethod
+    def of(cls, sensor: Sensor, settings: StripeSettings = None) -> StripeOptions:
+        """Options for a sensor's images: those given, or the sensor's own with the settings given in their place.
+
+        DescriptionError for a setting that is unknown, of the wrong type or out of range.
+        """
+        if isinstance(settings, StripeOptions):
+            return settings
+        wanted = sensor.stripe | dict(settings or {})
+        known = [field.name for field in fields(cls)]
+        if unknown := [name for name in wanted if name not in known]:
+            raise DescriptionError(f"unknown setting of the stripe: {', '.join(unknown)}; known are {', '.join(known)}")
+        try:
+            return replace(cls(), **wanted)
+        except (RangeError, TypeError) as error:
+            raise DescriptionError(f"settings of the stripe: {error}") from error
+
     def doubled(self) -> StripeOptions:
         """The same for stripes twice as wide."""
         return replace(self, half_window_px=2 * self.half_window_px, smoothing_px=2 * self.smoothing_px)
+
+
+StripeSettings = StripeOptions | Mapping[str, Any] | None
+"""How the stripe is found: all options; some, in place of the sensor's own; or None, the sensor's own."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import erf
 
-from uwlts.model.errors import ImageError, RangeError
+from uwlts.model.errors import DescriptionError, ImageError, RangeError
+from uwlts.model.library import load_sensor
 from uwlts.stripe import PeakRule, StripeOptions, StripeStatus, extract_stripe, method_names
 
 LENGTH = 120
@@ -504,3 +505,18 @@ def test_a_stripe_shorter_than_its_two_ends_gives_no_points():
     image = np.full((40, 128), 10, np.uint8)
     image[20:23] = grey(gaussian(np.full(3, 60.0), sigma=2, amplitude=150, length=128) + 10)
     assert (rows(image).status[20:23] == StripeStatus.END).all()
+
+
+def test_settings_of_the_sensor_and_of_the_call():
+    sensor = load_sensor("thesis").model_copy(update={"stripe": {"half_window_px": 32, "peak": "first"}})
+    assert StripeOptions.of(sensor) == StripeOptions(half_window_px=32, peak=PeakRule.FIRST)
+    assert StripeOptions.of(sensor, {"peak": "last"}) == StripeOptions(half_window_px=32, peak=PeakRule.LAST)
+    assert StripeOptions.of(sensor, StripeOptions()) == StripeOptions()
+    for wrong, said in (
+        ({"window": 3}, "unknown setting of the stripe: window; known are method"),
+        ({"method": "x"}, "method is 'x'"),
+        ({"half_window_px": "32"}, "half_window_px is '32'"),
+        ({"threshold_sigmas": "many"}, "settings of the stripe"),
+    ):
+        with pytest.raises(DescriptionError, match=said):
+            StripeOptions.of(sensor, wrong)

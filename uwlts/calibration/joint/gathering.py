@@ -28,7 +28,7 @@ from uwlts.model.parameter_keys import (
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
 from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
-from uwlts.stripe import StripeOptions, find_stripes
+from uwlts.stripe import StripeSettings, find_stripes
 
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
@@ -142,7 +142,7 @@ def gather_jointly(
     return Gathered(sensor, media, series, on_steps, on_scans, provenance, warnings)
 
 
-def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeOptions) -> ScanStripes:
+def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) -> ScanStripes:
     """Find the stripes of a scan.
 
     Raises DescriptionError: the capture does not describe spheres, a plane or a pipe. CaptureError: no image shows a

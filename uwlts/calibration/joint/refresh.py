@@ -34,7 +34,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.window import require_index
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, opened_captures
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeSettings
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def refresh(
     *,
     index: float | None = None,
     index_std: float | None = None,
-    stripe: StripeOptions = StripeOptions(),
+    stripe: StripeSettings = None,
     progress: Progress | None = None,
 ) -> Refreshed:
     """Estimate all parameters again from a joint calibration and images of a step in new water.
@@ -221,8 +221,8 @@ def refresh(
         Refractive index of the new water as far as it is known, in place of the one that follows from the captures.
     index_std : float, optional
         Standard uncertainty of that index, in place of what follows from the sensor's description.
-    stripe : StripeOptions, optional
-        How stripes are found.
+    stripe : StripeOptions or dict, optional
+        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
     progress : callable, optional
         Called with the name of the stage, the number of images done, and the number in all.
 

@@ -30,7 +30,7 @@ from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.optics.window import require_index
 from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
-from uwlts.stripe import StripeOptions
+from uwlts.stripe import StripeSettings
 
 Level = TypeVar("Level")
 
@@ -336,7 +336,7 @@ def compare_models(
     step: _Captures = (),
     poses: Literal["stage", "free"] = "stage",
     index: float | None = None,
-    stripe: StripeOptions = StripeOptions(),
+    stripe: StripeSettings = None,
     workers: int | None = None,
     progress: Searched = lambda stage, done, total: None,
 ) -> Comparison:
@@ -350,8 +350,8 @@ def compare_models(
         stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the captures.
-    stripe : StripeOptions, optional
-        How stripes are found.
+    stripe : StripeOptions or dict, optional
+        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
     workers : int, optional
         Models calibrated at a time; as many as there are processors unless given.
     progress : callable, optional
