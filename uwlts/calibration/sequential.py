@@ -14,6 +14,7 @@ from pydantic import JsonValue
 import uwlts
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.figures import camera_figures, lens_figures, sheet_figures, window_figures
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.lens import LensCalibration, LensChoice, calibrate_lens, jackknife
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
@@ -24,89 +25,6 @@ from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
 from uwlts.storage.capture import Capture, source_of
 from uwlts.stripe import StripeSettings
-
-
-def _camera_figures(solution: CameraSolution) -> dict[str, JsonValue]:
-    """Residuals, standard deviations and covariance of the camera, as files hold them; None for what is missing."""
-    direction, tilt, tilt_std = solution.stage_direction, solution.stage_tilt_rad, solution.stage_tilt_std_rad
-    return {
-        "images": len(solution.residuals_px),
-        "points": sum(map(len, solution.residuals_px)),
-        "rms_px": solution.rms_px(),
-        "sigma_px": solution.sigma_px,
-        "image_rms_px": solution.image_rms_px().tolist(),
-        "std": {**solution.std()},
-        "parameters": list(solution.parameters),
-        "covariance": solution.covariance.tolist(),
-        "stage_direction": None if direction is None else direction.tolist(),
-        "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
-        "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
-        "largest_circle_bias_px": solution.largest_bias_px(),
-        "rounds": solution.rounds,
-        "stopped": solution.stopped,
-    }
-
-
-def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
-    """Models tried and images used, of ``found`` those alone, as files hold them; None for what is missing."""
-    rms = lens.solution.image_rms_px()
-    columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.strays, strict=True)
-    table: list[JsonValue] = [
-        {
-            "image": name,
-            "points": len(image.pixels),
-            "rms_px": float(miss),
-            "moves": None if np.isnan(moved) else float(moved),
-            "stripe_points": len(stripe),
-            "stripe_strays": astray,
-        }
-        for name, image, miss, moved, stripe, astray in columns
-    ]
-    tried: list[JsonValue] = [
-        {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates
-    ]
-    return {
-        "lens_model": lens.name,
-        "models_tried": tried,
-        "rejected_share": lens.rejected_share,
-        "images_left_out": len(lens.left_out),
-        "image_table": table,
-    }
-
-
-def _sheet_figures(solution: SheetSolution, points: StripePoints) -> dict[str, JsonValue]:
-    """Distances of the stripe points from the sheet, as files hold them."""
-    return {
-        "images": len(np.unique(points.image)),
-        "points": len(points.points_mm),
-        "rms_mm": solution.rms_mm,
-        "max_mm": solution.max_mm,
-        "rejected_share": solution.rejected_share,
-        "normal_std_deg": float(np.degrees(solution.normal_std_rad)),
-        "turn_from_nominal_deg": float(np.degrees(solution.turn_rad)),
-    }
-
-
-def _window_figures(solution: WindowSolution, steps: Sequence[StepEvidence]) -> dict[str, JsonValue]:
-    """Step heights and their errors, the distance's standard deviations, the curve, as files hold them."""
-    return {
-        "images": [step.source for step in steps],
-        "distance_mm": solution.model.distance_mm,
-        "std_mm": solution.std_mm,
-        "scatter_std_mm": solution.scatter_std_mm,
-        "per_height": solution.per_height,
-        "heights_mm": solution.heights_mm.tolist(),
-        "errors_mm": solution.errors_mm.tolist(),
-        "height_std_mm": solution.height_std_mm.tolist(),
-        "image_distances_mm": _none_for_nan(solution.image_distances_mm),
-        "curve_mm": [_none_for_nan(row) for row in solution.curve_mm],
-        "bounds_mm": list(solution.bounds_mm),
-    }
-
-
-def _none_for_nan(values: np.ndarray) -> list[JsonValue]:
-    return [value if np.isfinite(value) else None for value in values.tolist()]
-
 
 _FEWEST_LEFT_OUT = 4  # images; of fewer the jackknife says little
 _CLEARLY_LESS = 0.7  # of the misses: so much less with a free direction of the stage is no chance
@@ -257,35 +175,9 @@ def gather(
 
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
     """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
-    sensor, found = evidence.sensor, evidence.air
-    seen_by = partial(
-        solve_camera,
-        width_px=sensor.camera.width_px,
-        height_px=sensor.camera.height_px,
-        approaching=evidence.approaching is not False,
-        circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
-    )
-    of_lens: dict[str, JsonValue] = {}
-    doubts: list[str] = []
-    lens = None
-    if options.lens is None:
-        camera = seen_by(found.images, poses=options.poses, options=options.camera, start=start)
-    else:
-        lens = calibrate_lens(
-            found.images,
-            width_px=sensor.camera.width_px,
-            height_px=sensor.camera.height_px,
-            poses=options.poses,
-            approaching=evidence.approaching is not False,
-            choice=options.lens,
-            circle_diameter_mm=found.target.circle_diameter_mm if options.correct_circles else None,
-        )
-        camera, names = replace(lens.solution, covariance=lens.covariance), found.names()
-        doubts = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
-        found = found.only(lens.used, lens.images)
-        of_lens = _lens_figures(lens, found)
-        if options.poses == "stage-normal" and lens.options.square_pixels:
-            doubts += _leaning(camera, seen_by(found.images, poses="stage", options=lens.options))
+    sensor = evidence.sensor
+    seen = _camera_of(evidence, options, start)
+    camera, found = seen.camera, seen.air
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
     stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
@@ -293,10 +185,12 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     sheet = fit_sheet(
         stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
     )
-    if lens is not None:
-        sheet = _by_images(sheet, lens, found)
-    warnings = [*evidence.warnings, *doubts, *_turn_warnings(camera, sheet, evidence)]
-    figures = {"camera": _camera_figures(camera) | of_lens, "sheet": _sheet_figures(sheet, stripe_points)}
+    figures = {"camera": camera_figures(camera)}
+    if seen.lens is not None:
+        sheet = _by_images(sheet, seen.lens, found)
+        figures["camera"] |= lens_figures(seen.lens, found)
+    figures["sheet"] = sheet_figures(sheet, stripe_points)
+    warnings = [*evidence.warnings, *seen.warnings, *_turn_warnings(camera, sheet, evidence)]
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -319,7 +213,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
             why = "; ".join([*evidence.warnings, *left_out][:3])
             raise CalibrationError(f"no step image can be used for the window's distance; {why}")
         window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm)
-        figures["window"] = _window_figures(window, used)
+        figures["window"] = window_figures(window, used)
     warnings += left_out
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
@@ -330,6 +224,47 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         }
     )
     return CalibrationResult(calibration, found, camera, stripe_points, sheet, used, window, warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A camera, the lens it was chosen with or None, the images it rests on, and what speaks against it."""
+
+    camera: CameraSolution
+    lens: LensCalibration | None
+    air: AirEvidence
+    warnings: list[str]
+
+
+def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _Seen:
+    """The camera from the images of the target, near ``start`` if that is given, or with a lens that is chosen."""
+    air = evidence.air
+    width_px, height_px = evidence.sensor.camera.width_px, evidence.sensor.camera.height_px
+    approaching = evidence.approaching is not False
+    diameter_mm = air.target.circle_diameter_mm if options.correct_circles else None
+    solved = partial(
+        solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
+    )
+    if options.lens is None:
+        return _Seen(solved(air.images, poses=options.poses, options=options.camera, start=start), None, air, [])
+    lens = calibrate_lens(
+        air.images,
+        width_px=width_px,
+        height_px=height_px,
+        poses=options.poses,
+        approaching=approaching,
+        choice=options.lens,
+        circle_diameter_mm=diameter_mm,
+    )
+    camera, used, names = (
+        replace(lens.solution, covariance=lens.covariance),
+        air.only(lens.used, lens.images),
+        air.names(),
+    )
+    warnings = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
+    if options.poses == "stage-normal" and lens.options.square_pixels:
+        warnings += _leaning(camera, solved(used.images, poses="stage", options=lens.options))
+    return _Seen(camera, lens, used, warnings)
 
 
 def common_sensor(captures: Sequence[Capture]) -> Sensor:

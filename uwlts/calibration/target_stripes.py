@@ -11,7 +11,7 @@ from uwlts.targets import Target, TargetView
 
 _DEGREE = 4  # bends of lens, window, line optics and plate; more would follow strays
 _TRIALS = 300  # parabolas through three points; with half the points astray one in eight is free of them
-_BEYOND = 0.05  # of the plate's size; so far beyond it distortion may put its border in the image
+_BEYOND = 0.025  # of the plate's size; so far beyond it distortion may put its border in the image
 _OUTLIER, _LEAST_LIMIT_PX = 5.0, 1.0
 _FEWEST = 20  # points of a curve
 _LOST = 0.05  # share of the lines on the plate that may have no point on the curve without a second look
@@ -41,9 +41,7 @@ def stripe_on_target(
     the plate. Parameters and errors as of `extract_stripe`.
     """
     stripe = extract_stripe(image, stripe_along=stripe_along, saturation=saturation, options=options)
-    # (x across, line) of every point, whichever way the stripe runs.
-    plate = _plate_in_image(view, target)
-    on_plate = _inside(plate, stripe.pixels())
+    on_plate = _on_plate(stripe.pixels(), view, target)
     lines, across = stripe.lines[on_plate], stripe.centre_px[stripe.lines][on_plate]
     if len(lines) < _FEWEST:
         return TargetStripe(stripe.pixels()[on_plate], 0)
@@ -52,7 +50,7 @@ def stripe_on_target(
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
     along_curve = np.arange(len(stripe.status))
-    expected = _inside(plate, _pixels(along_curve, curve.at(along_curve), stripe_along))
+    expected = _on_plate(_pixels(along_curve, curve.at(along_curve), stripe_along), view, target)
     missing = np.setdiff1d(along_curve[expected], lines[near])
     strays = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
@@ -72,20 +70,18 @@ def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndar
     return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
 
 
-def _plate_in_image(view: TargetView, target: Target) -> np.ndarray:
-    """Corners (4, 2) of the plate in the image, a little beyond it."""
-    homography = cv2.findHomography(view.points_mm[:, :2], view.pixels)[0]
-    plate = target.plate_mm
-    wider = plate + _BEYOND * (plate - plate.mean(axis=0))
-    return cv2.perspectiveTransform(wider[:, None], homography)[:, 0]
-
-
-def _inside(corners: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Whether (N,) pixels (N, 2) are within a convex polygon (V, 2)."""
-    sides = np.roll(corners, -1, axis=0) - corners
-    apart = pixels[:, None] - corners
-    turn = sides[:, 0] * apart[..., 1] - sides[:, 1] * apart[..., 0]
-    return np.all(turn >= 0, axis=1) | np.all(turn <= 0, axis=1)
+def _on_plate(pixels: np.ndarray, view: TargetView, target: Target) -> np.ndarray:
+    """Whether (N,) pixels (N, 2) see a target's plate, or a little beyond it, by the homography of its points."""
+    to_plate = np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
+    seen = np.column_stack([pixels, np.ones(len(pixels))]) @ to_plate.T
+    # Beyond the plate's horizon the sign changes.
+    ahead = seen[:, 2] * (to_plate[2] @ [*view.pixels[0], 1.0]) > 0
+    corners = target.plate_mm
+    beyond = _BEYOND * np.ptp(corners, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = seen[:, :2] / seen[:, 2:]
+    within = (places >= corners.min(axis=0) - beyond) & (places <= corners.max(axis=0) + beyond)
+    return ahead & np.all(within, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +107,8 @@ class _Curve:
                 best = near
         if best.sum() < _FEWEST:
             return None
-        fitted = np.polynomial.Polynomial.fit(lines[best], across[best], 2)
-        # Outside the points of a parabola only, the limit must not depend on points that are none of the stripe's.
-        return cls(fitted, tolerance_px).refined(lines, across)
+        parabola = np.polynomial.Polynomial.fit(lines[best], across[best], 2)
+        return cls(parabola, tolerance_px).refined(lines, across)
 
     def refined(self, lines: np.ndarray, across: np.ndarray) -> "_Curve":
         """The curve of full degree through the points near this one, found anew until they stay the same."""
@@ -129,6 +124,7 @@ class _Curve:
         return curve
 
     def at(self, lines: np.ndarray) -> np.ndarray:
+        """Places across the stripe."""
         return self.polynomial(lines)
 
     def holds(self, lines: np.ndarray, across: np.ndarray) -> np.ndarray:
