@@ -68,7 +68,7 @@ BAD_SENSORS = {
     "stripe": ("[camera]\nstripe_along = 'depth'", r"camera\.stripe_along: .*'depth'"),
     "bits": ("[detector]\nbits = 9", r"detector\.bits: .*found 9"),
     "placed twice": (
-        "[laser]\norigin_mm = [0.0, -265.0, 0.0]\naxis = [0.0, 0.6, 0.8]",
+        "[laser]\norigin_mm = [0.0, -265.0, 0.0]\naxis = [0.0, 0.6, 0.8]\nbaseline_mm = 265.0",
         r"laser: place the laser by baseline_mm",
     ),
     "placed half": ("[laser]\naxis = [0.0, 0.6, 0.8]", r"laser: place the laser by baseline_mm"),
