@@ -109,7 +109,7 @@ def extract_stripe(
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
     found = _found(profiles, options, clip)
-    # A wider window is taken only where it shows what the narrower one did not.
+    # A wider window is taken only if it measures what was too wide.
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.doubled()
