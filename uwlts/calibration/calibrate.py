@@ -62,8 +62,9 @@ def calibrate(
         stage-normal: one target pose, moved by the stage along the target's normal. stage: the same in a free
         direction, as always in the joint method. free: every image has a pose of its own.
     distortion : "auto" or tuple of str
-        The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0. auto: those that predict images of the
-        target left out best; jointly k1 and k2, with what the description says of p1 and p2.
+        The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0. auto: with the poses stage and free
+        those that predict images of the target left out best; with stage-normal k1 and k2; jointly the same, and p1 and
+        p2 as far as the description leaves them open.
     pixels : {"auto", "square", "free"}
         Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one.
     index : float, optional

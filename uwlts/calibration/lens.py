@@ -121,8 +121,8 @@ def calibrate_lens(
 
     Parameters
     ----------
-    choice : what is estimated. Models are compared with a free direction of the stage, for a wrong one can look like
-        another lens; their pixels are square then
+    choice : what is estimated. A stage's direction that is taken for the target's normal, and is not, looks like
+        another lens: so with the poses "stage-normal" "auto" is k1 and k2; with both poses of a stage pixels are square
     progress : called with the number of models tried and of all
 
     Other parameters are those of `solve_camera`.
@@ -131,25 +131,20 @@ def calibrate_lens(
     """
 
     def solved(
-        chosen: Sequence[TargetImage],
-        options: CameraOptions,
-        start: CameraSolution | None = None,
-        *,
-        circles: bool,
-        freer: bool = False,
+        chosen: Sequence[TargetImage], options: CameraOptions, start: CameraSolution | None = None, *, circles: bool
     ) -> CameraSolution:
         return solve_camera(
             chosen,
             width_px=width_px,
             height_px=height_px,
-            poses="stage" if freer and poses != "free" else poses,
+            poses=poses,
             approaching=approaching,
             options=options,
             start=start,
             circle_diameter_mm=circle_diameter_mm if circles else None,
         )
 
-    tried = _candidates(choice, square=poses != "free")
+    tried = _candidates(choice, poses)
     usual = tried[0] if len(tried) == 1 else CameraOptions(("k1", "k2"), square_pixels=choice.pixels != "free")
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
@@ -162,10 +157,8 @@ def calibrate_lens(
     options, keep = usual, inliers(usual)
     good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        start = solved(good, usual, circles=True, freer=usual.square_pixels)
-        candidates = _compared(
-            _centred(good, start), tried, lambda i, o: solved(i, o, circles=False, freer=o.square_pixels), progress
-        )
+        start = solved(good, usual, circles=True)
+        candidates = _compared(_centred(good, start), tried, lambda i, o: solved(i, o, circles=False), progress)
         options = _chosen(candidates, usual)
     if options != usual:
         keep = inliers(options)
@@ -219,9 +212,11 @@ def _name(options: CameraOptions) -> str:
     return f"{coefficients}, {'square' if options.square_pixels else 'free'} pixels"
 
 
-def _candidates(choice: LensChoice, *, square: bool) -> list[CameraOptions]:
-    sets = _DISTORTIONS if choice.distortion == "auto" else (choice.distortion,)
-    shapes = {"auto": (True,) if square else (True, False), "square": (True,), "free": (False,)}[choice.pixels]
+def _candidates(choice: LensChoice, poses: Poses) -> list[CameraOptions]:
+    any_of = (("k1", "k2"),) if poses == "stage-normal" else _DISTORTIONS
+    sets = any_of if choice.distortion == "auto" else (choice.distortion,)
+    any_shape = (True, False) if poses == "free" else (True,)
+    shapes = {"auto": any_shape, "square": (True,), "free": (False,)}[choice.pixels]
     return [CameraOptions(names, square_pixels=shape) for names in sets for shape in shapes]
 
 

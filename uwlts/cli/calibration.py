@@ -81,8 +81,9 @@ def calibrate(
             through the window. The joint calibration takes this from the captures.
         poses: stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same
             with a free direction, as always in the joint calibration. free: every image has a pose of its own.
-        distortion: Distortion coefficients to estimate; the others stay 0. auto: those that predict images left out
-            best; jointly k1 and k2, with p1 and p2 as far as the description leaves them open.
+        distortion: Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and
+            free those that predict images left out best; with stage-normal k1 and k2; jointly the same, and p1 and p2
+            as far as the description leaves them open.
         pixels: Whether pixels are square or free to be not; auto: as distortion, with free poses; else square.
         camera: Guided: address of the camera, in place of the plan's.
         stage: Guided: serial port of the stage, in place of the plan's.
