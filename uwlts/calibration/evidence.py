@@ -23,7 +23,7 @@ Progress = Callable[[str, int, int], None]
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
-_MANY_STRAYS = 0.05  # share of a capture's stripe points from which those left out are worth a warning
+_MANY_OUTLIERS = 0.05  # share of a capture's stripe points from which those left out are worth a warning
 _LOOKED_AT = 15  # images of a capture in which the reason for a missing stripe is sought
 
 
@@ -37,7 +37,7 @@ class AirEvidence:
     stripes: list[np.ndarray]  # (N, 2) each; stripe pixels on the target at the position of the image; may be empty
     warnings: list[str]  # images left out, and why
     no_stripe: str = ""  # why there is no stripe at all; empty where there is one
-    strays: list[int] = field(default_factory=list)  # stripe pixels of each left out as off the curve of the others
+    outliers: list[int] = field(default_factory=list)  # stripe pixels of each that lie beside its curve; left out
     captures: list[str] = field(default_factory=list)  # their names
 
     def names(self) -> list[str]:
@@ -52,7 +52,7 @@ class AirEvidence:
             images=images,
             frames=[self.frames[n] for n in some],
             stripes=[self.stripes[n] for n in some],
-            strays=[self.strays[n] for n in some],
+            outliers=[self.outliers[n] for n in some],
         )
 
 
@@ -84,7 +84,7 @@ def air_evidence(
     if any(target != targets[0] for target in targets):
         raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
     total, done = sum(map(len, captures)), 0
-    images, frames, views, stripes, strays, warnings = [], [], [], [], [], []
+    images, frames, views, stripes, outliers, warnings = [], [], [], [], [], []
     reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
@@ -95,7 +95,7 @@ def air_evidence(
                 frames.append((number, frame))
                 views.append(view)
                 stripes.append(np.empty((0, 2)))
-                strays.append(0)
+                outliers.append(0)
             except (TargetError, CalibrationError) as error:
                 reason = why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
                 reasons[reason] += 1
@@ -108,16 +108,16 @@ def air_evidence(
                 place = first + int(here[0])
                 found = _stripe_of(capture, frame, image, stripe, warnings, on=(views[place], targets[0]))
                 stripes[place] = np.vstack([stripes[place], found.pixels])
-                strays[place] += found.strays
+                outliers[place] += found.outliers
             else:
                 warnings.append(
                     f"{capture.path.name}, frame {frame}: stripe left out, no target was found at "
                     f"{capture.stage_mm[frame]:g} mm"
                 )
             done = _report(progress, "target", done, total)
-        astray, kept = sum(strays[first:]), sum(map(len, stripes[first:]))
-        if astray > _MANY_STRAYS * (astray + kept):
-            share = 100 * astray / (astray + kept)
+        rejected, kept = sum(outliers[first:]), sum(map(len, stripes[first:]))
+        if rejected > _MANY_OUTLIERS * (rejected + kept):
+            share = 100 * rejected / (rejected + kept)
             warnings.append(
                 f"{capture.path.name}: {share:.0f} % of the stripe on the target was left out, for it lies beside the "
                 "curve of the rest: reflections, a second line, or a plate that is not flat"
@@ -127,7 +127,7 @@ def air_evidence(
             f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
         )
     no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
-    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, strays, _file_names(captures))
+    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, _file_names(captures))
 
 
 def step_evidence(

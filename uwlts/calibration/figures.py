@@ -36,7 +36,7 @@ def camera_figures(solution: CameraSolution) -> dict[str, JsonValue]:
 def lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
     """Models tried and images used, of ``found`` those alone, as files hold them; None for what is missing."""
     rms = lens.solution.image_rms_px()
-    columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.strays, strict=True)
+    columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.outliers, strict=True)
     table: list[JsonValue] = [
         {
             "image": name,
@@ -44,9 +44,9 @@ def lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVal
             "rms_px": float(miss),
             "moves": None if np.isnan(moved) else float(moved),
             "stripe_points": len(stripe),
-            "stripe_strays": astray,
+            "stripe_outliers": outliers,
         }
-        for name, image, miss, moved, stripe, astray in columns
+        for name, image, miss, moved, stripe, outliers in columns
     ]
     tried: list[JsonValue] = [
         {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates

@@ -120,6 +120,7 @@ def fit_sheet(
             f"{100 * robust.rejected_share:.0f} % of the stripe points do not lie on the plane of the others: check "
             f"the stage positions, and that the stripe falls on the target"
         )
+    offset = float(plane.normal @ plane.point_mm)
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
     to_turned = float(np.arccos(min(abs(plane.normal @ (_HALF_TURN * nominal_normal)), 1.0)))
     advice = None
@@ -134,13 +135,11 @@ def fit_sheet(
         found = f"the sheet that was found has the normal {np.round(plane.normal, 3).tolist()}"
         axis = int(np.argmax(np.abs(plane.normal[:2])))
         if abs(plane.normal[axis]) > _CROSSING:
-            place = plane.normal @ plane.point_mm / plane.normal[axis]
-            found += f" and crosses the camera's {'xy'[axis]} axis at {place:.0f} mm"
+            found += f" and crosses the camera's {'xy'[axis]} axis at {offset / plane.normal[axis]:.0f} mm"
         raise CalibrationError(
             f"the sheet's normal is turned by {np.degrees(turn):.0f} deg against the sensor's description{advice}; "
             + found
         )
-    offset = float(plane.normal @ plane.point_mm)
     if nominal_offset_mm is not None and abs(nominal_offset_mm) > _LEAST_OFFSET_MM:
         times = offset / nominal_offset_mm
         if not 1 / _OTHER_UNIT < times < _OTHER_UNIT:
@@ -150,7 +149,7 @@ def fit_sheet(
                 "laser's place that of this sensor"
             )
     return SheetSolution(
-        model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=float(plane.normal @ plane.point_mm)),
+        model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=offset),
         residuals_mm=robust.distances_mm,
         used=used,
         rms_mm=float(np.sqrt(np.mean(plane.residuals_mm**2))),

@@ -9,8 +9,8 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe
 from uwlts.targets import Target, TargetView
 
-_DEGREE = 4  # bends of lens, window, line optics and plate; more would follow strays
-_TRIALS = 300  # parabolas through three points; with half the points astray one in eight is free of them
+_DEGREE = 4  # bends of lens, window, line optics and plate; more would follow outliers
+_TRIALS = 300  # parabolas through three points; with half the points outliers one in eight is free of them
 _BEYOND = 0.025  # of the plate's size; so far beyond it distortion may put its border in the image
 _OUTLIER, _LEAST_LIMIT_PX = 5.0, 1.0
 _FEWEST = 20  # points of a curve
@@ -22,7 +22,7 @@ class TargetStripe:
     """Stripe pixels (N, 2) on the plate of a target, and the number of those on it that lie beside the curve."""
 
     pixels: np.ndarray
-    strays: int
+    outliers: int
 
 
 def stripe_on_target(
@@ -41,18 +41,20 @@ def stripe_on_target(
     the plate. Parameters and errors as of `extract_stripe`.
     """
     stripe = extract_stripe(image, stripe_along=stripe_along, saturation=saturation, options=options)
-    on_plate = _on_plate(stripe.pixels(), view, target)
-    lines, across = stripe.lines[on_plate], stripe.centre_px[stripe.lines][on_plate]
+    to_plate, pixels = _to_plate(view), stripe.pixels()
+    on_plate = _on_plate(pixels, to_plate, target)
+    lines = stripe.lines[on_plate]
+    across = stripe.centre_px[lines]
     if len(lines) < _FEWEST:
-        return TargetStripe(stripe.pixels()[on_plate], 0)
+        return TargetStripe(pixels[on_plate], 0)
     curve = _Curve.through(lines, across, tolerance_px=max(2.0, 0.25 * float(np.median(stripe.width_px[lines]))))
     if curve is None:
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
     along_curve = np.arange(len(stripe.status))
-    expected = _on_plate(_pixels(along_curve, curve.at(along_curve), stripe_along), view, target)
+    expected = _on_plate(_pixels(along_curve, curve.at(along_curve), stripe_along), to_plate, target)
     missing = np.setdiff1d(along_curve[expected], lines[near])
-    strays = int(np.count_nonzero(~near))
+    outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
     if len(missing) > _LOST * np.count_nonzero(expected):
         width = float(np.median(stripe.width_px[lines]))
@@ -62,7 +64,7 @@ def stripe_on_target(
         near = curve.holds(lines, across)
         lines, across = lines[near], across[near]
     order = np.argsort(lines)
-    return TargetStripe(_pixels(lines[order], across[order], stripe_along), strays)
+    return TargetStripe(_pixels(lines[order], across[order], stripe_along), outliers)
 
 
 def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndarray:
@@ -70,18 +72,19 @@ def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndar
     return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
 
 
-def _on_plate(pixels: np.ndarray, view: TargetView, target: Target) -> np.ndarray:
-    """Whether (N,) pixels (N, 2) see a target's plate, or a little beyond it, by the homography of its points."""
-    to_plate = np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
+def _to_plate(view: TargetView) -> np.ndarray:
+    """Homography (3, 3) from pixels to the target's plane; its third coordinate is positive where the plate is seen."""
+    inverse = np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
+    return inverse * np.sign(inverse[2] @ [*view.pixels[0], 1.0])
+
+
+def _on_plate(pixels: np.ndarray, to_plate: np.ndarray, target: Target) -> np.ndarray:
+    """Whether (N,) pixels (N, 2) see a target's plate, or a little beyond it."""
     seen = np.column_stack([pixels, np.ones(len(pixels))]) @ to_plate.T
-    # Beyond the plate's horizon the sign changes.
-    ahead = seen[:, 2] * (to_plate[2] @ [*view.pixels[0], 1.0]) > 0
-    corners = target.plate_mm
-    beyond = _BEYOND * np.ptp(corners, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         places = seen[:, :2] / seen[:, 2:]
-    within = (places >= corners.min(axis=0) - beyond) & (places <= corners.max(axis=0) + beyond)
-    return ahead & np.all(within, axis=1)
+    # Beyond the plane's horizon the third coordinate is negative.
+    return (seen[:, 2] > 0) & target.on_plate(places, beyond=_BEYOND)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +101,7 @@ class _Curve:
         powers = ((lines - middle) / half)[:, None] ** np.arange(3)
         rng = np.random.default_rng(0)
         best = np.zeros(len(lines), bool)
-        for chosen in np.sort(rng.random((_TRIALS, len(lines))).argpartition(3, axis=1)[:, :3], axis=1):
+        for chosen in rng.integers(len(lines), size=(_TRIALS, 3)):
             if np.ptp(lines[chosen]) < 0.1 * half:
                 continue
             parabola, _, rank, _ = np.linalg.lstsq(powers[chosen], across[chosen], rcond=None)

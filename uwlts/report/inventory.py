@@ -245,15 +245,15 @@ def _image_lines(camera: Mapping[str, JsonValue]) -> list[str]:
         f"lens: {camera.get('lens_model')}{best}",
         f"images of the target: {len(table)} used, {camera.get('images_left_out')} left out, and "
         f"{100 * share if isinstance(share, float) else math.nan:.1f} % of the points of those used",
-        "  points  misses/px  moves/sigma  stripe  astray  image",
+        "  points  misses/px  moves/sigma  stripe  outliers  image",
     ]
     for row in table:
         if isinstance(row, dict):
-            points, rms, moves, stripe, astray, name = (
-                row.get(key) for key in ("points", "rms_px", "moves", "stripe_points", "stripe_strays", "image")
+            points, rms, moves, stripe, outliers, name = (
+                row.get(key) for key in ("points", "rms_px", "moves", "stripe_points", "stripe_outliers", "image")
             )
             moved = f"{moves:11.2f}" if isinstance(moves, float) else f"{'-':>11}"
-            lines.append(f"  {points:6}  {rms:9.3f}  {moved}  {stripe:6}  {astray:6}  {name}")
+            lines.append(f"  {points:6}  {rms:9.3f}  {moved}  {stripe:6}  {outliers:8}  {name}")
     return lines
 
 

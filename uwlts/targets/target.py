@@ -130,10 +130,15 @@ class Target(Description, ABC):
         corners = self.extent_mm
         return rectangle_corners(corners.min(axis=0) - margin[:2], corners.max(axis=0) + margin[2:])
 
-    def on_plate(self, places_mm: np.ndarray) -> np.ndarray:
-        """Whether (N,) places (N, 2) in the target's plane lie on the flat plate; False for those that are NaN."""
+    def on_plate(self, places_mm: np.ndarray, *, beyond: float = 0.0) -> np.ndarray:
+        """Whether (N,) places (N, 2) in the target's plane lie on the flat plate; False for those that are NaN.
+
+        ``beyond`` is the share of the plate's size by which a place may lie outside.
+        """
         corners = self.plate_mm
-        return ((places_mm >= corners.min(axis=0)) & (places_mm <= corners.max(axis=0))).all(axis=1)
+        margin = beyond * np.ptp(corners, axis=0)
+        low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+        return ((places_mm >= low) & (places_mm <= high)).all(axis=1)
 
     def findable(self, in_view: np.ndarray) -> bool:
         """Whether `detect` finds the target if these (N,) of its points are in the image, as in `indices`."""

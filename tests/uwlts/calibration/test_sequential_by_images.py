@@ -6,40 +6,23 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import built_sensor, lattice, lens_of, stage_images, stripes_on_target, turn
+from tests.uwlts.joint_views import TARGET
+from tests.virtual_sensors import altered
 from uwlts.calibration.evidence import AirEvidence
 from uwlts.calibration.lens import LensChoice
 from uwlts.calibration.sequential import CalibrationOptions, CalibrationResult, Evidence, solve
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.placement import laser_pose
 from uwlts.report.inventory import calibration_lines
-from uwlts.targets import CircleTarget
 
-SENSOR = built_sensor()
-BARE = SENSOR.model_copy(
-    update={
-        "camera": SENSOR.camera.model_copy(
-            update={"window": SENSOR.camera.window.model_copy(update={"mounted": False})}
-        )
-    }
-)
-TARGET = CircleTarget(
-    diameter_mm=5.0,
-    marker_diameter_mm=2.0,
-    columns=25,
-    rows=25,
-    spacing_x_mm=9.375,
-    spacing_y_mm=9.372,
-    origin=(12, 12),
-    marker_x=(1, 0),
-    marker_y=(0, 1),
-)
+BARE = altered(built_sensor(), {"camera": {"window": {"mounted": False}}})
 POSITIONS = np.arange(12) * 20.0
 
 
 def calibrated(images: list[TargetImage], at: np.ndarray, *, seed: int, **options) -> CalibrationResult:
     stripes = stripes_on_target(BARE, at, noise_px=0.1, rng=np.random.default_rng([seed, 1]))
     names = [(0, 2 * number) for number in range(len(images))]
-    air = AirEvidence(TARGET, images, names, stripes, [], strays=[0] * len(images), captures=["air.h5"])
+    air = AirEvidence(TARGET, images, names, stripes, [], outliers=[0] * len(images), captures=["air.h5"])
     direction = np.array([0.0, 0.0, 1.0])
     evidence = Evidence(BARE, "air", direction, True, air, None, [], {}, [])
     chosen = CalibrationOptions(lens=LensChoice(), correct_circles=False, **options)

@@ -62,7 +62,7 @@ def test_the_stripe_is_one_smooth_curve(other: np.ndarray, turned: bool):
     assert rows.min() > 50 and rows.max() < 440
     away = across - curve(rows)
     assert np.sqrt(np.mean(away**2)) < (0.3 if other.max() > 220 else 0.1) and np.abs(away).max() < 1.5
-    assert (found.strays > 50) == (other.max() == 200)
+    assert (found.outliers > 50) == (other.max() == 200)
 
 
 def test_an_image_without_a_curve_gives_no_stripe():
