@@ -119,8 +119,9 @@ def test_either_of_two_lines_on_the_board_is_straight(tmp_path: Path, peak: Peak
 
 @pytest.mark.parametrize(
     ("number", "points", "columns_rows", "residual_px"),
-    # 02 was printed in whole dots of the printer, which moves rows and columns by half a pixel.
-    [("01", 6400, {98, 69}, 0.05), ("02", 1300, {41, 35}, 0.8), ("05", 4300, {85, 52}, 0.05)],
+    # In 01 two hundred dots of the outer rows lie where the light ends, which moves them by 0.1 px: left out. 02 was
+    # printed in whole dots of the printer, which moves rows and columns by half a pixel.
+    [("01", 6200, {98, 67}, 0.05), ("02", 1300, {41, 35}, 0.8), ("05", 4300, {85, 52}, 0.05)],
 )
 def test_dots_under_strong_distortion_are_numbered(number, points, columns_rows, residual_px):
     image = cv2.imread(str(DATA / "dot-patterns" / f"dot_pattern_{number}.jpg"), cv2.IMREAD_GRAYSCALE)

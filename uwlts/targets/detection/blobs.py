@@ -68,7 +68,8 @@ def find_blobs(image):
     Each window of `WINDOWS_PX` gives a threshold half-way between the mean levels of the local bright and dark pixels
     (one step of Ridler and Calvard's iteration per pass, taken locally, which removes uneven lighting). Holes are
     filled by keeping outer contours only; blobs at the image border and small ones are left out. The window and
-    polarity with most blobs of about the same size win.
+    polarity with most blobs of about the same size win, of as many the smaller ones: what is bright around each dark
+    circle is a blob too.
 
     The image is (H, W) of uint8 or uint16, ImageError for others; the result may be empty.
     """
@@ -78,7 +79,7 @@ def find_blobs(image):
     floor = max(CONTRAST_OVER_NOISE * max(noise_level(grey), 0.5), CONTRAST_OVER_RANGE * (high - low))
     smooth = cv2.medianBlur(grey, 3)
     small = _reduced(smooth)
-    best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), 0
+    best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), (0, 0.0)
     for window in WINDOWS_PX:
         if window > WINDOWS_PX[0] and window > max(grey.shape):
             break
@@ -87,7 +88,8 @@ def find_blobs(image):
         for bright in (True, False):
             side = smooth > threshold if bright else smooth < threshold
             blobs = _ellipse_like(np.logical_and(side, clear).view(np.uint8), bright=bright)
-            score = _largest_family(np.sqrt(np.linalg.det(blobs.shapes)))
+            radii = np.sqrt(np.linalg.det(blobs.shapes))
+            score = _largest_family(radii), -float(np.median(radii)) if len(radii) else 0.0
             if score > best_score:
                 best, best_score = blobs, score
     return best

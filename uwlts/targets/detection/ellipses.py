@@ -13,6 +13,8 @@ REACH_TIMES_SLOPE = 1.2
 MIN_REACH_PX = 2.5
 MAX_REACH_PX = 8.0
 MIN_RELATIVE_CONTRAST = 0.25
+NEIGHBOURS = 12  # their levels show the shading
+MAX_LEVEL_DEPARTURE = 0.25  # a neighbour that differs by more differs by its print, or is no circle
 MAX_SHIFT_PX = 0.5  # a centroid further from the ellipse's centre has something other than a circle in its band
 PROFILES = 48  # around a blob
 SAMPLES = 11  # on each profile
@@ -34,9 +36,9 @@ def area_centroids(grey, ellipses):
     where not, the ellipse's centre is given. ``grey`` is float32 (H, W).
     """
     centres, agree = ellipses.centres, np.ones(len(ellipses), bool)
-    wanted, *reaches = _reaches(grey.shape, ellipses)
+    reaches = _reaches(grey.shape, ellipses)
     for _ in range(PASSES):
-        planes = _level_planes(grey, centres, ellipses.shapes, reaches, wanted)
+        planes = _level_planes(grey, centres, ellipses.shapes, reaches)
         moved = _centroids(grey, centres, ellipses.shapes, reaches, planes)
         agree &= np.linalg.norm(moved - ellipses.centres, axis=1) < MAX_SHIFT_PX
         centres = np.where(agree[:, None], moved, ellipses.centres)
@@ -44,7 +46,7 @@ def area_centroids(grey, ellipses):
 
 
 def _reaches(shape, ellipses):
-    """Wanted reach of the band, and its reach inwards and outwards from each ellipse, three times (N,), px."""
+    """Reach of the band inwards and outwards from each ellipse, twice (N,), px."""
     semi_axes = np.linalg.eigvalsh(ellipses.shapes)
     wanted = np.clip(REACH_TIMES_SLOPE / np.maximum(ellipses.sharpness, 0.1), MIN_REACH_PX, MAX_REACH_PX)
     inner = np.minimum(wanted, REACH_OVER_MINOR_AXIS * semi_axes[:, 0])
@@ -56,23 +58,38 @@ def _reaches(shape, ellipses):
     half_width = np.sqrt((ellipses.shapes**2).sum(2))
     limit = np.array([shape[1], shape[0]]) - 2.0
     room = np.minimum(ellipses.centres - half_width, limit - ellipses.centres - half_width).min(1)
-    return wanted, inner, np.minimum(outer, np.maximum(room, 0.5))
+    return inner, np.minimum(outer, np.maximum(room, 0.5))
 
 
-def _level_planes(grey, centres, shapes, reaches, wanted):
-    """Inside and outside level of each blob: (N, 2, 3), value at the centre and slopes along u and v per px."""
+def _level_planes(grey, centres, shapes, reaches):
+    """Inside and outside level of each blob: (N, 2, 3), value at the centre and slopes along u and v per px.
+
+    The slopes are those of the levels of neighbouring blobs: levels read around a single one, close to a blurred edge,
+    slope with the edge's tail, which reaches further on one side where the plate is inclined.
+    """
     rim, normals = _rims(shapes)
     planes = np.zeros((len(centres), 2, 3))
     for side, reach in enumerate((-reaches[0], reaches[1])):
         offsets = rim + normals * reach[:, None, None]
-        levels = sample(grey, centres[:, None] + offsets)
-        planes[:, side, 0] = levels.mean(1)
-        spread = offsets.swapaxes(1, 2) @ offsets
-        slopes = np.linalg.solve(spread, offsets.swapaxes(1, 2) @ levels[:, :, None])[:, :, 0]
-        # Levels read within the edge itself slope with the error of the centre, not with the shading. The pull of
-        # shading grows with the square of the radius and is small where there is no room beyond the edge.
-        planes[:, side, 1:] = np.where((np.abs(reach) < wanted)[:, None], 0.0, slopes)
+        planes[:, side, 0] = sample(grey, centres[:, None] + offsets).mean(1)
+        planes[:, side, 1:] = _slopes(centres, planes[:, side, 0])
     return planes
+
+
+def _slopes(places, values):
+    """Slopes (N, 2) of planes through values (N,) at each of the places (N, 2) and at those next to it."""
+    count = min(NEIGHBOURS + 1, len(places))
+    if count < 2:
+        return np.zeros_like(places)
+    near = KDTree(places).query(places, k=count)[1]
+    alike = np.abs(values[near] - values[:, None]) <= MAX_LEVEL_DEPARTURE * np.abs(values[:, None])
+    weights = alike / alike.sum(1, keepdims=True)
+    at, level = places[near], values[near]
+    at = at - np.einsum("nk,nki->ni", weights, at)[:, None]
+    level = level - np.einsum("nk,nk->n", weights, level)[:, None]
+    spread = np.einsum("nk,nki,nkj->nij", weights, at, at)
+    # Of places on one line the slope along it is all that they tell.
+    return np.einsum("nij,nj->ni", np.linalg.pinv(spread, rcond=1e-3), np.einsum("nk,nki,nk->ni", weights, at, level))
 
 
 def _centroids(grey, centres, shapes, reaches, planes):
