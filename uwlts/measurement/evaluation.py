@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
-from uwlts.measurement.figure_uncertainty import figure_uncertainties
+from uwlts.measurement.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.metrology.evaluation import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
 from uwlts.metrology.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
@@ -64,9 +64,14 @@ class TruthFigures(_Stored):
 
 
 class TruthComparisons(TruthFigures):
-    """The points as measured, and after the rigid motion that fits them best to the truth."""
+    """The points as measured, and after the rigid motion that fits them best to the truth.
+
+    ``shift_mm`` is the mean error of the points along X, Y and Z, ``shift_expanded_mm`` its stated uncertainty (k = 2).
+    """
 
     after_best_fit: TruthFigures | None = None
+    shift_mm: tuple[float, float, float] | None = None
+    shift_expanded_mm: tuple[float, float, float] | None = None
 
 
 class StoredUncertainty(_Stored):
@@ -177,6 +182,9 @@ class Evaluation:
         content |= {"artefact": found and found.artefact, "evaluation": found and found.as_dict(), "truth": None}
         if self.truth is not None and self.truth_after_best_fit is not None:
             content["truth"] = self.truth.as_dict() | {"after_best_fit": self.truth_after_best_fit.as_dict()}
+            content["truth"]["shift_mm"] = self.truth.shift_mm.tolist()
+            if self.cloud.uncertainty is not None:
+                content["truth"]["shift_expanded_mm"] = (2 * shift_std_mm(self.cloud, self.truth.matched)).tolist()
         if found is not None:
             known = {figure.key.name: figure.uncertainty for figure in self.figures if figure.uncertainty is not None}
             parts = ("random_mm", "systematic_mm", "expanded_mm")

@@ -1,4 +1,4 @@
-"""Uncertainty of an artefact's figures, including the correlations between the points."""
+"""Uncertainty of an artefact's figures and of a cloud's place, including the correlations between the points."""
 
 from dataclasses import replace
 
@@ -46,6 +46,20 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
     return {
         name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
     }
+
+
+def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
+    """Standard uncertainty (3,) of the mean of the ``used`` (N,) points, mm; NaN where the points have none.
+
+    Patterns move all points together, an image's position those of the image, noise each alone (GUM, Eq. 13).
+    """
+    if (uncertainty := cloud.uncertainty) is None:
+        return np.full(3, np.nan)
+    count = np.count_nonzero(used)
+    together = uncertainty.patterns_mm[:, used].sum(axis=1)
+    by_image = [uncertainty.position_mm[used & (cloud.frame == image)].sum(axis=0) for image in np.unique(cloud.frame)]
+    moved = np.vstack([together, by_image, noise_mm(uncertainty)[used]])
+    return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 
 def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:

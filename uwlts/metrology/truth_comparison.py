@@ -43,6 +43,11 @@ class TruthComparison:
     false_points: int
     missed: int
 
+    @property
+    def shift_mm(self) -> np.ndarray:
+        """Mean error (3,) of the matched points."""
+        return np.mean(self.error_mm[self.matched], axis=0)
+
     def as_dict(self) -> dict[str, Any]:
         """The statistics as plain JSON, with the number of matched points."""
         arrays = ("matched", "error_mm", "distance_mm")

@@ -23,6 +23,7 @@ from uwlts.report.gather import (
     gather_campaign,
     load_reference,
 )
+from uwlts.report.inventory import shift_texts
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.report.page_toolkit import (
     ComparisonTable,
@@ -221,7 +222,9 @@ def _truth_table(compared: TruthComparisons) -> ComparisonTable:
         }
         for truth in shown.values()
     ]
-    rows = zip(texts[0], zip(*(column.values() for column in texts), strict=True), strict=True)
+    rows = [*zip(texts[0], zip(*(column.values() for column in texts), strict=True), strict=True)]
+    for axis, text in zip("XYZ", shift_texts(compared), strict=False):
+        rows.append((f"mean error along {axis}, k = 2", (text, "–")[: len(shown)]))
     return ComparisonTable(tuple(shown), tuple((words, "", values) for words, values in rows))
 
 

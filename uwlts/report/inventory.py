@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.measurement.evaluation import FORMAT as EVALUATION_FORMAT
-from uwlts.measurement.evaluation import EvaluationRecord, read_evaluation
+from uwlts.measurement.evaluation import EvaluationRecord, TruthComparisons, read_evaluation
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CaptureError, DescriptionError
 from uwlts.model.library import load_sensor
@@ -304,8 +304,21 @@ def evaluation_lines(record: EvaluationRecord) -> list[str]:
                     f"  {name}: rms {part.rms_mm:.4f} mm, 99 % within {part.p99_mm:.4f} mm, "
                     f"{100 * part.share_within_tolerance:.1f} % within {part.tolerance_mm:g} mm"
                 )
+        if truth.shift_mm is not None:
+            shift = ", ".join(f"{axis} {value}" for axis, value in zip("XYZ", shift_texts(truth), strict=True))
+            lines.append(f"  shift of all points: {shift}{' (k = 2)' if truth.shift_expanded_mm else ''}")
         lines.append(f"  {truth.missed} stripe points missed, {truth.false_points} false")
     return lines
+
+
+def shift_texts(truth: TruthComparisons) -> list[str]:
+    """Mean errors of all points along X, Y and Z, with what is stated for them; nothing where the file has none."""
+    shift = truth.shift_mm or ()
+    stated = truth.shift_expanded_mm or (None,) * len(shift)
+    return [
+        f"{value:+.4f} mm" if expanded is None else f"{value:+.4f} ± {expanded:.4f} mm"
+        for value, expanded in zip(shift, stated, strict=True)
+    ]
 
 
 def sensor_lines(sensor: Sensor) -> list[str]:

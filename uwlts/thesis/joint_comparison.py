@@ -21,9 +21,10 @@ import uwlts
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.measurement.figure_uncertainty import figure_uncertainties
+from uwlts.measurement.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.metrology.truth_comparison import compare_with_truth
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
@@ -33,6 +34,7 @@ from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import json_text, written_aside
+from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, TWO, calibrations
@@ -53,6 +55,8 @@ _USED = ("near", "standoff", "far")
 _COVERAGE = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
 _BESIDE = 0.16  # of the distance between two campaigns, from method to method
 SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
+SHIFTS = ("mean error X", "mean error Y", "mean error Z")
+"""Of all points of a scan."""
 Progress = Callable[[int, int], None]
 
 
@@ -140,15 +144,20 @@ def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
 def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> SphereErrors:
     errors: dict[Method, dict[str, float]] = {}
     std_mm: dict[JointMethod, dict[str, float]] = {}
+    truth = read_truth(truth_path(scan.path))[1]
+    against = partial(compare_with_truth, point_mm=truth.point_mm, normal=truth.normal, status=truth.status)
     with Capture(scan.path) as capture:
         artefact, stripes = parse_artefact(capture.header.artefact or {}), find_stripes(capture)
         for method, calibration in known.items():
             cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=method in JOINT)
             evaluation = evaluate_cloud(cloud, artefact)
+            compared = against(cloud.points_mm, cloud.frame, cloud.line)
             errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
+            errors[method] |= zip(SHIFTS, compared.shift_mm.tolist(), strict=True)
             if method in JOINT:
                 expanded = figure_uncertainties(cloud, evaluation)
-                std_mm[method] = {name: expanded[name].expanded_mm / 2 for name in errors[method]}
+                std_mm[method] = {name: expanded[name].expanded_mm / 2 for name in (SPACING, *DIAMETERS)}
+                std_mm[method] |= zip(SHIFTS, shift_std_mm(cloud, compared.matched).tolist(), strict=True)
     return SphereErrors(scan.placement, scan.medium, errors, std_mm)
 
 
@@ -187,13 +196,14 @@ def _medium_summary(results: Sequence[JointResults], medium: str) -> MediumSumma
         way: [
             abs(scan.errors_mm[way][name]) <= _COVERAGE * scan.std_mm[way][name]
             for scan in spheres
-            for name in (SPACING, *DIAMETERS)
+            for name in (SPACING, *DIAMETERS, *SHIFTS)
         ]
         for way in JOINT
     }
     return MediumSummary(
         spacing_error_mm={m: [scan.errors_mm[m][SPACING] for scan in spheres] for m in methods},
         diameter_error_mm={m: [scan.errors_mm[m][n] for scan in spheres for n in DIAMETERS] for m in methods},
+        shift_mm={m: [scan.errors_mm[m][n] for scan in spheres for n in SHIFTS] for m in methods},
         plane_std_over_speckle_limit=[p.over_limit for r in results for p in r.planes if p.medium == medium],
         coverage_95={way: float(np.mean(held)) for way, held in inside.items() if held},
     )
@@ -212,7 +222,12 @@ class _Row(NamedTuple):
 
 def _rows(part: MediumSummary) -> list[_Row]:
     rows = []
-    for quantity, errors_mm in (("sphere spacing", part.spacing_error_mm), ("sphere diameter", part.diameter_error_mm)):
+    quantities = {
+        "sphere spacing": part.spacing_error_mm,
+        "sphere diameter": part.diameter_error_mm,
+        "place, along an axis": part.shift_mm,
+    }
+    for quantity, errors_mm in quantities.items():
         sizes: dict[Method, np.ndarray] = {method: np.abs(errors) for method, errors in errors_mm.items()}
         for method, size in sizes.items():
             rows.append(_Row(quantity, _WORDS[method], size.mean(), size.max(), len(size), method in JOINT))

@@ -134,7 +134,8 @@ class CampaignResults(_Kept):
 class SphereErrors:
     """Errors of a scan of spheres by calibration and figure, and the joint ones' standard uncertainties, mm.
 
-    A medium for which a method has no calibration lacks it.
+    Besides the figures there is the mean error of all points along X, Y and Z. A medium for which a method has no
+    calibration lacks it.
     """
 
     placement: str
@@ -160,7 +161,7 @@ class JointResults(_Kept):
     """
 
     format: Literal["uwlts-joint-comparison"] = "uwlts-joint-comparison"
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     campaign: str
     solve_s: dict[JointMethod, float]
     spheres: list[SphereErrors]
@@ -174,6 +175,7 @@ class MediumSummary(BaseModel):
 
     spacing_error_mm: dict[Method, list[float]]
     diameter_error_mm: dict[Method, list[float]]
+    shift_mm: dict[Method, list[float]]
     plane_std_over_speckle_limit: list[float]
     coverage_95: dict[JointMethod, float]
 
