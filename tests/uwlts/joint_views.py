@@ -79,7 +79,8 @@ def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise
         pixels = seen(sensor, lit, index=index, window=window)
         pixels = pixels[inside(pixels, sensor)]
         stripes.append(pixels + np.column_stack([np.zeros(len(pixels)), noise.draw(noise.stripe_px, len(pixels))]))
-    evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
+    names = [(0, n) for n in range(len(images))]
+    evidence = AirEvidence(TARGET, images, names, stripes, [], outliers=[0] * len(images))
     return Series(ViewMedium(window, medium), evidence, None if tilts is not None else True, ["target"])
 
 

@@ -28,6 +28,7 @@ def calibrate(
     method: Literal["auto", "sequential", "joint"] = "auto",
     new_water: bool = False,
     unknown_sizes: bool = False,
+    strict: bool = False,
     refractions: Literal[1, 2] = 2,
     poses: Poses = "stage-normal",
     distortion: Distortion = "auto",
@@ -55,6 +56,9 @@ def calibrate(
         The scans were taken in other water than the target, or on another day: its index is a parameter of its own.
     unknown_sizes : bool
         Estimate the diameters and spacings of what was scanned, even if the captures state their uncertainty.
+    strict : bool
+        Jointly: refuse images that do not fit the model. Otherwise single ones are left out, and what most images show
+        is stated as an error of the model, which makes uncertainties larger; both with a warning.
     refractions : {1, 2}
         2: a window of known thickness; the images in air are taken without it. 1: a single interface; the images in air
         are taken through the window, whose effect goes into the distortion. The joint method ignores it.
@@ -63,8 +67,8 @@ def calibrate(
         direction, as always in the joint method. free: every image has a pose of its own.
     distortion : "auto" or tuple of str
         The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0. auto: with the poses stage and free
-        those that predict images of the target left out best; with stage-normal k1 and k2; jointly the same, and p1 and
-        p2 as far as the description leaves them open.
+        those that predict images of the target left out best; with stage-normal k1 and k2; jointly k1 and k2, p1
+        and p2 as far as the description leaves them open, and k3 where images misfit without.
     pixels : {"auto", "square", "free"}
         Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one.
     index : float, optional
@@ -105,6 +109,7 @@ def calibrate(
         medium_index=index,
         same_water=not new_water,
         sizes_known=not unknown_sizes,
+        strict=strict,
     )
     if method == "auto":
         method = "joint" if water or scan else "sequential"

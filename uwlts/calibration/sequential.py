@@ -48,6 +48,7 @@ class CalibrationOptions:
     same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
     sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
         uncertainty is stated; they are estimated otherwise
+    strict : jointly: refuse images that do not fit, in place of leaving them out or stating an error of the model
     bounds_mm : (low, high), optional; window distances to search
     """
 
@@ -60,6 +61,7 @@ class CalibrationOptions:
     medium_index: float | None = None
     same_water: bool = True
     sizes_known: bool = True
+    strict: bool = False
     bounds_mm: tuple[float, float] | None = None
 
 

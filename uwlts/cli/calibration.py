@@ -38,6 +38,7 @@ def calibrate(
     new_water: Flag = False,
     unknown_sizes: Flag = False,
     joint: Flag = False,
+    strict: Flag = False,
     live: Path | None = None,
     out: CalibrationOut,
     refractions: Literal[1, 2] = 2,
@@ -74,6 +75,8 @@ def calibrate(
         unknown_sizes: Estimate diameters and spacings of what was scanned, even if its description states their
             uncertainty.
         joint: Estimate all parameters together; the sensor's description states what is known before and how well.
+        strict: Refuse images that do not fit together. Jointly, single ones are otherwise left out, and what most
+            images show is stated as an error of the model, which makes uncertainties larger; both with a warning.
         live: Plan (TOML, docs/how-to/calibrate-live.md) of a guided calibration with camera and stage, in place of
             captures: leads through the images, rejects bad ones with the reason, and records the good ones beside the
             calibration.
@@ -82,8 +85,8 @@ def calibrate(
         poses: stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same
             with a free direction, as always in the joint calibration. free: every image has a pose of its own.
         distortion: Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and
-            free those that predict images left out best; with stage-normal k1 and k2; jointly the same, and p1 and p2
-            as far as the description leaves them open.
+            free those that predict images left out best; with stage-normal k1 and k2; jointly k1 and k2, p1 and
+            p2 as far as the description leaves them open, and k3 where images misfit without.
         pixels: Whether pixels are square or free to be not; auto: as distortion, with free poses; else square.
         camera: Guided: address of the camera, in place of the plan's.
         stage: Guided: serial port of the stage, in place of the plan's.
@@ -124,6 +127,7 @@ def calibrate(
             method="joint" if joint else "auto",
             new_water=new_water,
             unknown_sizes=unknown_sizes,
+            strict=strict,
             refractions=refractions,
             poses=poses,
             distortion=distortion,

@@ -89,15 +89,27 @@ _MOST_NAMED, _MOST_SAID = 4, 6  # for a message that can be read
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings against an estimate, in words: contradictions, which make it useless, and doubts."""
+    """Findings against an estimate, in words.
+
+    ``contradictions`` are those of what is known before, and make it useless. ``unfit`` are images, by their sources,
+    that contradict all others, and ``misfits`` kinds of residuals that show throughout what the model lacks. Doubts are
+    everything else.
+    """
 
     contradictions: list[str]
+    unfit: dict[str, str]
+    misfits: dict[str, str]
     doubts: list[str]
 
+    def all_against(self) -> list[str]:
+        """All that speaks against the estimate but doubts."""
+        return [*self.contradictions, *_some(self.unfit.values()), *self.misfits.values()]
+
     def refusal(self) -> str:
-        """The gravest contradictions as a message."""
-        more = len(self.contradictions) - _MOST_SAID
-        said = "; ".join(self.contradictions[:_MOST_SAID])
+        """The gravest of it as a message."""
+        every = self.all_against()
+        more = len(every) - _MOST_SAID
+        said = "; ".join(every[:_MOST_SAID])
         return f"the evidence contradicts itself: {said}" + (f"; and {more} more contradictions" if more > 0 else "")
 
 
@@ -141,14 +153,21 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
     known = [*_of_priors(result), *_of_stage(result, evidence, sensor)]
     lens = [*_of_lens(result, sensor)]
     earlier = [] if any(wrong for wrong, _ in known + lens) else [*_of_earlier(result)]
-    found = [*known, *earlier, *lens, *_of_images(images), *_of_kinds(images), *_of_shapes(result)]
-    found += [
-        (False, f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images")
+    unfit, noisy = _of_images(images)
+    misfits, waves = _of_kinds(images), [*_of_shapes(result)]
+    for wrong, kind, words in waves:
+        if wrong:
+            misfits[kind] = "; ".join(filter(None, [misfits.get(kind), words]))
+    found = [*known, *earlier, *lens]
+    doubts = [words for wrong, words in found if not wrong] + noisy
+    doubts += [words for wrong, _, words in waves if not wrong]
+    doubts += [
+        f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
         for kind, share in much_left_out(result).items()
     ]
     if result.stopped == UNSETTLED:
-        found.append((False, f"{UNSETTLED}: some of the evidence contradicts the rest"))
-    return Findings([words for wrong, words in found if wrong], [words for wrong, words in found if not wrong])
+        doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
+    return Findings([words for wrong, words in found if wrong], unfit, misfits, doubts)
 
 
 @dataclass(frozen=True)
@@ -279,7 +298,8 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
         if 0 < wrong.sum() <= max(1, len(errors) // 4):
             stood = zip((piece.sources[image] for image in images[wrong]), errors[wrong], strict=True)
             said = f"mm from where it said, stated uncertainty {std:g} mm"
-            yield from _some((True, f"{source}: the stage stood {error:+.3f} {said}") for source, error in stood)
+            for words in _some(f"{source}: the stage stood {error:+.3f} {said}" for source, error in stood):
+                yield True, words
         elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
             yield (
                 True,
@@ -288,9 +308,10 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
             )
 
 
-def _of_images(images: Sequence[_Image]) -> _Found:
-    """Images that fit far worse than their like: contradictions where not by their own noise, else doubts."""
-    found = []
+def _of_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
+    """Images that fit far worse than their like: contradictions by source, and doubts where it is their own noise."""
+    unfit: dict[str, str] = {}
+    noisy = []
     for image in images:
         others = [other.scatter_px for other in images if other.peers == image.peers and other is not image]
         usual = float(np.median(others)) if others else image.noise_px
@@ -299,34 +320,43 @@ def _of_images(images: Sequence[_Image]) -> _Found:
         shaped = image.scatter_px > _OVER_NOISE * image.noise_px
         than = f"in the other images {usual:.2f} px" if others else f"its noise being {usual:.2f} px"
         words = f"{image.source}: the {image.kind} is {image.scatter_px:.2f} px off (rms), {than}"
-        found.append((shaped or image.scatter_px > image.largest_px(), words))
-    for gravity in (True, False):
-        yield from _some((wrong, words) for wrong, words in found if wrong == gravity)
+        if shaped or image.scatter_px > image.largest_px():
+            unfit.setdefault(image.source, words)
+        else:
+            noisy.append(words)
+    return unfit, _some(noisy)
 
 
-def _of_kinds(images: Sequence[_Image]) -> _Found:
+def _of_kinds(images: Sequence[_Image]) -> dict[str, str]:
     """Kinds of residuals that scatter more than images are noisy."""
+    found = {}
     for kind in dict.fromkeys(image.kind for image in images):
         of_kind = [image for image in images if image.kind == kind]
         scatter, noise = np.median([(image.scatter_px, image.noise_px) for image in of_kind], axis=0)
         if scatter > of_kind[0].largest_px() or scatter > max(_OVER_NOISE * noise, noise + _OVER_OTHERS_PX):
             worst = max(of_kind, key=lambda image: image.scatter_px)
-            yield (
-                True,
+            found[kind] = (
                 f"the {kind} is {scatter:.2f} px off (rms) in most images, noise accounts for {noise:.2f} px; worst is "
-                f"{worst.source} with {worst.scatter_px:.2f} px",
+                f"{worst.source} with {worst.scatter_px:.2f} px"
             )
+    return found
 
 
-def _of_shapes(result: Estimate) -> _Found:
-    """Stripes whose residuals run together over many lines, as those of a wrong height or window do."""
+def _of_shapes(result: Estimate) -> Iterator[tuple[bool, str, str]]:
+    """Kinds whose residuals run together over many lines or points, as those of a wrong lens or height do."""
     for kind, noise in result.noise.items():
-        if kind != TARGET and noise.together > _WAVES_DOUBTFUL:
+        if noise.together > _WAVES_DOUBTFUL:
+            where, values = ("across the image", "points") if kind == TARGET else ("along itself", "lines")
+            check = (
+                "the target's flatness, and the lens"
+                if kind == TARGET
+                else "heights, media and what else was described"
+            )
             yield (
                 noise.together > _WAVES_WRONG,
-                f"the {kind} is off in waves along itself rather than by noise ({noise.sigma_px:.2f} px rms, as good "
-                f"as one independent value in {noise.together:.0f} lines): check heights, media and what else was "
-                "described",
+                kind,
+                f"the {kind} is off in waves {where} rather than by noise ({noise.sigma_px:.2f} px rms, as good as one "
+                f"independent value in {noise.together:.0f} {values}): check {check}",
             )
 
 
@@ -341,9 +371,8 @@ def much_left_out(result: Estimate) -> dict[str, float]:
     return found
 
 
-def _some(found: Iterable[tuple[bool, str]]) -> _Found:
+def _some(found: Iterable[str]) -> list[str]:
     """The first of findings that are alike, and the number of the others."""
     every = list(found)
-    yield from every[:_MOST_NAMED]
-    if len(every) > _MOST_NAMED:
-        yield every[0][0], f"and {len(every) - _MOST_NAMED} more images"
+    more = len(every) - _MOST_NAMED
+    return every[:_MOST_NAMED] + ([f"and {more} more images"] if more > 0 else [])

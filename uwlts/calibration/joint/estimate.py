@@ -1,12 +1,12 @@
 """The joint least squares: all evidence and all prior knowledge, weighted by the scatter that the evidence shows."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from uwlts.calibration.joint.evidence import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
-from uwlts.calibration.joint.noise import Noise, judged, outliers, with_common_error
+from uwlts.calibration.joint.noise import Noise, judged, outliers, with_common_error, with_misfit
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
@@ -61,12 +61,14 @@ def estimate(
     *,
     uncertainty: Uncertainty,
     diameter_mm: float | None = None,
+    misfits: Collection[str] = (),
 ) -> Estimate:
     """Least squares over all evidence, repeated until weights and corrections agree with the solution.
 
     At first large residuals count linearly; then outliers, beyond five standard deviations, are left out. The start is
     ``global_values`` (P,) and ``local``, (b,) of every piece of evidence. With ``diameter_mm`` of the target's circles
-    the offsets of their images' centres are taken out.
+    the offsets of their images' centres are taken out. Of kinds of residuals among ``misfits`` the model is known to
+    lack something: all residuals of an image count as one.
 
     Raises CalibrationError: the start has no meaning, the evidence does not determine the parameters, or corrections do
     not settle.
@@ -84,7 +86,7 @@ def estimate(
             if (parts := piece.residuals(parameters, global_values, values)) is None:
                 raise CalibrationError("the joint calibration diverged: a ray that was seen meets no sheet or target")
             residuals.append(parts)
-        before, known = known, _noise(evidence, residuals)
+        before, known = known, _noise(evidence, residuals, misfits)
         left_out = [[outliers(r, known[r.kind]) for r in parts] for parts in residuals]
         used, evidence = evidence, []
         for piece, values, parts, masks in zip(found, local, residuals, left_out, strict=True):
@@ -160,7 +162,9 @@ def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Obs
     return [Observation(off[:, None], by_global, np.empty((len(off), 0))) for off, by_global in found]
 
 
-def _noise(evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> dict[str, Noise]:
+def _noise(
+    evidence: Sequence[Evidence], residuals: list[list[Residuals]], misfits: Collection[str]
+) -> dict[str, Noise]:
     result = {}
     for kind in dict.fromkeys(r.kind for parts in residuals for r in parts):
         points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
@@ -170,4 +174,7 @@ def _noise(evidence: Sequence[Evidence], residuals: list[list[Residuals]]) -> di
             scans = [e for e in evidence if isinstance(e, SurfaceScanEvidence) and e.surface.kind == kind]
             common_px, bodies = np.concatenate([e.common_px for e in scans]), sum(e.surface.count for e in scans)
             result[kind] = with_common_error(result[kind], common_px, bodies=bodies)
+        if kind in misfits:
+            per_image = float(np.mean([len(r.values) for r in of_kind]))
+            result[kind] = with_misfit(result[kind], per_image=per_image)
     return result

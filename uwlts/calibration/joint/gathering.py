@@ -1,7 +1,7 @@
 """Evidence of captures and prior knowledge from descriptions, as the joint calibration needs them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import JsonValue
@@ -30,6 +30,7 @@ from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
+_FEWEST_KEPT, _MOST_LEFT_OUT = 3, 0.3  # images; where more contradict the rest, it is not clear which are right
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 
@@ -96,6 +97,19 @@ class Gathered:
         """Through what each series of target images, each step image and each scan was seen."""
         return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
+    def without(self, sources: Collection[str]) -> "Gathered | None":
+        """The same without the images of these names; None where too many of a series or of the steps would go."""
+        series = []
+        for each in self.series:
+            kept = [n for n, name in each.sources(np.arange(len(each.found.images))).items() if name not in sources]
+            if not _enough(len(kept), len(each.found.images)):
+                return None
+            series.append(replace(each, found=each.found.only(np.array(kept), [each.found.images[n] for n in kept])))
+        steps = [(step, view) for step, view in self.steps if step.source not in sources]
+        if not _enough(len(steps), len(self.steps)):
+            return None
+        return replace(self, series=series, steps=steps)
+
     def indices(self, options: CalibrationOptions) -> list[float]:
         """Refractive indices of the media, as described or as the options give them."""
         wavelength = self.sensor.laser.wavelength_nm
@@ -140,6 +154,10 @@ def gather_jointly(
     seen = [capture.header.sensor for capture in [*steps, *targets, *scans]]
     sensor = next((each for each in seen if each.camera.window.mounted), sensor)
     return Gathered(sensor, media, series, on_steps, on_scans, provenance, warnings)
+
+
+def _enough(kept: int, images: int) -> bool:
+    return kept == images or (kept >= _FEWEST_KEPT and images - kept <= _MOST_LEFT_OUT * images)
 
 
 def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) -> ScanStripes:

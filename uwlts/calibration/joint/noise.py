@@ -1,7 +1,7 @@
 """Scatter of residuals, outliers among them, and the share of the scatter that they have in common."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 _OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
 _LAGS = 100  # lines; filters and speckle join a few, wrong models some tens
 _SHARED_LAG = 0.05  # correlation that some thousand pairs no longer separate from none, by three standard errors
+_FEWEST_POINTS = 25  # of an image, for its ten smooth functions
 _FINEST_PX = 1e-3  # no point of an image counts as better known: what is known before would count for nothing
 
 
@@ -19,7 +20,8 @@ class Noise:
     """Scatter of one kind of residual: ``sigma_px``, the standard deviation of one, without outliers.
 
     ``together`` is the variance of a mean of many over that of as many independent ones, as neighbours along a stripe
-    and images of the same point of the target err together; ``besides`` adds to that for errors that do not show.
+    and images of the same point of the target err together; ``besides`` adds to that for errors that do not show, and
+    for what the model lacks.
     """
 
     sigma_px: float
@@ -45,7 +47,7 @@ def outlier_limit(values: np.ndarray) -> float:
 
 
 def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
-    """Scatter of all residuals of a kind; ``points`` (N, 3) are the target's, for residuals of that kind."""
+    """Scatter of all residuals of a kind; ``points`` (N, 3) of each placement are the target's, for that kind."""
     values = np.concatenate([r.values for r in residuals])
     limit = outlier_limit(values)
     kept = np.abs(values) <= limit
@@ -53,7 +55,7 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
     if sigma < _FINEST_PX:
         return Noise(_FINEST_PX)
     if kind == TARGET:
-        together = _of_points(values, np.vstack(points), kept, sigma)
+        together = max(_of_points(values, np.vstack(points), kept, sigma), _of_images(residuals, points, sigma))
     else:
         together = _of_neighbours(residuals, sigma)
     return Noise(sigma, max(together, 1.0))
@@ -63,6 +65,11 @@ def with_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> 
     """Noise on scanned bodies, all points of which share an error of the standard uncertainties ``common_px`` (N,)."""
     points_per_body, common = len(common_px) / bodies, float(np.mean(common_px**2))
     return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
+
+
+def with_misfit(noise: Noise, *, per_image: float) -> Noise:
+    """Noise of residuals whose model lacks something: the ``per_image`` residuals of an image say as much as one."""
+    return replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
 
 
 def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:
@@ -76,6 +83,28 @@ def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: 
     sums = np.stack([np.bincount(point[kept], pairs[kept, axis], len(number)) for axis in (0, 1)])
     # n times the variance of the mean of n, over the variance of one.
     return float(np.mean(sums[:, often] ** 2 / number[often])) / sigma**2
+
+
+def _of_images(residuals: Sequence[Residuals], points: Sequence[np.ndarray], sigma: float) -> float:
+    """By how much residuals vary smoothly across an image, as those of a wrong lens or a bent target do.
+
+    Independent ones have the variance sigma^2 along each of orthonormal functions of the place; here all products of
+    powers up to the third order. The median of the images counts: a single one that does not fit is another matter.
+    """
+    found = []
+    start, every = 0, np.vstack(points)[:, :2]
+    for part in residuals:
+        pairs = part.values.reshape(-1, 2)
+        at = every[start : start + len(pairs)]
+        start += len(pairs)
+        kept = np.all(np.abs(pairs) <= _OUTLIER * sigma, axis=1)
+        at, pairs = at[kept], pairs[kept]
+        if len(pairs) < _FEWEST_POINTS:
+            continue
+        x, y = ((at - at.mean(axis=0)) / at.std(axis=0)).T
+        smooth = np.linalg.qr(np.column_stack([x**i * y**j for i in range(4) for j in range(4 - i)]))[0]
+        found.append(np.mean((smooth.T @ pairs) ** 2) / sigma**2)
+    return float(np.median(found)) if found else 1.0
 
 
 def _of_neighbours(residuals: Sequence[Residuals], sigma: float) -> float:

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
+from uwlts.calibration.intrinsics import Intrinsics
 from uwlts.calibration.joint.consistency import Findings, deviations, findings, understated
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.evidence import BENDS, STRETCH
@@ -22,6 +24,8 @@ from uwlts.model.parameter_keys import TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 
+_ROUNDS_LEFT_OUT = 3
+_CLEARLY_LESS = 0.9  # scatter with a richer lens, over that without
 _NOTICED = 3.0  # standard uncertainties: what is taken for more uncertain loses little where that was chance
 
 
@@ -30,7 +34,7 @@ class JointProblem:
     """All evidence with what is to be estimated from it, and where that starts.
 
     The start is ``global_values`` (P,) and ``local``, (b,) of every piece of evidence. ``diameter_mm`` is that of the
-    target's circles, whose images are to be corrected; None where nothing is.
+    target's circles, whose images are to be corrected; None where nothing is. ``misfits`` are as for `estimate`.
     """
 
     parameters: Parameters
@@ -40,6 +44,7 @@ class JointProblem:
     sensor: Sensor
     diameter_mm: float | None
     warnings: list[str]
+    misfits: frozenset[str] = frozenset()
 
     def solve(self) -> Estimate:
         """The estimate, not judged yet; errors as `estimate`."""
@@ -50,6 +55,7 @@ class JointProblem:
             self.local,
             uncertainty=self.sensor.uncertainty,
             diameter_mm=self.diameter_mm,
+            misfits=self.misfits,
         )
 
     def judged(self) -> tuple[Estimate, Findings]:
@@ -161,13 +167,113 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """A problem with its estimate and what speaks against that; ``said`` is what was done about it before."""
+
+    gathered: Gathered
+    problem: JointProblem
+    result: Estimate
+    against: Findings
+    said: tuple[str, ...] = ()
+
+    def settled(self, options: CalibrationOptions) -> "_Attempt":
+        """The same with a richer lens, if that helps, without images that do not fit; what is left is an error.
+
+        Where images still show something that the model lacks, all residuals of an image count as one. What contradicts
+        the description is left to be refused.
+        """
+        attempt = self
+        if attempt.against.all_against() and options.lens is not None and options.lens.distortion == "auto":
+            attempt = attempt._with_richer_lens()
+        if attempt.against.contradictions:
+            return attempt
+        for _ in range(_ROUNDS_LEFT_OUT):
+            if not attempt.against.unfit or (fewer := attempt._without_unfit(options)) is None:
+                break
+            attempt = fewer
+        return attempt._with_error_of_model() if attempt.against.all_against() else attempt
+
+    def _without_unfit(self, options: CalibrationOptions) -> "_Attempt | None":
+        """Without the images that contradict all others; None where that leaves too few, or contradicts more."""
+        kept = self.gathered.without(self.against.unfit)
+        if kept is None:
+            return None
+        problem = joint_problem(kept, options=options)
+        result, against = problem.judged()
+        if against.contradictions:
+            return None
+        said = [f"{words}; left out" for words in self.against.unfit.values()]
+        return _Attempt(kept, problem, result, against, (*self.said, *said))
+
+    def _with_richer_lens(self) -> "_Attempt":
+        """With k3, or with pixels that are not square, or both: what removes contradictions, or a share of the scatter.
+
+        Pixels are not freed for contradictions alone: a spacing described wrongly along one side looks like them.
+        """
+        best = self
+        for change in ({"distortion": "k3"}, {"square_pixels": False}):
+            if (richer := best._with_lens(change)) is None:
+                continue
+            fewer = "distortion" in change and len(richer.against.all_against()) < len(best.against.all_against())
+            if fewer or (best.against.misfits and richer._scatter() < _CLEARLY_LESS * best._scatter()):
+                best = richer
+        return best
+
+    def _with_lens(self, change: dict[str, Any]) -> "_Attempt | None":
+        parameters, lens = self.problem.parameters, self.problem.parameters.intrinsics
+        added = change.get("distortion")
+        if added in lens.options.distortion:
+            return None
+        distortion = (*lens.options.distortion, *([added] if added else ()))
+        options = replace(lens.options, **change | {"distortion": distortion})
+        richer = replace(parameters, intrinsics=Intrinsics(options, lens.width_px, lens.height_px))
+        start = richer.intrinsics.from_model(parameters.camera(self.result.values))
+        values = np.concatenate([start, self.result.values[len(lens.names) :]])
+        problem = replace(self.problem, parameters=richer, global_values=values, local=self.result.local)
+        try:
+            result, against = problem.judged()
+        except CalibrationError:
+            return None
+        words = (
+            f"the lens was given {added or 'pixels that are not square'}, without which the evidence contradicts itself"
+        )
+        return (
+            None if against.contradictions else _Attempt(self.gathered, problem, result, against, (*self.said, words))
+        )
+
+    def _scatter(self) -> float:
+        """Geometric mean of the scatter of the target's points and stripes, px."""
+        return float(np.exp(np.mean([np.log(self.result.noise[kind].sigma_px) for kind in self.result.noise])))
+
+    def _with_error_of_model(self) -> "_Attempt":
+        """With what does not fit as an error that all residuals of an image share, of whatever kind.
+
+        What the model lacks moves lens and poses with it, so that points that fit well are no better known.
+        """
+        problem = replace(self.problem, misfits=frozenset(self.result.noise))
+        result, against = problem.judged()
+        before, after = self.result.std(), result.std()
+        factor = float(np.median([after[key] / before[key] for key in before if key in after]))
+        said = [f"{words}; kept, for too many images are like that" for words in self.against.unfit.values()]
+        said += self.against.misfits.values()
+        said.append(
+            "images show something that the model lacks: all points of an image are counted as one, and uncertainties "
+            f"are {factor:.1f} times larger by that (median)"
+        )
+        return _Attempt(self.gathered, problem, result, replace(against, unfit={}, misfits={}), (*self.said, *said))
+
+
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
     sensor, problem = gathered.sensor, joint_problem(gathered, options=options)
-    result, against = problem.judged()
-    if against.contradictions:
+    attempt = _Attempt(gathered, problem, *problem.judged())
+    if not options.strict:
+        attempt = attempt.settled(options)
+    problem, result, against = attempt.problem, attempt.result, attempt.against
+    if against.all_against():
         raise CalibrationError(against.refusal())
-    warnings = problem.warnings + against.doubts
+    warnings = [*problem.warnings, *attempt.said, *against.doubts]
     provenance: dict[str, JsonValue] = {
         **gathered.provenance,
         "poses": options.poses,

@@ -279,7 +279,7 @@ def solve_refreshed(
     lines = [line_start(profile, parameters, start) for profile in profiles]
     problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
     result, against = problem.judged()
-    if against.contradictions:
+    if against.all_against():
         raise CalibrationError(_other_water(problem, earlier) or against.refusal())
     warnings += against.doubts
     refreshed = refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
@@ -293,7 +293,7 @@ def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
     freed = replace(problem, parameters=replace(parameters, priors=parameters.priors | free))
     result, against = freed.judged()
-    if against.contradictions:
+    if against.all_against():
         return ""
     found = dict(zip(parameters.keys, result.values, strict=True))
     words = []

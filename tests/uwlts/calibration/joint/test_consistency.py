@@ -7,12 +7,14 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.virtual_sensors import altered
 from uwlts.calibration.joint.consistency import format_deviation
 from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.lens import LensChoice
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError
-from uwlts.model.parameter_keys import LensParameter, parameter_of
+from uwlts.model.parameter_keys import LensParameter, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium, Uncertainty
 
 pytestmark = pytest.mark.slow
@@ -49,8 +51,24 @@ def stripes_edited(series, edit):
 
 def refusal(evidence):
     with pytest.raises(CalibrationError) as error:
-        solve_jointly(evidence, options=OPTIONS)
+        solve_jointly(evidence, options=replace(OPTIONS, strict=True))
     return str(error.value)
+
+
+def pulls(result):
+    """Errors of lens and window distance over their stated uncertainties."""
+    camera = BUILT.camera
+    cx, cy = camera.principal_point()
+    true = {
+        LensParameter.F: camera.focal_length_px(),
+        LensParameter.CX: cx,
+        LensParameter.CY: cy,
+        LensParameter.K1: camera.distortion.k1,
+        LensParameter.K2: camera.distortion.k2,
+        WindowParameter.DISTANCE: camera.window.distance_mm,
+    }
+    found = dict(zip(result.estimate.parameters.keys, result.estimate.values.tolist(), strict=True))
+    return np.array([(found[key] - value) / result.estimate.std()[key] for key, value in true.items()])
 
 
 def test_good_evidence_raises_no_doubt(views, thesis):
@@ -70,17 +88,64 @@ def test_a_slip_of_the_stage_is_named(views, thesis):
     assert all(f"frame {other}: the stage" not in said for other in (0, 1, 2, 4, 5, 6, 7))
 
 
-def test_the_image_that_does_not_fit_is_named(views, thesis):
+def touched(number, image):
     """Moved by 1.5 px and sheared by up to a pixel, as a window that was touched; one of 16 images."""
-    air, water = views
+    shear = 1e-3 * (image.pixels - image.pixels.mean(axis=0))[:, ::-1]
+    return replace(image, pixels=image.pixels + (1.5, 0.0) + shear) if number == 5 else image
 
-    def touched(number, image):
-        shear = 1e-3 * (image.pixels - image.pixels.mean(axis=0))[:, ::-1]
-        return replace(image, pixels=image.pixels + (1.5, 0.0) + shear) if number == 5 else image
 
-    said = refusal(gathered(thesis, [air, edited(water, touched)]))
+def test_the_image_that_does_not_fit_is_named(views, thesis):
+    said = refusal(gathered(thesis, [views[0], edited(views[1], touched)]))
     assert "water.h5, frame 5: the target is" in said
     assert "air.h5" not in said
+
+
+def test_the_image_that_does_not_fit_is_left_out(views, thesis):
+    result = solve_jointly(gathered(thesis, [views[0], edited(views[1], touched)]), options=OPTIONS)
+    (said,) = result.warnings
+    assert said.startswith("water.h5, frame 5: the target is") and said.endswith("left out")
+    assert [len({part.image for part in parts}) for parts in result.estimate.residuals] == [8, 7]
+    assert np.abs(pulls(result)).max() < 4.5
+
+
+def test_images_are_left_out_as_long_as_enough_agree(views, thesis):
+    evidence = gathered(thesis, views)
+    assert evidence.without({"air.h5, frame 0", "air.h5, frame 7"}).series[0].found.frames == [
+        (0, n) for n in range(1, 7)
+    ]
+    assert evidence.without({f"air.h5, frame {n}" for n in range(3)}) is None
+
+
+def curled(strength_px):
+    """Distortion that no lens of the model has: a cubic across the image, ``strength_px`` at its sides."""
+
+    def edit(_, image):
+        x = (image.pixels[:, 0] - 640.0) / 640.0
+        return replace(image, pixels=image.pixels + np.column_stack([0 * x, strength_px * x**3]))
+
+    return edit
+
+
+def test_what_the_model_lacks_makes_uncertainties_larger(views, thesis):
+    """Some parameters are off by many of the uncertainties that scatter alone would state."""
+    wrong = gathered(thesis, [edited(part, curled(6.0)) for part in views])
+    assert "the target is off in waves across the image" in refusal(wrong)
+    result = solve_jointly(wrong, options=OPTIONS)
+    assert any("the model lacks" in said for said in result.warnings)
+    assert np.abs(pulls(result)).max() < 4.5
+
+
+def test_a_lens_with_k3_is_found(thesis):
+    """A wide lens, of which k1 and k2 leave more than a pixel in the corners."""
+    wide = {"camera": {"focal_length_mm": 8.0, "distortion": {"k3": 1.5}}}
+    lens, described = altered(BUILT, wide), altered(thesis, {"camera": {"focal_length_mm": 8.0}})
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
+    air = target_series(lens, window=False, positions=np.arange(8) * 35.0 - 200.0, noise=noise, columns=17)
+    seen = gathered(described, [replace(air, names=["air.h5"])])
+    result = solve_jointly(seen, options=replace(OPTIONS, lens=LensChoice()))
+    assert any("the lens was given k3" in said for said in result.warnings)
+    k3 = result.estimate.values[result.estimate.parameters.keys.index(LensParameter.K3)]
+    assert abs(k3 - 1.5) < 4.5 * result.estimate.std()[LensParameter.K3]
 
 
 def test_a_lens_other_than_in_water_is_refused(views, thesis):
