@@ -11,9 +11,12 @@ import pytest
 from uwlts.calibration.camera import solve_camera
 from uwlts.calibration.evidence import air_evidence
 from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.joint.gathering import gather_jointly
+from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.lens import LensChoice
 from uwlts.calibration.sequential import CalibrationOptions, gather, solve
 from uwlts.calibration.target_stripes import stripe_on_target
+from uwlts.model.parameter_keys import LensParameter
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
 from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
@@ -208,6 +211,25 @@ def test_a_folder_of_photographs_calibrates_camera_and_sheet(tmp_path: Path):
     assert abs(focal[0] - focal[1]) < 3 * np.hypot(*(part.camera.std()["f"] for part in parts))
     one, other = (np.array(part.calibration.sheet.normal) for part in parts)
     assert np.arccos(one @ other) < 3 * np.hypot(*(part.sheet.normal_std_rad for part in parts))
+
+
+@pytest.mark.slow
+def test_photographs_that_do_not_fit_the_model_are_calibrated_jointly_all_the_same(tmp_path: Path):
+    """The plate is bent: what the images share is stated, and halves of them agree with the robot's poses."""
+    (tmp_path / "import.toml").write_text(ETNA)
+    import_images(DATA / "etna", tmp_path / "etna.h5", description=tmp_path / "import.toml")
+    options = CalibrationOptions(poses="free", lens=LensChoice())
+    with Capture(tmp_path / "etna.h5") as capture:
+        evidence = gather_jointly([capture], [], options=options)
+    (series,) = evidence.series
+    for start in (0, 1):
+        half = np.arange(start, 16, 2)
+        found = series.found.only(half, [series.found.images[n] for n in half])
+        result = solve_jointly(replace(evidence, series=[replace(series, found=found)]), options=options)
+        assert any("the model lacks: all points of an image are counted as one" in said for said in result.warnings)
+        std = result.estimate.std()[LensParameter.F]
+        assert 10 < std < 150
+        assert result.calibration.camera.fx_px == pytest.approx(2365, abs=2.5 * std)
 
 
 def _scatter(rows: np.ndarray, across: np.ndarray) -> float:
