@@ -1,6 +1,7 @@
 """Import, target detection and stripe extraction on real images that others took (tests/data/README.md)."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,19 +192,27 @@ margin_mm = 60.0
 """
 
 
-@pytest.mark.slow
-def test_a_folder_of_photographs_calibrates_camera_and_sheet(tmp_path: Path):
-    """Board and stripe in one image, poses free: all of it, and halves that agree within what is stated."""
+ETNA_OPTIONS = CalibrationOptions(poses="free", lens=LensChoice())
+
+
+@pytest.fixture
+def etna(tmp_path: Path) -> Iterator[Capture]:
+    """The photographs as a capture: board and stripe in one image."""
     (tmp_path / "import.toml").write_text(ETNA)
     import_images(DATA / "etna", tmp_path / "etna.h5", description=tmp_path / "import.toml")
-    options = CalibrationOptions(poses="free", lens=LensChoice())
     with Capture(tmp_path / "etna.h5") as capture:
-        evidence = gather([capture], [], options=options)
+        yield capture
+
+
+@pytest.mark.slow
+def test_a_folder_of_photographs_calibrates_camera_and_sheet(etna: Capture):
+    """Poses free: all of it, and halves that agree within what is stated."""
+    evidence = gather([etna], [], options=ETNA_OPTIONS)
     air = evidence.air
     assert len(air.images) == 16 and min(map(len, air.stripes)) > 700
     halves = [np.arange(start, 16, 2) for start in (0, 1)]
     chosen = [replace(evidence, air=air.only(half, [air.images[n] for n in half])) for half in halves]
-    whole, *parts = (solve(each, options=options) for each in (evidence, *chosen))
+    whole, *parts = (solve(each, options=ETNA_OPTIONS) for each in (evidence, *chosen))
     # The robot's poses, which no calibration has seen, agree best with 2350 to 2380 px.
     assert whole.camera.model.fx_px == pytest.approx(2365, abs=2.5 * whole.camera.std()["f"])
     assert 0.005 < np.degrees(whole.sheet.normal_std_rad) < 2.0
@@ -214,18 +223,14 @@ def test_a_folder_of_photographs_calibrates_camera_and_sheet(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_photographs_that_do_not_fit_the_model_are_calibrated_jointly_all_the_same(tmp_path: Path):
+def test_photographs_that_do_not_fit_the_model_are_calibrated_jointly_all_the_same(etna: Capture):
     """The plate is bent: what the images share is stated, and halves of them agree with the robot's poses."""
-    (tmp_path / "import.toml").write_text(ETNA)
-    import_images(DATA / "etna", tmp_path / "etna.h5", description=tmp_path / "import.toml")
-    options = CalibrationOptions(poses="free", lens=LensChoice())
-    with Capture(tmp_path / "etna.h5") as capture:
-        evidence = gather_jointly([capture], [], options=options)
+    evidence = gather_jointly([etna], [], options=ETNA_OPTIONS)
     (series,) = evidence.series
     for start in (0, 1):
         half = np.arange(start, 16, 2)
         found = series.found.only(half, [series.found.images[n] for n in half])
-        result = solve_jointly(replace(evidence, series=[replace(series, found=found)]), options=options)
+        result = solve_jointly(replace(evidence, series=[replace(series, found=found)]), options=ETNA_OPTIONS)
         assert any("the model lacks: all points of an image are counted as one" in said for said in result.warnings)
         std = result.estimate.std()[LensParameter.F]
         assert 10 < std < 150

@@ -1,7 +1,6 @@
 """Evaluation of point clouds against artefacts with calibrated sizes and against ground truth, and its JSON files."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -197,6 +196,19 @@ class Evaluation:
             ) from error
 
 
+def compared_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
+    """Distances of a cloud's points to the true surface; EvaluationError where truth and cloud do not match."""
+    return compare_with_truth(
+        cloud.points_mm,
+        cloud.frame,
+        cloud.line,
+        point_mm=truth.point_mm,
+        normal=truth.normal,
+        status=truth.status,
+        tolerance_mm=TOLERANCE_MM,
+    )
+
+
 def evaluate(
     cloud: PointCloud | str | Path,
     artefact: Artefact | dict[str, object] | str | Path | None = None,
@@ -242,12 +254,11 @@ def evaluate(
         )
     compared = fitted = None
     if truth is not None:
-        true = {"point_mm": truth.point_mm, "normal": truth.normal, "status": truth.status}
-        against = partial(compare_with_truth, frame=cloud.frame, line=cloud.line, **true, tolerance_mm=TOLERANCE_MM)
-        compared = against(cloud.points_mm)
+        compared = compared_with_truth(cloud, truth)
         # Takes out the difference of the coordinate systems.
         motion = best_fit_motion(compared, cloud.points_mm)
-        fitted = against(cloud.points_mm @ motion[:3, :3].T + motion[:3, 3])
+        moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
+        fitted = compared_with_truth(replace(cloud, points_mm=moved), truth)
     found = None if artefact is None else evaluate_cloud(cloud, artefact)
     figures: tuple[Figure, ...] = ()
     deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm

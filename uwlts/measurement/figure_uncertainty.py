@@ -57,7 +57,8 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
         return np.full(3, np.nan)
     count = np.count_nonzero(used)
     together = uncertainty.patterns_mm[:, used].sum(axis=1)
-    by_image = [uncertainty.position_mm[used & (cloud.frame == image)].sum(axis=0) for image in np.unique(cloud.frame)]
+    image = np.unique(cloud.frame[used], return_inverse=True)[1]
+    by_image = np.stack([np.bincount(image, moves) for moves in uncertainty.position_mm[used].T], axis=1)
     moved = np.vstack([together, by_image, noise_mm(uncertainty)[used]])
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 

@@ -21,10 +21,10 @@ import uwlts
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.measurement.evaluation import compared_with_truth
 from uwlts.measurement.figure_uncertainty import figure_uncertainties, shift_std_mm
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.artefacts import evaluate_cloud
-from uwlts.metrology.truth_comparison import compare_with_truth
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
@@ -145,13 +145,12 @@ def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> Spher
     errors: dict[Method, dict[str, float]] = {}
     std_mm: dict[JointMethod, dict[str, float]] = {}
     truth = read_truth(truth_path(scan.path))[1]
-    against = partial(compare_with_truth, point_mm=truth.point_mm, normal=truth.normal, status=truth.status)
     with Capture(scan.path) as capture:
         artefact, stripes = parse_artefact(capture.header.artefact or {}), find_stripes(capture)
         for method, calibration in known.items():
             cloud = reconstruct_stripes(capture, stripes, calibration, with_uncertainty=method in JOINT)
             evaluation = evaluate_cloud(cloud, artefact)
-            compared = against(cloud.points_mm, cloud.frame, cloud.line)
+            compared = compared_with_truth(cloud, truth)
             errors[method] = {name: evaluation.figures_mm[name] for name in (SPACING, *DIAMETERS)}
             errors[method] |= zip(SHIFTS, compared.shift_mm.tolist(), strict=True)
             if method in JOINT:

@@ -55,7 +55,8 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
     if sigma < _FINEST_PX:
         return Noise(_FINEST_PX)
     if kind == TARGET:
-        together = max(_of_points(values, np.vstack(points), kept, sigma), _of_images(residuals, points, sigma))
+        places = np.vstack(points)[:, :2]
+        together = max(_of_points(values, places, kept, sigma), _of_images(residuals, places, sigma))
     else:
         together = _of_neighbours(residuals, sigma)
     return Noise(sigma, max(together, 1.0))
@@ -72,9 +73,9 @@ def with_misfit(noise: Noise, *, per_image: float) -> Noise:
     return replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
 
 
-def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: float) -> float:
+def _of_points(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
     """By how much residuals of the same point in several images share their error."""
-    _, point = np.unique(np.round(points[:, :2], 6), axis=0, return_inverse=True)
+    _, point = np.unique(np.round(places, 6), axis=0, return_inverse=True)
     pairs, kept = values.reshape(-1, 2), np.all(kept.reshape(-1, 2), axis=1)
     number = np.bincount(point[kept], minlength=point.max() + 1)
     often = number >= 3
@@ -85,18 +86,16 @@ def _of_points(values: np.ndarray, points: np.ndarray, kept: np.ndarray, sigma: 
     return float(np.mean(sums[:, often] ** 2 / number[often])) / sigma**2
 
 
-def _of_images(residuals: Sequence[Residuals], points: Sequence[np.ndarray], sigma: float) -> float:
+def _of_images(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
     """By how much residuals vary smoothly across an image, as those of a wrong lens or a bent target do.
 
     Independent ones have the variance sigma^2 along each of orthonormal functions of the place; here all products of
     powers up to the third order. The median of the images counts: a single one that does not fit is another matter.
     """
     found = []
-    start, every = 0, np.vstack(points)[:, :2]
-    for part in residuals:
+    ends = np.cumsum([len(part.values) // 2 for part in residuals])
+    for part, at in zip(residuals, np.split(places, ends[:-1]), strict=True):
         pairs = part.values.reshape(-1, 2)
-        at = every[start : start + len(pairs)]
-        start += len(pairs)
         kept = np.all(np.abs(pairs) <= _OUTLIER * sigma, axis=1)
         at, pairs = at[kept], pairs[kept]
         if len(pairs) < _FEWEST_POINTS:

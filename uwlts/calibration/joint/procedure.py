@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Self
 
 import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
-from uwlts.calibration.intrinsics import Intrinsics
+from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.joint.consistency import Findings, deviations, findings, understated
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.evidence import BENDS, STRETCH
@@ -172,79 +172,77 @@ class _Attempt:
     """A problem with its estimate and what speaks against that; ``said`` is what was done about it before."""
 
     gathered: Gathered
+    options: CalibrationOptions
     problem: JointProblem
     result: Estimate
     against: Findings
-    said: tuple[str, ...] = ()
+    said: tuple[str, ...]
 
-    def settled(self, options: CalibrationOptions) -> "_Attempt":
+    @classmethod
+    def at(cls, gathered: Gathered, options: CalibrationOptions, said: tuple[str, ...] = ()) -> Self:
+        """The first one with this evidence and these options."""
+        problem = joint_problem(gathered, options=options)
+        return cls(gathered, options, problem, *problem.judged(), said)
+
+    def settled(self) -> "_Attempt":
         """The same with a richer lens, if that helps, without images that do not fit; what is left is an error.
 
         Where images still show something that the model lacks, all residuals of an image count as one. What contradicts
         the description is left to be refused.
         """
-        attempt = self
-        if attempt.against.all_against() and options.lens is not None and options.lens.distortion == "auto":
-            attempt = attempt._with_richer_lens()
+        attempt = self._with_richer_lens() if self.against.all_against() else self
         if attempt.against.contradictions:
             return attempt
         for _ in range(_ROUNDS_LEFT_OUT):
-            if not attempt.against.unfit or (fewer := attempt._without_unfit(options)) is None:
+            if not attempt.against.unfit or (fewer := attempt._without_unfit()) is None:
                 break
             attempt = fewer
         return attempt._with_error_of_model() if attempt.against.all_against() else attempt
 
-    def _without_unfit(self, options: CalibrationOptions) -> "_Attempt | None":
+    def _without_unfit(self) -> "_Attempt | None":
         """Without the images that contradict all others; None where that leaves too few, or contradicts more."""
         kept = self.gathered.without(self.against.unfit)
         if kept is None:
             return None
-        problem = joint_problem(kept, options=options)
-        result, against = problem.judged()
-        if against.contradictions:
-            return None
         said = [f"{words}; left out" for words in self.against.unfit.values()]
-        return _Attempt(kept, problem, result, against, (*self.said, *said))
+        fewer = _Attempt.at(kept, self.options, (*self.said, *said))
+        return None if fewer.against.contradictions else fewer
 
     def _with_richer_lens(self) -> "_Attempt":
         """With k3, or with pixels that are not square, or both: what removes contradictions, or a share of the scatter.
 
-        Pixels are not freed for contradictions alone: a spacing described wrongly along one side looks like them.
+        Only what the options leave open. Pixels are not freed for contradictions alone: a spacing described wrongly
+        along one side looks like them.
         """
-        best = self
-        for change in ({"distortion": "k3"}, {"square_pixels": False}):
-            if (richer := best._with_lens(change)) is None:
-                continue
-            fewer = "distortion" in change and len(richer.against.all_against()) < len(best.against.all_against())
-            if fewer or (best.against.misfits and richer._scatter() < _CLEARLY_LESS * best._scatter()):
+        best, choice, camera = self, self.options.lens, self.options.camera
+        if choice is None or choice.distortion != "auto":
+            return best
+        richer = best._with_lens(replace(camera, distortion=(*camera.distortion, "k3")), "k3")
+        if richer is not None and (
+            len(richer.against.all_against()) < len(best.against.all_against()) or richer._fits_better_than(best)
+        ):
+            best = richer
+        if best.against.misfits and choice.pixels == "auto":
+            free = replace(best.options.camera, square_pixels=False)
+            richer = best._with_lens(free, "pixels that are not square")
+            if richer is not None and richer._fits_better_than(best):
                 best = richer
         return best
 
-    def _with_lens(self, change: dict[str, Any]) -> "_Attempt | None":
-        parameters, lens = self.problem.parameters, self.problem.parameters.intrinsics
-        added = change.get("distortion")
-        if added in lens.options.distortion:
-            return None
-        distortion = (*lens.options.distortion, *([added] if added else ()))
-        options = replace(lens.options, **change | {"distortion": distortion})
-        richer = replace(parameters, intrinsics=Intrinsics(options, lens.width_px, lens.height_px))
-        start = richer.intrinsics.from_model(parameters.camera(self.result.values))
-        values = np.concatenate([start, self.result.values[len(lens.names) :]])
-        problem = replace(self.problem, parameters=richer, global_values=values, local=self.result.local)
+    def _with_lens(self, camera: CameraOptions, name: str) -> "_Attempt | None":
+        said = f"the lens was given {name}, without which the evidence contradicts itself"
         try:
-            result, against = problem.judged()
+            richer = _Attempt.at(self.gathered, replace(self.options, camera=camera), (*self.said, said))
         except CalibrationError:
             return None
-        words = (
-            f"the lens was given {added or 'pixels that are not square'}, without which the evidence contradicts itself"
-        )
-        return (
-            None if against.contradictions else _Attempt(self.gathered, problem, result, against, (*self.said, words))
-        )
+        return None if richer.against.contradictions else richer
+
+    def _fits_better_than(self, other: "_Attempt") -> bool:
+        return bool(other.against.misfits) and self._scatter() < _CLEARLY_LESS * other._scatter()
 
     def _scatter(self) -> float:
         """Geometric mean of the scatter of the target's points and stripes, px."""
-        return float(np.exp(np.mean([np.log(self.result.noise[kind].sigma_px) for kind in self.result.noise])))
+        return float(np.exp(np.mean(np.log([noise.sigma_px for noise in self.result.noise.values()]))))
 
     def _with_error_of_model(self) -> "_Attempt":
         """With what does not fit as an error that all residuals of an image share, of whatever kind.
@@ -261,16 +259,16 @@ class _Attempt:
             "images show something that the model lacks: all points of an image are counted as one, and uncertainties "
             f"are {factor:.1f} times larger by that (median)"
         )
-        return _Attempt(self.gathered, problem, result, replace(against, unfit={}, misfits={}), (*self.said, *said))
+        against = replace(against, unfit={}, misfits={})
+        return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
     """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
-    sensor, problem = gathered.sensor, joint_problem(gathered, options=options)
-    attempt = _Attempt(gathered, problem, *problem.judged())
+    attempt = _Attempt.at(gathered, options)
     if not options.strict:
-        attempt = attempt.settled(options)
-    problem, result, against = attempt.problem, attempt.result, attempt.against
+        attempt = attempt.settled()
+    sensor, problem, result, against = gathered.sensor, attempt.problem, attempt.result, attempt.against
     if against.all_against():
         raise CalibrationError(against.refusal())
     warnings = [*problem.warnings, *attempt.said, *against.doubts]
