@@ -31,7 +31,7 @@ def test_circles_out_of_focus_are_found_where_they_are():
     matrix = np.diag([camera.focal_length_px(), camera.focal_length_px(), 1.0])
     matrix[:2, 2] = camera.principal_point()
     d = camera.distortion
-    distortion = np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+    distortion = np.array(list(d.model_dump().values()))
     products, squares = np.zeros(2), np.zeros(2)
     for image in recording.images:
         view = target.detect(image)

@@ -64,7 +64,7 @@ def pixels_in_air(sensor: Sensor, points: np.ndarray) -> np.ndarray:
     focal, (cx, cy), d = camera.focal_length_px(), camera.principal_point(), camera.distortion
     matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
     rotation, shift = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3]
-    return cv2.projectPoints(points, rotation, shift, matrix, np.array([d.k1, d.k2, d.p1, d.p2, d.k3]))[0][:, 0]
+    return cv2.projectPoints(points, rotation, shift, matrix, np.array(list(d.model_dump().values())))[0][:, 0]
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------

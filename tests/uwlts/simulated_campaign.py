@@ -33,12 +33,16 @@ class ModelErrors:
 
     ``distortion`` are coefficients added to the lens's. The target is a saddle, ``saddle_mm`` high at its edges'
     middles, and printed wider along x by the share ``stretch``. Its gloss moves the stripe on it by ``gloss_px``.
+    Waist and aperture make circles and stripe ``noise`` times as noisy as usual in the focus, and 100 mm before and
+    behind it by the share ``blur`` of that more.
     """
 
     distortion: tuple[tuple[str, float], ...] = ()
     saddle_mm: float = 0.0
     stretch: float = 0.0
     gloss_px: float = 0.0
+    noise: float = 1.0
+    blur: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +52,7 @@ class Reality:
     ``lean`` (2,) are the slopes of the stage's direction against the target's normal, ``warmer_k`` by how much the
     water is warmer than its thermometer says. ``target_saddle_mm`` is twice the height of the middles of the target's
     sides across x, ``stretch`` (2,) that of its columns and rows, ``gloss_px`` by how much it moves the stripe on it.
+    ``circles_px`` and ``stripe_px`` are their noise in the focus, which grows by ``blur`` of it within 100 mm.
     """
 
     sensor: Sensor
@@ -65,6 +70,11 @@ class Reality:
     target_saddle_mm: float
     stretch: np.ndarray
     gloss_px: float
+    blur: float
+
+    def noisier(self, z_mm: float) -> float:
+        """Noise at a depth of the OCS as a multiple of that in the focus."""
+        return 1 + self.blur * abs(z_mm) / 100
 
     def index(self, medium: Medium, drift_k: float = 0.0) -> float:
         """Index of a medium; that of water is of the second order in the temperature, also beyond 30 degC."""
@@ -133,13 +143,14 @@ def drawn_reality(
         lean=np.tan(np.radians(known.stage_alignment_deg)) * rng.standard_normal(2),
         target_bow_mm=rng.normal(0, known.target_bow_mm),
         step_mm=STEP_MM + rng.normal(0, known.step_height_mm),
-        circles_px=rng.uniform(0.03, 0.05),
-        stripe_px=rng.uniform(0.1, 0.15),
+        circles_px=errors.noise * rng.uniform(0.03, 0.05),
+        stripe_px=errors.noise * rng.uniform(0.1, 0.15),
         stage_mm=known.stage_position_mm,
         rng=rng,
         target_saddle_mm=rng.normal(0, known.target_bow_mm) + 2 * errors.saddle_mm,
         stretch=rng.normal(0, known.target_stretch, 2) + [errors.stretch, 0.0],
         gloss_px=rng.normal(0, known.target_stripe_px) + errors.gloss_px,
+        blur=errors.blur,
     )
 
 
@@ -188,9 +199,10 @@ class FanRays:
         return self.points[hit] - (half[hit] + np.sqrt(under_root[hit]))[:, None] * along[hit]
 
 
-def stripe_noise(real: Reality, pixels: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of a stripe along the width, with its noise across."""
-    return pixels + np.column_stack([np.zeros(len(pixels)), real.rng.normal(0, real.stripe_px, len(pixels))])
+def stripe_noise(real: Reality, pixels: np.ndarray, z_mm: float) -> np.ndarray:
+    """Pixels (N, 2) of a stripe along the width at a depth of the OCS, with its noise across."""
+    noise = real.rng.normal(0, real.stripe_px * real.noisier(z_mm), len(pixels))
+    return pixels + np.column_stack([np.zeros(len(pixels)), noise])
 
 
 def target_series(
@@ -217,17 +229,18 @@ def target_series(
     images, stripes = [], []
     for position in positions:
         travel = position * (1 + real.stage_scale) + real.rng.normal(0, real.stage_mm)
+        z_mm = 20.0 - position
         origin = frame[:3, 3] + 20.0 * frame[:3, 2] - travel * direction
         pixels = seen(sensor, bent @ rotation.T + origin, index=index, window=view.window)
         here = inside(pixels, sensor)
-        found = pixels[here] + real.rng.normal(0, real.circles_px, (here.sum(), 2))
+        found = pixels[here] + real.rng.normal(0, real.circles_px * real.noisier(z_mm), (here.sum(), 2))
         images.append(TargetImage(flat[here], found, float(position)))
         lit = fan.on_plane(rotation[:, 2], rotation[:, 2] @ origin)
         for _ in range(2):
             lit = fan.on_plane(rotation[:, 2], rotation[:, 2] @ origin + bulge((lit - origin) @ rotation))
         on_it = (np.abs((lit - origin) @ rotation)[:, :2] < 115.0).all(axis=1)
         pixels = seen(sensor, lit[on_it], index=index, window=view.window)
-        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)]) + [0.0, real.gloss_px])
+        stripes.append(stripe_noise(real, pixels[inside(pixels, sensor)], z_mm) + [0.0, real.gloss_px])
     evidence = AirEvidence(TARGET, images, [(0, n) for n in range(len(images))], stripes, [])
     return Series(view, evidence, True, ["target"])
 
@@ -248,7 +261,7 @@ def step_images(real: Reality, *, index: float, depths: np.ndarray, rays: int) -
         along = np.abs((lit - middle) @ rotation[:, 1] - shift)
         lit = lit[on_top | ((along > 34.0) & (along < 75.0))]
         pixels = seen(real.sensor, lit, index=index, window=True)
-        pixels = stripe_noise(real, pixels[inside(pixels, real.sensor)])
+        pixels = stripe_noise(real, pixels[inside(pixels, real.sensor)], float(depth))
         found.append(
             (StepEvidence(pixels, StepStandard(kind="step", height_mm=STEP_MM), index, "step"), ViewMedium(True, 0))
         )
@@ -315,4 +328,5 @@ def scan_of_spheres(
             rows = CubicSpline(*pixels.T)(columns)
             parts.append((np.full(len(columns), number), columns.astype(int), rows))
     frame_of, line, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return ScanStripes(frame_of, line, rows + real.rng.normal(0, real.stripe_px, len(rows)), positions)
+    noise = real.rng.normal(0, real.stripe_px * real.noisier(PLACES_MM[place]), len(rows))
+    return ScanStripes(frame_of, line, rows + noise, positions)

@@ -188,22 +188,31 @@ def length_outside_mm(xp: ModuleType, window: WindowGeometry, path: Path) -> Arr
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole with Brown-Conrady distortion: focal length and principal point in px."""
+    """A pinhole with distortion as in `uwlts.model.sensor.Distortion`: focal length and principal point in px."""
 
     focal_px: Array
     cx: Array
     cy: Array
     k1: Array
     k2: Array
-    k3: Array
     p1: Array
     p2: Array
+    k3: Array
+    k4: Array
+    k5: Array
+    k6: Array
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
         """That of a camera's description."""
-        d = camera.distortion
-        return cls(camera.focal_length_px(), *camera.principal_point(), d.k1, d.k2, d.k3, d.p1, d.p2)
+        return cls(camera.focal_length_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
+
+    def radial(self, r2: Array) -> tuple[Array, Array]:
+        """Radial factor of the distortion at squares of the radius, and twice its derivative by them."""
+        below = 1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        factor = (1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))) / below
+        slope = self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3)
+        return factor, 2 * (slope - factor * (self.k4 + r2 * (2 * self.k5 + r2 * 3 * self.k6))) / below
 
 
 @dataclass(frozen=True)
@@ -219,9 +228,9 @@ class ImagePoints:
 
 
 def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Image points (x, y) of slopes (a, b), and the radial factor; distortion after Brown 1971, in OpenCV's form."""
+    """Image points (x, y) of slopes (a, b), and the radial factor; distortion in OpenCV's form."""
     r2 = a * a + b * b
-    radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    radial, _ = lens.radial(r2)
     x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
     y = b * radial + 2 * lens.p2 * a * b + lens.p1 * (r2 + 2 * b * b)
     return x, y, radial
@@ -249,7 +258,7 @@ def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> I
     a, b = ray[0] / ray[2], ray[1] / ray[2]
     r2 = a * a + b * b
     x, y, radial = distorted(lens, a, b)
-    slope = 2 * (lens.k1 + r2 * (2 * lens.k2 + r2 * 3 * lens.k3))
+    _, slope = lens.radial(r2)
     mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
     jacobian = (
         lens.focal_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),

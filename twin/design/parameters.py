@@ -31,7 +31,7 @@ class SensorArrays:
     """One array of numbers per quantity, all of the same shape or 1; units are part of the names.
 
     ``placed`` is the pose (origin, axis, fan, normal) of lasers that are placed by their axis, NaN for those placed by
-    baseline and angle. ``distortion`` is k1, k2, k3, p1 and p2. ``along_width`` is 1 where the stripe runs along the
+    baseline and angle. ``distortion`` is k1 k2 p1 p2 k3 k4 k5 k6. ``along_width`` is 1 where the stripe runs along the
     image's width, else 0. ``fan_nodes_rad`` and ``fan_powers`` hold tabulated profiles (relative power per angle).
     """
 
@@ -45,7 +45,7 @@ class SensorArrays:
     pixel_mm: Array
     focal_mm: Array
     principal_px: tuple[Array, Array]
-    distortion: tuple[Array, Array, Array, Array, Array]
+    distortion: tuple[Array, ...]
     f_number: Array
     focus_mm: Array
     window_mounted: Array
@@ -219,7 +219,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
     table = () if isinstance(laser.fan_profile, str) else laser.fan_profile
     half = math.radians(laser.fan_angle_deg / 2)
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
-    d, angle, speckle = camera.distortion, laser.triangulation_angle_deg, 1.0
+    angle, speckle = laser.triangulation_angle_deg, 1.0
     if (width := laser.linewidth_nm) > 0:
         # The contrast that the line width leaves on a diffuse surface.
         speckle = coherence(_DIFFUSE_ROUGHNESS_UM, linewidth_nm=width, wavelength_nm=wavelength, index=index)
@@ -286,7 +286,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
         **{name: float(value) for name, value in numbers.items()},
         placed=placed,
         principal_px=camera.principal_point(),
-        distortion=(d.k1, d.k2, d.k3, d.p1, d.p2),
+        distortion=tuple(camera.distortion.model_dump().values()),
         fan_nodes_rad=tuple(angles.tolist()),
         fan_powers=tuple(powers.tolist()),
     )

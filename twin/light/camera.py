@@ -67,16 +67,18 @@ class LensRays:
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
     def _undistorted(self, seen: Point2f) -> Point2f:
-        """Invert x_d = x (1 + k1 r2 + k2 r4 + k3 r6) + 2 p1 x y + p2 (r2 + 2 x2) (Brown 1971) by Newton's method."""
+        """Invert the distortion, a rational Brown-Conrady model (`Distortion`), by Newton's method."""
         d = self.camera.distortion
-        if not any((d.k1, d.k2, d.p1, d.p2, d.k3)):
+        if not any(d.model_dump().values()):
             return seen
         point = mi.Point2f(seen)
         for _ in range(_NEWTON_STEPS):
             x, y = point.x, point.y
             r2 = x * x + y * y
-            radial = 1 + r2 * (d.k1 + r2 * (d.k2 + r2 * d.k3))
-            slope = 2 * (d.k1 + r2 * (2 * d.k2 + r2 * 3 * d.k3))
+            below = 1 + r2 * (d.k4 + r2 * (d.k5 + r2 * d.k6))
+            radial = (1 + r2 * (d.k1 + r2 * (d.k2 + r2 * d.k3))) / below
+            above_by, below_by = d.k1 + r2 * (2 * d.k2 + r2 * 3 * d.k3), d.k4 + r2 * (2 * d.k5 + r2 * 3 * d.k6)
+            slope = 2 * (above_by - radial * below_by) / below
             off_x = x * radial + 2 * d.p1 * x * y + d.p2 * (r2 + 2 * x * x) - seen.x
             off_y = y * radial + 2 * d.p2 * x * y + d.p1 * (r2 + 2 * y * y) - seen.y
             xx = radial + slope * x * x + 2 * d.p1 * y + 6 * d.p2 * x

@@ -66,7 +66,7 @@ def calibrate(
         stage-normal: one target pose, moved by the stage along the target's normal. stage: the same in a free
         direction, as always in the joint method. free: every image has a pose of its own.
     distortion : "auto" or tuple of str
-        The coefficients among k1, k2, p1, p2, k3 to estimate; the others are 0. auto: with the poses stage and free
+        The coefficients among k1 to k6, p1 and p2 to estimate; the others are 0. auto: with the poses stage and free
         those that predict images of the target left out best; with stage-normal k1 and k2; jointly k1 and k2, p1
         and p2 as far as the description leaves them open, and k3 where images misfit without.
     pixels : {"auto", "square", "free"}

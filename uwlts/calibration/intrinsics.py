@@ -8,14 +8,15 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.sensor import Distortion
 
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+DISTORTION = tuple(Distortion.model_fields)
+"""Names of the coefficients in OpenCV's order."""
 
 
 @dataclass(frozen=True)
 class CameraOptions:
     """Camera parameters that are estimated."""
 
-    distortion: tuple[str, ...] = ("k1", "k2")  # those of k1, k2, p1, p2, k3 that are estimated; the others are zero
+    distortion: tuple[str, ...] = ("k1", "k2")  # those of k1 to k6, p1 and p2 that are estimated; others are zero
     square_pixels: bool = True  # whether fx and fy are one focal length f
     principal_point_px: tuple[float, float] | None = None  # (cx, cy), optional; given, it is not estimated
     soft_limit_px: float | None = None  # distances well beyond it count linearly ("soft L1") rather than squared
@@ -30,7 +31,7 @@ class CameraOptions:
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
-    """The estimated parameters (P,) as a part of (fx, fy, cx, cy, k1, k2, p1, p2, k3): fixed + map @ estimated."""
+    """The estimated parameters (P,) as a part of (fx, fy, cx, cy, *DISTORTION): fixed + map @ estimated."""
 
     options: CameraOptions
     width_px: int
@@ -47,7 +48,7 @@ class Intrinsics:
         rows = [[float(name == row or (name == "f" and row in ("fx", "fy"))) for name in names] for row in order]
         object.__setattr__(self, "names", tuple(names))
         object.__setattr__(self, "map", np.array(rows))
-        object.__setattr__(self, "fixed", np.array([0, 0, *(centre or (0, 0)), 0, 0, 0, 0, 0], dtype=np.float64))
+        object.__setattr__(self, "fixed", np.array([0.0, 0.0, *(centre or (0.0, 0.0)), *(0.0 for _ in DISTORTION)]))
 
     @property
     def keys(self) -> tuple[LensParameter, ...]:
@@ -63,7 +64,7 @@ class Intrinsics:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def coefficients(self, estimated: np.ndarray) -> np.ndarray:
-        """Distortion coefficients (5,) in OpenCV's order."""
+        """Distortion coefficients (8,) in OpenCV's order."""
         return self._all(estimated)[4:]
 
     def from_matrix(self, matrix: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ uncertainties follow from what leaving out one image after the other does (the d
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -20,6 +21,7 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
 
 _DISTORTIONS = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2", "k3"))
+_RATIONAL = (("k1", "k2", "k4", "k5"), ("k1", "k2", "p1", "p2", "k4", "k5"))  # tried where k3 helps
 _FOLDS = 5
 _WORSE = 1.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
@@ -45,7 +47,7 @@ class LensCandidate:
     """A lens model, and how well it predicts images that it was not calibrated from.
 
     ``rms_px`` is the root mean square miss of their points, NaN where the images do not determine the model; ``worse``
-    the mean difference of the squares from the best model's, over its standard error (0 for the best).
+    the mean difference of the squares from the best model's, over its standard error: 0 for the best, infinite for NaN.
     """
 
     options: CameraOptions
@@ -144,7 +146,7 @@ def calibrate_lens(
             circle_diameter_mm=circle_diameter_mm if circles else None,
         )
 
-    tried = _candidates(choice, poses)
+    tried = _candidates(_DISTORTIONS, choice, poses)
     usual = tried[0] if len(tried) == 1 else CameraOptions(("k1", "k2"), square_pixels=choice.pixels != "free")
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
@@ -157,9 +159,16 @@ def calibrate_lens(
     options, keep = usual, inliers(usual)
     good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        start = solved(good, usual, circles=True)
-        candidates = _compared(_centred(good, start), tried, lambda i, o: solved(i, o, circles=False), progress)
-        options = _chosen(candidates, usual)
+        centred = _centred(good, solved(good, usual, circles=True))
+        squares: dict[CameraOptions, np.ndarray] = {}
+        for further in (tried, _candidates(_RATIONAL, choice, poses)):
+            for number, each in enumerate(further):
+                squares[each] = _misses_predicted(centred, partial(solved, options=each, circles=False))
+                progress(number + 1, len(further))
+            candidates = _compared(squares)
+            options = _chosen(candidates, usual)
+            if choice.distortion != "auto" or "k3" not in options.distortion:
+                break
     if options != usual:
         keep = inliers(options)
     left_out = {
@@ -212,8 +221,8 @@ def _name(options: CameraOptions) -> str:
     return f"{coefficients}, {'square' if options.square_pixels else 'free'} pixels"
 
 
-def _candidates(choice: LensChoice, poses: Poses) -> list[CameraOptions]:
-    any_of = (("k1", "k2"),) if poses == "stage-normal" else _DISTORTIONS
+def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
+    any_of = (("k1", "k2"),) if poses == "stage-normal" else any_of
     sets = any_of if choice.distortion == "auto" else (choice.distortion,)
     any_shape = (True, False) if poses == "free" else (True,)
     shapes = {"auto": any_shape, "square": (True,), "free": (False,)}[choice.pixels]
@@ -248,35 +257,36 @@ def _centred(images: Sequence[TargetImage], solution: CameraSolution) -> list[Ta
     return [replace(i, pixels=i.pixels - bias) for i, bias in zip(images, solution.bias_px, strict=True)]
 
 
-def _compared(
-    images: list[TargetImage],
-    tried: list[CameraOptions],
-    solve: Callable[[Sequence[TargetImage], CameraOptions], CameraSolution],
-    progress: Callable[[int, int], None],
-) -> list[LensCandidate]:
-    """The models, each calibrated without every fifth image and tried on these; none if that determines none."""
+def _misses_predicted(
+    images: list[TargetImage], solve: Callable[[Sequence[TargetImage]], CameraSolution]
+) -> np.ndarray:
+    """Mean square miss (F,) of each image by a calibration without every fifth, it among them; NaN if one has none."""
     folds = min(_FOLDS, len(images))
-    squares = np.full((len(tried), len(images)), np.nan)
-    for number, options in enumerate(tried):
-        try:
-            for fold in range(folds):
-                rest = [image for place, image in enumerate(images) if place % folds != fold]
-                model = solve(rest, options).model
-                for place in range(fold, len(images), folds):
-                    squares[number, place] = _mean_square_miss(model, images[place])
-        except CalibrationError:
-            squares[number] = np.nan
-        progress(number + 1, len(tried))
-    means = squares.mean(axis=1)
-    if np.isnan(means).all():
+    squares = np.full(len(images), np.nan)
+    try:
+        for fold in range(folds):
+            model = solve([image for place, image in enumerate(images) if place % folds != fold]).model
+            for place in range(fold, len(images), folds):
+                squares[place] = _mean_square_miss(model, images[place])
+    except CalibrationError:
+        squares[:] = np.nan
+    return squares
+
+
+def _compared(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
+    """Models by the mean squares of their misses (F,); none if no model has any."""
+    means = {options: float(each.mean()) for options, each in squares.items()}
+    least = np.nanmin([*means.values(), np.inf])
+    if np.isinf(least):
         return []
-    best = int(np.nanargmin(means))
+    best = next(squares[options] for options, mean in means.items() if mean == least)
     found = []
-    for options, mean, each in zip(tried, means, squares, strict=True):
-        apart = each - squares[best]
+    for options, each in squares.items():
+        apart = each - best
         error = float(np.std(apart, ddof=1)) / np.sqrt(len(apart))
-        small = not mean - means[best] > _LEAST_GAIN * means[best]
-        found.append(LensCandidate(options, float(np.sqrt(mean)), 0.0 if small else float(np.mean(apart)) / error))
+        small = means[options] - least <= _LEAST_GAIN * least
+        worse = 0.0 if small else np.inf if np.isnan(means[options]) else float(np.mean(apart)) / error
+        found.append(LensCandidate(options, float(np.sqrt(means[options])), worse))
     return found
 
 
@@ -293,7 +303,7 @@ def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
 
 def _chosen(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
     """The model with the fewest parameters among those as good as the best; the usual one if none was tried."""
-    good = [each for each in candidates if np.isfinite(each.rms_px) and each.worse <= _WORSE]
+    good = [each for each in candidates if each.worse <= _WORSE]
     return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual
 
 

@@ -79,7 +79,7 @@ def calibrate_camera(
     channel : str, optional
         Channel of colour images, or a formula of channels; their luminance unless given.
     distortion : "auto" or tuple of str
-        Coefficients among k1, k2, p1, p2, k3 to estimate; auto: those that predict images left out best.
+        Coefficients among k1 to k6, p1 and p2 to estimate; auto: those that predict images left out best.
     pixels : {"auto", "square", "free"}
         Whether one focal length or two are estimated.
     progress : callable, optional
@@ -187,8 +187,8 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
         "image_height": model.height_px,
         "camera_name": camera.folder.resolve().name,
         "camera_matrix": matrix(model.matrix().tolist()),
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": matrix([[known.k1, known.k2, known.p1, known.p2, known.k3]]),
+        "distortion_model": "rational_polynomial" if known.is_rational() else "plumb_bob",
+        "distortion_coefficients": matrix([list(known.used().values())]),
         "rectification_matrix": matrix(np.eye(3).tolist()),
         "projection_matrix": matrix(projection),
         "estimated": {

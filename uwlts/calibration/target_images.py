@@ -126,6 +126,6 @@ def observe(
         by_local = np.hstack([by_local, by_tilt])
     return Observation(
         residuals=placement.pixels - projected.reshape(-1, 2),
-        by_global=-jacobian[:, 6:15] @ intrinsics.map,
+        by_global=-jacobian[:, 6 : 6 + len(intrinsics.map)] @ intrinsics.map,
         by_local=-by_local,
     )

@@ -21,7 +21,7 @@ app = App(
 Flag = Annotated[bool, Parameter(negative="")]
 Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
 Coefficients = Annotated[
-    tuple[Literal["k1", "k2", "p1", "p2", "k3"], ...], Parameter(consume_multiple=True, negative="")
+    tuple[Literal["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"], ...], Parameter(consume_multiple=True, negative="")
 ]
 if TYPE_CHECKING:
     MethodName = str

@@ -76,9 +76,8 @@ class CameraModel(Description):
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def coefficients(self) -> np.ndarray:
-        """Distortion coefficients (5,) in OpenCV's order k1 k2 p1 p2 k3."""
-        d = self.distortion
-        return np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+        """Distortion coefficients (8,) in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
+        return np.array(list(self.distortion.model_dump().values()))
 
 
 class WindowModel(Description):

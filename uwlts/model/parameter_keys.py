@@ -55,6 +55,9 @@ class LensParameter(_SingleParameter):
     P1 = "p1", "distortion p1"
     P2 = "p2", "distortion p2"
     K3 = "k3", "distortion k3"
+    K4 = "k4", "distortion k4"
+    K5 = "k5", "distortion k5"
+    K6 = "k6", "distortion k6"
 
 
 class WindowParameter(_SingleParameter):

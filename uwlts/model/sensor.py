@@ -93,13 +93,28 @@ class Window(Description):
 
 
 class Distortion(Description):
-    """Brown-Conrady coefficients in OpenCV's order and sense."""
+    """Coefficients in OpenCV's order and sense: Brown-Conrady's, and with k4, k5 and k6 the rational model's.
+
+    With r2 = x2 + y2 a point (x, y) is seen at x g + 2 p1 x y + p2 (r2 + 2 x2), y g + 2 p2 x y + p1 (r2 + 2 y2), where
+    g = (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6).
+    """
 
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+
+    def is_rational(self) -> bool:
+        """Whether the radial factor has a denominator."""
+        return self.k4 != 0 or self.k5 != 0 or self.k6 != 0
+
+    def used(self) -> dict[str, float]:
+        """The coefficients of the model in use: Brown-Conrady's five, or all eight of the rational one."""
+        return self.model_dump(exclude=None if self.is_rational() else {"k4", "k5", "k6"})
 
 
 class Camera(Description):

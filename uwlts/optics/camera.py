@@ -1,12 +1,13 @@
 """The camera: pixels to rays and points to pixels, with lens distortion, straight or through the window.
 
-Pinhole with Brown-Conrady distortion in OpenCV's order and sense; pixel (0, 0) is the centre of the first pixel.
+Pinhole with Brown-Conrady or rational distortion in OpenCV's sense; pixel (0, 0) is the centre of the first pixel.
 """
 
 import math
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from uwlts.model.calibration import CameraModel, WindowModel
 from uwlts.model.errors import RangeError
@@ -138,35 +139,56 @@ def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
 
 
 def _largest_square(d: Distortion) -> float:
-    return _edge_square(d.k1, d.k2, d.p1, d.p2, d.k3)
+    return _edge_square(d.k1, d.k2, d.p1, d.p2, d.k3, d.k4, d.k5, d.k6)
 
 
 @lru_cache(maxsize=16)
-def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float) -> float:
+def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
     """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it.
 
     The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
-    have the same image. With g(r) = 1 + k1 r^2 + k2 r^4 + k3 r^6 the radial terms give it the eigenvalues g and
-    (r g)'; the tangential terms lower them by 6 r |(p1, p2)| at most. So the disc ends where the smaller of the two
-    first reaches 6 r |(p1, p2)|, which is the exact edge for a barrel. Solved for 1 / r, as then the polynomials lead
-    with 1; an edge farther than `_WIDEST` is none.
+    have the same image. The radial factor g(r) = N / D gives it the eigenvalues g and (r g)'; the tangential terms
+    lower them by 6 r |(p1, p2)| at most. So the disc ends where the smaller of the two first reaches 6 r |(p1, p2)|,
+    which is the exact edge for a barrel, or at a pole of g. Solved for 1 / r, as then the polynomials lead with 1; an
+    edge farther than `_WIDEST` is none.
     """
-    tangential = 6.0 * math.hypot(p1, p2)
-    across = np.roots([1.0, -tangential, k1, 0.0, k2, 0.0, k3])
-    along = np.roots([1.0, -tangential, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3])
-    roots = np.concatenate([across, along])
+    r = Polynomial([0.0, 1.0])
+    tangential = 6.0 * math.hypot(p1, p2) * r
+    above, below = (Polynomial([1.0, 0.0, a, 0.0, b, 0.0, c]) for a, b, c in ((k1, k2, k3), (k4, k5, k6)))
+    across = above - tangential * below
+    along = (above + r * above.deriv()) * below - r * above * below.deriv() - tangential * below**2
+    roots = np.concatenate([np.roots(each.coef) for each in (across, along, below)])
     ends = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 1.0 / _WIDEST)]
     return float(ends.max() ** -2) if len(ends) else math.inf
 
 
+def _radial(d: Distortion, s: np.ndarray) -> np.ndarray:
+    """The radial factor g at squares s of the radius."""
+    above = 1.0 + s * (d.k1 + s * (d.k2 + s * d.k3))
+    return above / _below(d, s) if d.is_rational() else above
+
+
+def _below(d: Distortion, s: np.ndarray) -> np.ndarray:
+    """The radial factor's denominator."""
+    return 1.0 + s * (d.k4 + s * (d.k5 + s * d.k6))
+
+
+def _radial_slope(d: Distortion, s: np.ndarray) -> np.ndarray:
+    """The radial factor's derivative by s."""
+    slope = d.k1 + s * (2.0 * d.k2 + s * (3.0 * d.k3))
+    if not d.is_rational():
+        return slope
+    return (slope - _radial(d, s) * (d.k4 + s * (2.0 * d.k5 + s * (3.0 * d.k6)))) / _below(d, s)
+
+
 def _growth(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Square of the radius, and the factor of the coordinates in the Brown-Conrady distortion of `_distorted`."""
+    """Square of the radius, and the factor of the coordinates in the distortion of `_distorted`."""
     s = x * x + y * y
-    return s, 1.0 + s * (d.k1 + s * (d.k2 + s * d.k3)) + 2.0 * (d.p1 * y + d.p2 * x)
+    return s, _radial(d, s) + 2.0 * (d.p1 * y + d.p2 * x)
 
 
 def _distorted(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Brown-Conrady distortion of ideal image coordinates in units of the focal length (OpenCV, module calib3d)."""
+    """Distortion of ideal image coordinates in units of the focal length (OpenCV, module calib3d)."""
     s, growth = _growth(d, x, y)
     return x * growth + d.p2 * s, y * growth + d.p1 * s
 
@@ -175,26 +197,27 @@ def _jacobian(
     d: Distortion, x: np.ndarray, y: np.ndarray, s: np.ndarray, growth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives xx, xy = yx, yy of `_distorted`, with what `_growth` gives."""
-    slope = d.k1 + s * (2.0 * d.k2 + s * (3.0 * d.k3))
+    slope = _radial_slope(d, s)
     x_slope, y_slope = 2.0 * (slope * x + d.p2), 2.0 * (slope * y + d.p1)
     return growth + x * (x_slope + 2.0 * d.p2), x * y_slope + (2.0 * d.p2) * y, growth + y * (y_slope + 2.0 * d.p1)
 
 
 def image_derivatives(camera: CameraModel, pixels: np.ndarray, ideal: np.ndarray) -> np.ndarray:
-    """Derivatives (11, 2, N) of the ideal image coordinates (2, N) of pixels (N, 2): by u, v, fx, fy, cx, cy, k1 to k3.
+    """Derivatives (14, 2, N) of the ideal image coordinates (2, N) of pixels (N, 2): by u, v, fx, fy, cx, cy, k1 to k6.
 
-    The order of the distortion is OpenCV's, k1 k2 p1 p2 k3. The distorted image D(x, y; k) stays at ((u - cx) / fx,
-    (v - cy) / fy), so that dD/d(x, y) d(x, y) is the change of the latter minus dD/dk dk.
+    The order of the distortion is OpenCV's, k1 k2 p1 p2 k3 k4 k5 k6. The distorted image D(x, y; k) stays at
+    ((u - cx) / fx, (v - cy) / fy), so that dD/d(x, y) d(x, y) is the change of the latter minus dD/dk dk.
     """
     (x, y), d = ideal, camera.distortion
     focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
     s, growth = _growth(d, x, y)
     xx, xy, yy = _jacobian(d, x, y, s, growth)
-    change = np.zeros((11, 2, len(x)))
+    change = np.zeros((14, 2, len(x)))
     change[[0, 1], [0, 1]] = 1.0 / focal[:, None]
     change[[2, 3], [0, 1]] = (centre - pixels).T / focal[:, None] ** 2
     change[[4, 5], [0, 1]] = -1.0 / focal[:, None]
-    change[6], change[7], change[10] = -ideal * s, -ideal * s**2, -ideal * s**3
+    powers = np.stack([s, s**2, s**3])[:, None] * ideal / _below(d, s)
+    change[[6, 7, 10]], change[11:] = -powers, _radial(d, s) * powers
     change[8] = -2.0 * x * y, -s - 2.0 * y * y
     change[9] = -s - 2.0 * x * x, -2.0 * x * y
     first, second = yy * change[:, 0] - xy * change[:, 1], xx * change[:, 1] - xy * change[:, 0]
@@ -218,7 +241,7 @@ def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple
     allowed = _allowed(x_seen, y_seen)
     with np.errstate(all="ignore"):
         s = x_seen * x_seen + y_seen * y_seen
-        start = 1.0 / (1.0 + s * (d.k1 + s * (d.k2 + s * d.k3)))
+        start = 1.0 / _radial(d, s)
         x, y = start * x_seen, start * y_seen
         found = np.zeros(len(x), dtype=bool)
         for _ in range(_USUAL_STEPS):

@@ -200,12 +200,11 @@ def cloud_lines(cloud: PointCloud) -> list[str]:
 def calibration_lines(calibration: Calibration) -> list[str]:
     """Parameters and residuals of a calibration."""
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
-    d = camera.distortion
     lines = [
         f"calibration of the sensor '{calibration.sensor_name}' "
         f"({calibration.provenance.get('source', 'unknown source')})",
         f"camera: f {camera.fx_px:.2f} x {camera.fy_px:.2f} px, centre {camera.cx_px:.2f}, {camera.cy_px:.2f} px, "
-        f"k1 {d.k1:.5f}, k2 {d.k2:.5f}, p1 {d.p1:.5f}, p2 {d.p2:.5f}, k3 {d.k3:.5f}",
+        + ", ".join(f"{name} {value:.5f}" for name, value in camera.distortion.used().items()),
         f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
     ]
     if window is None:

@@ -154,8 +154,8 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
         ("principal point, y", camera.cy_px, ("cy",)),
     ):
         table[words, "px"] = _with_std(value, next((std[name] for name in names if name in std), None), 3)
-    for name in ("k1", "k2", "k3", "p1", "p2"):
-        table[f"distortion {name}", ""] = _with_std(getattr(camera.distortion, name), std.get(name), 6)
+    for name, value in camera.distortion.used().items():
+        table[f"distortion {name}", ""] = _with_std(value, std.get(name), 6)
     pose = calibration.object_transform()
     table["stand-off: sheet on the camera's axis", "mm"] = fixed(pose[2, 3])
     table["angle between camera and sheet", "°"] = fixed(math.degrees(math.asin(min(1, abs(sheet.normal[2])))), 4)

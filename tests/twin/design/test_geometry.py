@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,6 +16,8 @@ from uwlts.model.sensor import Sensor
 from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, nominal_setup, pixel_of_depth
 
 TILTED = {"camera": {"window": {"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}}}
+
+RATIONAL = {"camera": {"distortion": {"p1": 0.004, "k3": 0.05, "k4": 0.6, "k5": -0.2, "k6": 0.3}}}
 
 
 def numbers(sensor: Sensor, medium: str = "water"):
@@ -60,7 +63,16 @@ def test_points_appear_where_light_of_least_time_comes_from(thesis_as_built, cha
     np.testing.assert_allclose(view.slopes[1].ravel(), rays[:, 1] / rays[:, 2], atol=1e-8)
 
 
-@pytest.mark.parametrize("changes", [{}, TILTED])
+def test_distortion_is_opencvs(thesis_as_built):
+    camera = altered(thesis_as_built, RATIONAL).camera
+    slopes = np.random.default_rng(4).uniform(-0.4, 0.4, (2, 100))
+    x, y, _ = g.distorted(g.Lens.of(camera), *slopes)
+    points, coefficients = np.vstack([slopes, np.ones(100)]).T, np.array(list(camera.distortion.model_dump().values()))
+    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
+    np.testing.assert_allclose(np.stack([x, y], axis=1), seen, atol=1e-14)
+
+
+@pytest.mark.parametrize("changes", [{}, TILTED, RATIONAL])
 def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
     sensor = altered(thesis_as_built, changes)
     points, p, step = points_of_sheet(sensor), numbers(sensor), 1e-3

@@ -68,7 +68,7 @@ def image_points(camera: Camera, count: int = 200) -> np.ndarray:
 def opencv_matrix(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Camera matrix and coefficients as OpenCV takes them."""
     focal, (cx, cy), d = camera.focal_length_px(), camera.principal_point(), camera.distortion
-    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]]), np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
+    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]]), np.array(list(d.model_dump().values()))
 
 
 def opencv_directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:
@@ -137,8 +137,14 @@ def test_a_slightly_wrong_window_would_be_noticed(thesis):
 
 @pytest.mark.parametrize(
     "distortion",
-    [{}, {"k1": -0.085, "k2": 0.09}, STRONG, {"k1": 0.4, "k2": -0.3, "p2": 0.01}],
-    ids=["none", "mild", "strong", "pincushion"],
+    [
+        {},
+        {"k1": -0.085, "k2": 0.09},
+        STRONG,
+        {"k1": 0.4, "k2": -0.3, "p2": 0.01},
+        STRONG | {"k4": 0.6, "k5": -0.2, "k6": 0.3},
+    ],
+    ids=["none", "mild", "strong", "pincushion", "rational"],
 )
 def test_the_lens_inverts_opencvs_distortion(thesis, distortion):
     camera = altered(thesis, {"camera": {"distortion": distortion, "principal_point_px": (633.3, 517.7)}}).camera

@@ -324,8 +324,9 @@ def test_rays_leave_the_windows_outer_face(thesis):
     outer = oracle_window(sensor.laser.window, WATER)[0][1]
     height = (origin - laser_origin(sensor) - outer.point) @ outer.normal
     # A ray leaves where its fan ray does, a micrometre behind the face, but beside it along X: on a face tilted by
-    # 10 deg five sigmas of 0.67 mm, 370 mm before the waist, are up to 0.6 mm away from it, the mean is not.
-    assert np.abs(height).max() < 0.6
+    # 10 deg six sigmas of 0.67 mm, 370 mm before the waist, are up to 0.7 mm away from it, the mean is not. One of the
+    # 10,000 rays is farther off by chance once in 50,000.
+    assert np.abs(height).max() < 0.7
     assert abs(np.mean(height)) < 5 * 0.67 * math.sin(math.radians(10)) / math.sqrt(10_000) + 2e-3
 
 

@@ -42,7 +42,7 @@ def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
     focal, (cx, cy) = camera.focal_length_px(), camera.principal_point()
     matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
     rays = oracle_paths(sensor, medium, points)[0]
-    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array([d.k1, d.k2, d.p1, d.p2, d.k3]))[0][:, 0]
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(list(d.model_dump().values())))[0][:, 0]
 
 
 def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:

@@ -107,7 +107,7 @@ def test_chosen_parameters_only():
     solution = solve_camera(images, **SIZE, poses="free", options=centred)
     assert solution.parameters == ("f", "k1")
     assert (solution.model.cx_px, solution.model.cy_px, solution.model.distortion.k2) == (600.0, 500.0, 0.0)
-    for wrong in ({"distortion": ("k4",)}, {"distortion": ("k1", "k1")}, {"soft_limit_px": 0.0}):
+    for wrong in ({"distortion": ("k7",)}, {"distortion": ("k1", "k1")}, {"soft_limit_px": 0.0}):
         with pytest.raises(ValueError):
             CameraOptions(**wrong)
 

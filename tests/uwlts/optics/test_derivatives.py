@@ -10,15 +10,11 @@ from uwlts.optics.camera import image_derivatives
 from uwlts.optics.sheet import sheet_surface
 from uwlts.optics.window import trace_derivatives, trace_window
 
-CAMERA = CameraModel(
-    width_px=1280,
-    height_px=1024,
-    fx_px=2400.0,
-    fy_px=2410.0,
-    cx_px=650.0,
-    cy_px=500.0,
-    distortion=Distortion(k1=-0.21, k2=0.13, p1=0.004, p2=-0.003, k3=0.05),
-)
+CAMERA = CameraModel(width_px=1280, height_px=1024, fx_px=2400.0, fy_px=2410.0, cx_px=650.0, cy_px=500.0)
+LENSES = [
+    Distortion(k1=-0.21, k2=0.13, p1=0.004, p2=-0.003, k3=0.05),
+    Distortion(k1=0.31, k2=0.13, p1=0.004, p2=-0.003, k3=0.05, k4=0.52, k5=-0.3, k6=0.2),
+]
 PIXELS = np.random.default_rng(1).uniform([0, 0], [1279, 1023], (20, 2))
 
 
@@ -35,19 +31,20 @@ WATER = 1.333
 
 
 def ideal(values: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Ideal image coordinates (2, N) by OpenCV's iteration; ``values`` are fx, fy, cx, cy, k1, k2, p1, p2, k3."""
+    """Ideal image coordinates (2, N) by OpenCV's iteration; ``values`` are fx, fy, cx, cy, k1, k2, p1, p2, k3 to k6."""
     matrix = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1]])
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     return cv2.undistortPoints(pixels[:, None], matrix, values[4:], criteria=stop)[:, 0].T
 
 
-def test_ideal_coordinates_by_pixel_lens_and_all_five_distortions():
-    d = CAMERA.distortion
-    values = np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px, d.k1, d.k2, d.p1, d.p2, d.k3])
-    found = image_derivatives(CAMERA, PIXELS, ideal(values, PIXELS))
-    assert found.shape == (11, 2, len(PIXELS))
-    for column in range(11):
-        step = np.zeros(11)
+@pytest.mark.parametrize("lens", LENSES, ids=["Brown-Conrady", "rational"])
+def test_ideal_coordinates_by_pixel_lens_and_all_distortions(lens):
+    camera = CAMERA.model_copy(update={"distortion": lens})
+    values = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *lens.model_dump().values()])
+    found = image_derivatives(camera, PIXELS, ideal(values, PIXELS))
+    assert found.shape == (14, 2, len(PIXELS))
+    for column in range(14):
+        step = np.zeros(14)
         step[column] = 1e-2 if column < 6 else 1e-5
 
         def at(sign: float, step: np.ndarray = step) -> np.ndarray:

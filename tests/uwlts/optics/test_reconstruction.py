@@ -22,14 +22,11 @@ from uwlts.optics.window import RayStatus, trace_window
 WATER = 1.3312
 FOCAL_PX = 2358.0
 
-distortions = st.builds(
-    Distortion,
-    k1=st.floats(-0.5, 0.5),
-    k2=st.floats(-0.5, 0.5),
-    k3=st.floats(-0.5, 0.5),
-    p1=st.floats(-0.01, 0.01),
-    p2=st.floats(-0.01, 0.01),
-)
+brown_conrady = {name: st.floats(-0.5, 0.5) for name in ("k1", "k2", "k3")}
+brown_conrady |= {name: st.floats(-0.01, 0.01) for name in ("p1", "p2")}
+# The denominator stays above a third up to r = 1.2, the farthest that is asked for: near a pole roundings grow.
+rational = brown_conrady | {name: st.floats(-0.1, 0.5) for name in ("k4", "k5", "k6")}
+distortions = st.builds(Distortion, **brown_conrady) | st.builds(Distortion, **rational)
 
 
 def camera(*, distortion: Distortion | None = None, focal_px: float = FOCAL_PX) -> CameraModel:
@@ -105,6 +102,21 @@ def test_every_point_the_lens_can_show_is_found_again(distortion, seed):
     # In space the error of 1e-14 is divided by the slope of the distortion, which vanishes at the edge: near it the
     # square root of 1e-14 is left. A second, wrong solution would be off by much more.
     np.testing.assert_allclose(back / back[:, 2:], points[shown], rtol=0, atol=1e-6)
+
+
+def test_a_rational_lens_ends_where_it_folds_or_has_a_pole():
+    # x / (1 + 0.3 x^2) rises up to x = 1.8257, where it is half of that.
+    model, edge = camera(distortion=Distortion(k4=0.3)), math.sqrt(1 / 0.3)
+    x = np.array([0.5, 1.0, 1.8, 1.8257]) * [[1], [-1]]
+    pixels = project(model, np.column_stack([x.ravel(), 0 * x.ravel(), 0 * x.ravel() + 1]))
+    np.testing.assert_allclose(pixels[:, 0], model.cx_px + FOCAL_PX * (x / (1 + 0.3 * x**2)).ravel(), rtol=1e-14)
+    assert np.isnan(project(model, np.array([[1.8259, 0.0, 1.0], [3.0, 0.0, 1.0]]))).all()
+    outside = model.cx_px + FOCAL_PX * edge / 2 * 1.00001
+    assert np.isnan(directions(model, np.array([[outside, model.cy_px]]))).all()
+    # x / (1 - 0.5 x^2) grows beyond all bounds up to x = 1.4142 and comes back from the other side.
+    model = camera(distortion=Distortion(k4=-0.5))
+    assert project(model, np.array([[1.41, 0.0, 1.0]]))[0, 0] > 200 * FOCAL_PX
+    assert np.isnan(project(model, np.array([[1.42, 0.0, 1.0]]))).all()
 
 
 def test_a_fold_of_the_distortion_is_not_shown_as_an_image():

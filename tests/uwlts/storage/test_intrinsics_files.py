@@ -100,6 +100,9 @@ def test_longer_models_pass_where_they_say_no_more(tmp_path: Path):
     entries = {"K": MATRIX, "D": np.r_[COEFFICIENTS, np.zeros(3)]}
     known = read_intrinsics(written(tmp_path / "camera.yaml", entries))
     assert known.distortion == KNOWN.distortion and known.size_px is None
+    rational = {"K": MATRIX, "D": np.r_[COEFFICIENTS, 0.25, -0.125, 0.5, np.zeros(4)]}
+    eight = read_intrinsics(written(tmp_path / "eight.yaml", rational))
+    assert eight.distortion == KNOWN.distortion.model_copy(update={"k4": 0.25, "k5": -0.125, "k6": 0.5})
     four = read_intrinsics(written(tmp_path / "four.yaml", {"K": MATRIX, "D": COEFFICIENTS[:4]}))
     assert four.distortion == KNOWN.distortion.model_copy(update={"k3": 0.0})
 
@@ -112,8 +115,8 @@ def test_longer_models_pass_where_they_say_no_more(tmp_path: Path):
             "distortion model is 'equidistant'; this program's camera is a pinhole",
         ),
         (
-            ROS.replace("plumb_bob", "rational_polynomial").replace("0.03125]", "0.03125, 0.1, 0, 0]"),
-            "8 coefficients .rational or thin-prism model.*no choice of these five equals it",
+            ROS.replace("plumb_bob", "rational_polynomial").replace("0.03125]", "0.03125, 0, 0, 0, 0.1, 0, 0, 0]"),
+            "12 coefficients .thin prism or tilted sensor",
         ),
         (ROS.replace("0.03125]", "0.03125, 0]"), "there are 6 distortion coefficients"),
         (ROS.replace("camera_matrix", "matrix"), "has none of cameramatrix, .* it has imagewidth"),

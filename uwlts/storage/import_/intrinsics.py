@@ -35,7 +35,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
     """Camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
 
     DescriptionError where the file is missing or damaged, has no camera matrix or distortion, or the camera is another
-    than a pinhole with k1, k2, p1, p2, k3.
+    than a pinhole with Brown-Conrady or rational distortion.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -48,7 +48,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
     if model not in _BROWN_CONRADY:
         raise DescriptionError(
             f"{path}: the distortion model is {model!r}; this program's camera is a pinhole with k1, k2, p1, p2, k3 "
-            "(plumb_bob): calibrate with that model"
+            "(plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one of these"
         )
     matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
     if matrix.size != 9:
@@ -144,16 +144,17 @@ def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np
 
 
 def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
-    """k1, k2, p1, p2, k3; further ones of OpenCV's longer models must be zero."""
+    """k1, k2, p1, p2, k3, k4, k5, k6; further ones of OpenCV's longer models must be zero."""
     if len(coefficients) not in (0, 4, 5, 8, 12, 14):
-        raise DescriptionError(f"{path}: there are {len(coefficients)} distortion coefficients; expected 4 or 5")
-    if np.any(coefficients[5:]):
+        raise DescriptionError(f"{path}: there are {len(coefficients)} distortion coefficients; expected 4, 5 or 8")
+    known = dict(zip(Distortion.model_fields, coefficients.tolist(), strict=False))
+    if np.any(coefficients[len(known) :]):
         raise DescriptionError(
-            f"{path}: the distortion has {len(coefficients)} coefficients (rational or thin-prism model); this "
-            "program's camera has k1, k2, p1, p2, k3, and no choice of these five equals it: calibrate with the plain "
-            "model (plumb_bob)"
+            f"{path}: the distortion has {len(coefficients)} coefficients (thin prism or tilted sensor); this "
+            "program's camera has k1, k2, p1, p2, k3, k4, k5, k6: calibrate with one of the models plumb_bob and "
+            "rational_polynomial"
         )
-    return Distortion(**dict(zip(("k1", "k2", "p1", "p2", "k3"), coefficients.tolist(), strict=False)))
+    return Distortion(**known)
 
 
 def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:

@@ -278,13 +278,21 @@ def test_a_target_without_stripes_is_refused(in_water, thesis):
 
 @pytest.mark.parametrize(
     ("errors", "key"),
-    [(ModelErrors(saddle_mm=0.2), TargetParameter.SADDLE), (ModelErrors(stretch=1e-3), TargetParameter.STRETCH_X)],
+    [(ModelErrors(saddle_mm=0.2), TargetParameter.SADDLE), (ModelErrors(stretch=2e-3), TargetParameter.STRETCH_X)],
     ids=["saddle", "stretch"],
 )
 def test_a_target_of_another_form_is_noticed_and_taken_for_uncertain(thesis, errors, key):
-    """Far more than the 0.02 mm and 2e-5 that are stated. Which of rows and columns is right, images do not tell."""
+    """Far more than the 0.02 mm and 2e-5 that are stated. Which of rows and columns is right, images do not tell.
+
+    The stretch is found to 3e-4. So one of 2e-3 is noticed, from 0.7e-3 on, but once in 100,000; found to be a hundred
+    times as large as stated, it is refused.
+    """
     real = drawn_reality(thesis, np.random.default_rng(3), errors=errors)
-    calibration = solve_jointly(evidence(real, thesis, wet=True), options=OPTIONS).calibration
+    try:
+        calibration = solve_jointly(evidence(real, thesis, wet=True), options=OPTIONS).calibration
+    except CalibrationError as refusal:
+        assert key is TargetParameter.STRETCH_X and key.quantity.words in str(refusal)
+        return
     (warning,) = (each for each in calibration.origin().warnings if key.quantity.words in each)
     assert "taken for as uncertain" in warning
     place = list(calibration.joint.parameters).index(key)
