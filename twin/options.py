@@ -70,8 +70,7 @@ class Flaws:
     vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
     """Relative loss of light at the image's farthest corner, beyond that by the cosine's fourth power."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
-    """Relative loss of the lamp's light half the field of view's diagonal away from its spot, beside the camera's axis
-    by half as much."""
+    """Relative loss of the lamp's light half the view's diagonal away from its spot, which lies beside the middle."""
     lamp_and_laser: bool = False
     """Lamp and laser on in every image: stripe and board in one."""
     pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)
@@ -103,7 +102,7 @@ class Flaws:
         DescriptionError for an unknown name, or a strength that is no number, out of its range, or not asked for.
         """
         known = {_written(each.name): each for each in fields(cls)}
-        strengths: dict[str, float] = {}
+        strengths: dict[str, Any] = {}
         for text in texts:
             name, equals, value = text.partition("=")
             if name not in known:

@@ -369,7 +369,7 @@ def record_scene(
             "source": "twin",
             "seed": studio.options.seed,
             "spp": studio.options.spp,
-            "effects": studio.options.names(),
+            "effects": [*studio.options.names()],
             "variant": mi.variant(),
             **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
         },

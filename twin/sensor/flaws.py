@@ -5,6 +5,7 @@ Some are built into the sensor (`as_built`), some change the light on the image 
 """
 
 import math
+from typing import cast
 
 import cv2
 import numpy as np
@@ -85,5 +86,5 @@ def delivered(image: np.ndarray, flaws: Flaws) -> np.ndarray:
         image = cv2.cvtColor(image, cv2.COLOR_BayerRGGB2BGR)
     if flaws.jpeg:
         _, file = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, flaws.jpeg])
-        image = cv2.imdecode(file, cv2.IMREAD_UNCHANGED)
+        image = cast(np.ndarray, cv2.imdecode(file, cv2.IMREAD_UNCHANGED))
     return np.ascontiguousarray(image[..., 2]) if flaws.colour_filter else image
