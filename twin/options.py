@@ -66,7 +66,7 @@ class Flaws:
     """
 
     glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
-    """Share of an image's light that lens and window spread widely over it: veiling glare."""
+    """Share of an image's light that lens and window spread widely over it: veiling glare (ISO 9358)."""
     vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
     """Relative loss of light at the image's farthest corner, beyond that by the cosine's fourth power."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
