@@ -1,12 +1,12 @@
-"""Options of rendering: samples, seed, the effects that are shown, and Mitsuba's variant.
+"""Options of rendering: samples, seed, the effects and flaws that are shown, and Mitsuba's variant.
 
 Call `use_variant` before importing any module of the twin that renders: Mitsuba and Dr.Jit look for libLLVM when they
 are imported.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
 
 from twin.backend.llvm import prepare_llvm
 from uwlts.model.errors import DescriptionError, SetupError
@@ -43,7 +43,7 @@ class Effects:
 
     def names(self) -> list[str]:
         """The effects that are rendered, as a user writes them."""
-        return [f.name.replace("_", "-") for f in fields(self) if getattr(self, f.name)]
+        return [_written(f.name) for f in fields(self) if getattr(self, f.name)]
 
     def without(self, *names: str) -> "Effects":
         """The same with some effects left out; DescriptionError for an unknown name."""
@@ -52,6 +52,78 @@ class Effects:
             if name not in known:
                 raise DescriptionError(f"unknown effect '{name}'; known are {', '.join(known)}")
         return replace(self, **{name.replace("-", "_"): False for name in names})
+
+
+def _flaw(*, off: float, typical: float, least: float, most: float) -> Any:
+    return field(default=off, metadata={"typical": typical, "range": (least, most)})
+
+
+@dataclass(frozen=True)
+class Flaws:
+    """Effects of real recordings that are rendered only where they are asked for, most with a strength.
+
+    DescriptionError where a strength is out of its range.
+    """
+
+    glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
+    """Share of an image's light that lens and window spread widely over it: veiling glare (ISO 9358)."""
+    vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
+    """Relative loss of light at the image's farthest corner, beyond that by the cosine's fourth power."""
+    uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
+    """Relative loss of the lamp's light half the view's diagonal away from its spot, which lies beside the middle."""
+    lamp_and_laser: bool = False
+    """Lamp and laser on in every image: stripe and board in one."""
+    pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)
+    """Focal length in px along y over that along x: pixels so much wider than high."""
+    tangential: float = _flaw(off=0.0, typical=1e-3, least=-0.1, most=0.1)
+    """Added to the tangential distortion p1 of the lens as built."""
+    rolling_shutter: float = _flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
+    """Delay in us from row to row of a rolling shutter, which shows while the stage moves."""
+    jpeg: int = _flaw(off=0, typical=90, least=1, most=100)
+    """Quality of lossy compression; 8-bit images only."""
+    colour_filter: bool = False
+    """A colour image sensor (RGGB) in place of a grey one; its red channel is recorded."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, (least, most) = getattr(self, each.name), each.metadata.get("range", (False, True))
+            if value != each.default and not least <= value <= most:
+                raise DescriptionError(f"{_written(each.name)} is {value:g}; it must be from {least:g} to {most:g}")
+
+    def names(self) -> list[str]:
+        """The flaws that are rendered, as a user writes them."""
+        present = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
+        return [_written(name) + ("" if value is True else f"={value:.9g}") for name, value in present.items()]
+
+    @classmethod
+    def of(cls, *texts: str) -> "Flaws":
+        """Flaws written as NAME, of typical strength, or NAME=STRENGTH.
+
+        DescriptionError for an unknown name, or a strength that is no number, out of its range, or not asked for.
+        """
+        known = {_written(each.name): each for each in fields(cls)}
+        strengths: dict[str, Any] = {}
+        for text in texts:
+            name, equals, value = text.partition("=")
+            if name not in known:
+                raise DescriptionError(f"unknown effect '{name}' to add; known are {', '.join(known)}")
+            flaw = known[name]
+            if "typical" not in flaw.metadata and equals:
+                raise DescriptionError(f"{name} takes no strength; found '{text}'")
+            try:
+                strength = type(flaw.default)(value) if equals else flaw.metadata.get("typical", True)
+            except ValueError as error:
+                kind = "a whole number" if isinstance(flaw.default, int) else "a number"
+                raise DescriptionError(
+                    f"the strength of {name} is '{value}'; expected {kind}, as in {name}={flaw.metadata['typical']:g}"
+                ) from error
+            strengths[flaw.name] = strength
+        return cls(**strengths)
+
+
+def _written(field_name: str) -> str:
+    """The name of an effect as a user writes it."""
+    return field_name.replace("_", "-")
 
 
 ALL = Effects()
@@ -65,6 +137,7 @@ class Options:
     spp: int = 16
     seed: int = 0
     effects: Effects = ALL
+    flaws: Flaws = Flaws()
 
     def __post_init__(self) -> None:
         if not 1 <= self.spp <= 65536:
@@ -73,9 +146,13 @@ class Options:
             raise DescriptionError(f"seed is {self.seed}; it must not be negative")
 
     @classmethod
-    def chosen(cls, *, spp: int, seed: int, without: Sequence[str], ideal: bool) -> "Options":
-        """Options with some effects, or with ``ideal`` all of them, left out."""
-        return cls(spp, seed, (NONE if ideal else ALL).without(*without))
+    def chosen(cls, *, spp: int, seed: int, effects: Sequence[str], without: Sequence[str], ideal: bool) -> "Options":
+        """Options with flaws added by ``effects``, and some effects, or with ``ideal`` all of them, left out."""
+        return cls(spp, seed, (NONE if ideal else ALL).without(*without), Flaws.of(*effects))
+
+    def names(self) -> list[str]:
+        """All that is rendered beside geometry, refraction and extinction, as a user writes it."""
+        return [*self.effects.names(), *self.flaws.names()]
 
 
 def use_variant(name: str = CPU) -> str:

@@ -555,6 +555,9 @@ def test_truth_of_another_scan(fails, folder: Path, tmp_path: Path):
         ("plane --sensor sensor.toml --spp 0 --out x.h5", "spp is 0"),
         ("plane --sensor sensor.toml --seed -1 --out x.h5", "seed is -1"),
         ("plane --sensor sensor.toml --out missing/x.h5", "missing does not exist"),
+        ("plane --effects glare bloom=2 --out x.h5", "unknown effect 'bloom' to add; known are glare, vignetting"),
+        ("plane --effects jpeg=900 --out x.h5", "jpeg is 900; it must be from 1 to 100"),
+        ("plane --effects glare=much --out x.h5", "the strength of glare is 'much'; expected a number"),
     ],
 )
 def test_simulation_that_cannot_be(fails, folder: Path, monkeypatch, options: str, says: str):

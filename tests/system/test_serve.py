@@ -186,6 +186,14 @@ def test_a_detector_of_more_bits_is_refused(board, sensor):
         pass
 
 
+def test_lamp_and_laser_at_once_are_refused(board, sensor):
+    with (
+        pytest.raises(DescriptionError, match="lamp-and-laser cannot be served, as the controller switches the laser"),
+        serve(board, sensor=sensor, effects=["lamp-and-laser"]),
+    ):
+        pass
+
+
 # Faults
 
 

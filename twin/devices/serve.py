@@ -275,6 +275,7 @@ def serve(
     water: float | str | None = None,
     spp: int = 16,
     seed: int = 0,
+    effects: Sequence[str] = (),
     without: Sequence[str] = (),
     ideal: bool = False,
     stage_start: float | None = None,
@@ -295,10 +296,12 @@ def serve(
         Name or path of the sensor description that the sensor's software will be given.
     placement
         Named place of the objects, such as near, standoff or far.
+    effects
+        Effects of real images to add, as for `simulate`, but for lamp-and-laser: the controller switches the laser.
     without
         Effects to leave out, as for `simulate`; a moving stage does not blur the image in any case.
     ideal
-        Leave out all effects: a pinhole's sharp image without noise.
+        Leave out all of these: a pinhole's sharp image without noise.
     stage_start
         Stage position in mm at which the scene's motion starts; the middle of the travel is used unless given. There
         the stage stands at first.
@@ -330,7 +333,9 @@ def serve(
         Aravis is not installed, or Mitsuba cannot use the variant.
     """
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
-    options = Options.chosen(spp=spp, seed=seed, without=without, ideal=ideal)
+    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    if options.flaws.lamp_and_laser:
+        raise DescriptionError("lamp-and-laser cannot be served, as the controller switches the laser: leave it out")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
     _, built = choose_sensors(sensor, as_built)

@@ -61,9 +61,8 @@ class LensRays:
 
     def directions(self, x: Float, y: Float) -> Vector3f:
         """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
-        focal = self.camera.focal_length_px()
-        cx, cy = self.camera.principal_point()
-        true = self._undistorted(mi.Point2f((x - cx) / focal, (y - cy) / focal))
+        (fx, fy), (cx, cy) = self.camera.focal_lengths_px(), self.camera.principal_point()
+        true = self._undistorted(mi.Point2f((x - cx) / fx, (y - cy) / fy))
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
     def _undistorted(self, seen: Point2f) -> Point2f:
@@ -201,6 +200,11 @@ class CameraView:
             dr.eval(bundle.origin, bundle.direction, bundle.weight)
             self._grids[spacing] = bundle, (rows, columns)
         return self._grids[spacing]
+
+    def slopes(self, p: Point3f) -> Point2f:
+        """Slopes (x / z, y / z) in the camera frame of the straight lines from the pupil to points of the OCS."""
+        seen = mi.Transform4f(mi.Matrix4f(self._camera_from_object)) @ mi.Point3f(p)
+        return mi.Point2f(seen.x / seen.z, seen.y / seen.z)
 
     def depth_mm(self, p: Point3f) -> Float:
         """Depth z in the camera frame of points of the OCS."""

@@ -46,6 +46,8 @@ _MIRRORS = 2
 """Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
+_SPOT_ASIDE = 0.25
+"""Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
 
@@ -75,11 +77,14 @@ class LaserFrame:
 class Renderer:
     """One sensor in one medium before one scene.
 
+    ``uneven_lamp`` is the relative loss of the lamp's light away from its spot (`Flaws.uneven_lamp`).
     DesignError or DescriptionError where the sensor cannot work in the medium, or an object cannot be built.
     """
 
-    def __init__(self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL):
-        self.design = check_design(sensor, medium)
+    def __init__(
+        self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL, uneven_lamp: float = 0.0
+    ):
+        self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
         self.sensor, self.medium, self.effects = sensor, medium, effects
         wavelength = sensor.laser.wavelength_nm
         self.objects = build_objects(
@@ -100,25 +105,26 @@ class Renderer:
     ) -> np.ndarray:
         """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
 
-        With "day" laser and lamp are off.
+        With "laser" that is the laser's light and the day's; with "day" laser and lamp are off.
         ``spp`` samples are taken per lit pixel, the same places in every pixel; ``seed`` chooses the random walks.
         Equal arguments give equal images.
         """
         if light == "laser":
-            return self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
+            day = self.irradiance("day", scene_from_object, spp=spp, travel=travel)
+            return day + self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
+        if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
+            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
 
     def laser_frame(
         self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> LaserFrame:
-        """The light of the laser, and of the day if there is any, on the image sensor; see `irradiance`."""
+        """The light of the laser on the image sensor; see `irradiance`."""
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, image = self._laser_nodes(pose, direct, mirrored)
         walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
         self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
-        if self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0:
-            image += self._lamp_frame(pose, spp=spp, ambient=True)
         rows, columns = np.nonzero(self._repeated(lit))
         facts = [
             self._fine(self._stripe_sums, pose, r, c, direct + mirrored, spp=spp)
@@ -299,7 +305,21 @@ class Renderer:
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += scattered / self.scattering.extinction * (1 - left)
+        if self._uneven_lamp and not ambient:
+            radiance *= self._lamp_share(segment)
         return (segment.weight * level * radiance,)
+
+    def _lamp_share(self, segment: RaySegment) -> Float:
+        """Share of the lamp's light where camera rays end: a round Gaussian spot about the lamp's axis.
+
+        Towards the slope of the view's corner away from that axis, `Flaws.uneven_lamp` of it is lost.
+        """
+        length = dr.select(segment.valid, segment.si.t, self.design.standoff_mm)
+        x, y = self.view.slopes(mi.Point3f(segment.origin + segment.direction * length))
+        camera = self.sensor.camera
+        corner = math.hypot(camera.width_px, camera.height_px) / 2 / camera.focal_length_px()
+        squared = dr.square(x / corner - _SPOT_ASIDE) + dr.square(y / corner)
+        return dr.exp(math.log(1 - self._uneven_lamp) * squared)
 
     # --- pixels -------------------------------------------------------------------------------------------------------
 

@@ -1,12 +1,12 @@
 """Records whole campaigns: all recordings of a seed, several at a time, resumed where an earlier run was stopped."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from twin.options import CPU, Options, Variant, use_variant
+from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
 from uwlts.model.errors import DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
@@ -25,6 +25,7 @@ def record(
     seed: int = 0,
     every: int = 1,
     spp: int = 16,
+    effects: Sequence[str] = (),
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
@@ -48,7 +49,7 @@ def record(
         Recordings rendered at a time; as many as there are processors unless given.
     overwrite
         Render everything anew.
-    spp, variant
+    spp, effects, variant
         As for `simulate`.
     show_progress
         Draw a progress bar on the terminal.
@@ -66,8 +67,9 @@ def record(
         if value < least:
             raise DescriptionError(f"{name} is {value}; it must be at least {least}")
     described, folder = load_campaign(campaign), Path(out)
-    jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant)
-    plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed}
+    flaws = Flaws.of(*effects)
+    jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant, flaws=flaws)
+    plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed, "effects": flaws.names()}
     with progress_bar(f"rendering {described.title}", shown=show_progress) as progress:
         _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
     return folder
@@ -114,7 +116,7 @@ def record_campaigns(
     jobs = [
         job
         for seed, place in zip(seeds, folders, strict=True)
-        for job in _jobs(campaign, place, seed=seed, every=every, spp=spp, variant=variant)
+        for job in _jobs(campaign, place, seed=seed, every=every, spp=spp, variant=variant, flaws=Flaws())
     ]
     plan = _plan(campaign, every=every, spp=spp, variant=variant)
     _record_all(
@@ -123,9 +125,11 @@ def record_campaigns(
     return folders
 
 
-def _jobs(campaign: Campaign, place: Path, *, seed: int, every: int, spp: int, variant: str) -> list[_Job]:
+def _jobs(
+    campaign: Campaign, place: Path, *, seed: int, every: int, spp: int, variant: str, flaws: Flaws
+) -> list[_Job]:
     return [
-        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed), variant)
+        _Job(take, place / f"{take.name}.h5", Options(spp=spp, seed=take.seed, flaws=flaws), variant)
         for take in takes(campaign, seed=seed, every=every)
     ]
 

@@ -65,6 +65,7 @@ def render(
     spp: int = 16,
     seed: int = 0,
     water: float | str | None = None,
+    effects: Sequence[str] = (),
     without: Sequence[str] = (),
     ideal: bool = False,
     frames: Sequence[int] | None = None,
@@ -76,7 +77,7 @@ def render(
     ----------
     frames
         Numbers of the scan's images to render, from 0 on; all of them unless given.
-    scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
+    scene, sensor, as_built, placement, medium, spp, seed, water, effects, without, ideal, variant
         As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
 
     Raises
@@ -86,7 +87,7 @@ def render(
     """
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     _, built = choose_sensors(sensor, as_built)
-    options = Options.chosen(spp=spp, seed=seed, without=without, ideal=ideal)
+    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     shots = list(enumerate(described.motion.shots()))
     if frames is not None:
         if not frames or not all(0 <= number < len(shots) for number in frames):
@@ -119,6 +120,7 @@ def simulate(
     spp: int = 16,
     seed: int = 0,
     water: float | str | None = None,
+    effects: Sequence[str] = (),
     without: Sequence[str] = (),
     ideal: bool = False,
     resume: bool = False,
@@ -151,11 +153,15 @@ def simulate(
     water
         What floats in the water, in place of the medium's own: pure, clear, coastal, harbour, jerlov-I to jerlov-9C,
         or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
+    effects
+        Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
+        uneven-lamp=0.6, lamp-and-laser, pixel-aspect=1.002, tangential=0.001, rolling-shutter=10 (us per row),
+        jpeg=90, colour-filter.
     without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.
     ideal
-        Leave out all of these effects: a pinhole's sharp image without noise.
+        Leave out all of these: a pinhole's sharp image without noise.
     resume
         Go on with an interrupted run.
     overwrite
@@ -189,7 +195,7 @@ def simulate(
         raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
     described = [choose_scene(scene, placement=place, medium=medium, water=water) for place in places]
     nominal, built = choose_sensors(sensor, as_built)
-    options = Options.chosen(spp=spp, seed=seed, without=without, ideal=ideal)
+    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     use_variant(variant)
     from twin.recording.studio import record_scene
 

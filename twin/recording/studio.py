@@ -19,6 +19,7 @@ from twin.options import Options
 from twin.scene.description import Light, Printed, Scene, Shot, altered
 from twin.scene.finish import shift_points
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
+from twin.sensor.flaws import as_built, delivered, laser_shares, veiled, vignette
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
 from uwlts.model.library import validated
@@ -79,13 +80,18 @@ class Studio:
     """A sensor before a scene, ready to take shots; exposures are settled once, before the first."""
 
     def __init__(self, sensor: Sensor, scene: Scene, options: Options):
-        self.sensor = with_window(sensor, mounted=sensor.camera.window.mounted and scene.window_mounted)
+        flaws, mounted = options.flaws, sensor.camera.window.mounted and scene.window_mounted
+        self.sensor = as_built(with_window(sensor, mounted=mounted), flaws)
         self.scene, self.options = scene, options
         self.medium = medium_of(sensor, scene)
-        self.renderer = Renderer(self.sensor, self.medium, scene, effects=options.effects)
+        self.renderer = Renderer(
+            self.sensor, self.medium, scene, effects=options.effects, uneven_lamp=flaws.uneven_lamp
+        )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
+        self._vignette = vignette(camera, flaws.vignetting) if flaws.vignetting else 1.0
+        self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else 1.0
         self._pattern = None
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
@@ -126,13 +132,28 @@ class Studio:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) of a shot."""
-        if shot.light == "day" and not (self.options.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
-            return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        if shot.light != "laser":
-            return self._electrons(self.renderer.irradiance(shot.light, self.pose(shot), spp=spp, travel=travel))
+        others = "lamp" if self._shows(shot, "lamp") else "day"
+        light = self._through_lens(self.renderer.irradiance(others, self.pose(shot), spp=spp, travel=travel))
+        if self._shows(shot, "laser"):
+            laser_light = self._laser_light(shot, spp=spp, seed=seed, travel=travel)
+            light += self._laser_shares * self._through_lens(laser_light)
+        sensor = self.sensor
+        return electrons_per_ms(light, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
+
+    def _shows(self, shot: Shot, light: Light) -> bool:
+        """Whether a shot is taken with the laser or the lamp on."""
+        return shot.light == light or (self.options.flaws.lamp_and_laser and shot.light != "day")
+
+    def _through_lens(self, irradiance: np.ndarray) -> np.ndarray:
+        """Irradiance (H, W) behind a lens with vignetting and glare."""
+        passed, glare = irradiance * self._vignette, self.options.flaws.glare
+        return veiled(passed, glare) if glare else passed
+
+    def _laser_light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> np.ndarray:
+        """Irradiance (H, W) of the laser's light in W/mm2, with its speckle."""
         frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
         if not self.options.effects.speckle:
-            return self._electrons(frame.irradiance())
+            return frame.irradiance()
         laser = self.sensor.laser
         contrast = coherence(
             frame.roughness_um,
@@ -143,11 +164,7 @@ class Studio:
         factors = self._speckle.factors(
             frame.rows, frame.columns, travel_mm=shot.travelled_mm, polarisation=frame.polarisation, coherence=contrast
         )
-        return self._electrons(frame.irradiance(factors))
-
-    def _electrons(self, irradiance: np.ndarray) -> np.ndarray:
-        sensor = self.sensor
-        return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
+        return frame.irradiance(factors)
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Image number ``index`` of the scan with what a capture records of it."""
@@ -172,13 +189,14 @@ class Studio:
     def detected(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
         """Grey values (H, W) of mean photo-electrons (H, W), with the noise of a seed if noise is rendered."""
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
-        return grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
+        image = grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
+        return delivered(image, self.options.flaws)
 
     def truth(self, shot: Shot) -> "FrameTruth":
         """Ground truth of every profile line of a shot."""
-        if shot.light != "laser":
+        if not self._shows(shot, "laser"):
             return no_stripe(self.sensor.camera.lines())
-        return true_stripe(self.renderer, self.pose(shot), travel=self.travel("laser"))
+        return true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot.light))
 
     def _shift_points(self, shot: Shot, index: int) -> None:
         """Move the points of a target with errors of detection to where this image shows them."""
@@ -351,7 +369,7 @@ def record_scene(
             "source": "twin",
             "seed": studio.options.seed,
             "spp": studio.options.spp,
-            "effects": [*studio.options.effects.names()],
+            "effects": [*studio.options.names()],
             "variant": mi.variant(),
             **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
         },

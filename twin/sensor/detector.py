@@ -43,7 +43,7 @@ _SEVERAL = 255
 
 def electrons_per_ms(irradiance: np.ndarray, camera: Camera, detector: Detector, *, wavelength_nm: float) -> np.ndarray:
     """Mean photo-electrons per ms and pixel for an irradiance in W/mm2 (EMVA 1288 release 4, Eq. 4)."""
-    area_mm2 = (1e-3 * camera.pixel_size_um) ** 2
+    area_mm2 = (1e-3 * camera.pixel_size_um) ** 2 / camera.pixel_aspect
     photons_per_joule = 1e-9 * wavelength_nm / PLANCK_TIMES_LIGHT
     return irradiance * np.float32(1e-3 * area_mm2 * photons_per_joule * detector.quantum_efficiency)
 

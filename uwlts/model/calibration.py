@@ -66,10 +66,10 @@ class CameraModel(Description):
     @classmethod
     def described(cls, camera: Camera, *, magnified: float = 1.0) -> "CameraModel":
         """A camera as described; with a focal length ``magnified`` by refraction the distortion is not known: zero."""
-        f, (cx, cy) = camera.focal_length_px() * magnified, camera.principal_point()
+        (fx, fy), (cx, cy) = camera.focal_lengths_px(), camera.principal_point()
         size = {"width_px": camera.width_px, "height_px": camera.height_px}
         distortion = camera.distortion if magnified == 1.0 else Distortion()
-        return cls(**size, fx_px=f, fy_px=f, cx_px=cx, cy_px=cy, distortion=distortion)
+        return cls(**size, fx_px=fx * magnified, fy_px=fy * magnified, cx_px=cx, cy_px=cy, distortion=distortion)
 
     def matrix(self) -> np.ndarray:
         """Camera matrix K (3, 3)."""

@@ -122,12 +122,13 @@ class Camera(Description):
 
     ``stripe_along`` is the side of the image along which the laser stripe runs: "width" (1280 in the thesis's camera,
     one peak per column) or "height" (1024, one peak per row). It also places the laser: above the camera (-y) for
-    "width", to its right (+x) for "height".
+    "width", to its right (+x) for "height". A pixel is ``pixel_size_um`` wide, ``pixel_aspect`` times its height.
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
     pixel_size_um: Positive
+    pixel_aspect: Annotated[float, Field(ge=0.9, le=1.1)] = 1.0
     focal_length_mm: Positive
     principal_point_px: tuple[float, float] | None = None
     distortion: Distortion = Distortion()
@@ -141,8 +142,12 @@ class Camera(Description):
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
     def focal_length_px(self) -> float:
-        """Focal length in pixels."""
+        """Focal length in pixels, along x where they are not square."""
         return 1e3 * self.focal_length_mm / self.pixel_size_um
+
+    def focal_lengths_px(self) -> tuple[float, float]:
+        """Focal lengths in pixels along x and y."""
+        return self.focal_length_px(), self.pixel_aspect * self.focal_length_px()
 
     def lines(self) -> int:
         """Number of profile lines in an image: its columns if the stripe runs along the width, else its rows."""

@@ -45,6 +45,7 @@ SENSORS = {
     "tilted": ("water", {"camera": {"window": {"tilt_x_deg": 5.0, "tilt_y_deg": -5.0, "aperture_diameter_mm": 80.0}}}),
     "thick": ("water", {"camera": {"window": {"distance_mm": 15.0, "thickness_mm": 25.0, "glass": 1.75}}}),
     "distorted": ("water", {"camera": {"distortion": STRONG}}),
+    "oblong": ("water", {"camera": {"pixel_aspect": 1.05, "principal_point_px": (646.2, 505.9)}}),
     "upright": ("water", {"camera": {"stripe_along": "height"}, "laser": {"triangulation_angle_deg": 38.0}}),
     "air": ("air", {"camera": {"window": {"mounted": False}}}),
     "air, window": ("air", {}),
@@ -67,8 +68,9 @@ def image_points(camera: Camera, count: int = 200) -> np.ndarray:
 
 def opencv_matrix(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Camera matrix and coefficients as OpenCV takes them."""
-    focal, (cx, cy), d = camera.focal_length_px(), camera.principal_point(), camera.distortion
-    return np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]]), np.array(list(d.model_dump().values()))
+    fx, (cx, cy), d = camera.focal_length_px(), camera.principal_point(), camera.distortion
+    matrix = np.array([[fx, 0, cx], [0, camera.pixel_aspect * fx, cy], [0, 0, 1.0]])
+    return matrix, np.array(list(d.model_dump().values()))
 
 
 def opencv_directions(camera: Camera, pixels: np.ndarray) -> np.ndarray:

@@ -39,8 +39,8 @@ def coarse(thesis: Sensor) -> Sensor:
 def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
     """Image points (N, 2) of points (N, 3) of the OCS by least time and OpenCV's lens."""
     camera, d = sensor.camera, sensor.camera.distortion
-    focal, (cx, cy) = camera.focal_length_px(), camera.principal_point()
-    matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
+    fx, (cx, cy) = camera.focal_length_px(), camera.principal_point()
+    matrix = np.array([[fx, 0, cx], [0, camera.pixel_aspect * fx, cy], [0, 0, 1.0]])
     rays = oracle_paths(sensor, medium, points)[0]
     return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(list(d.model_dump().values())))[0][:, 0]
 
@@ -74,6 +74,7 @@ SENSORS = {
         "distortion": {"k1": -0.15, "k2": 0.1, "p1": 0.002, "p2": -0.003},
         "principal_point_px": (640.3, 519.2),
     },
+    "oblong": {"pixel_aspect": 1.05},
     "upright": {"stripe_along": "height"},
 }
 

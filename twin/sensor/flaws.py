@@ -1,0 +1,90 @@
+"""What real recordings show beside the effects of an ordinary rendering; see `twin.options.Flaws`.
+
+Some are built into the sensor (`as_built`), some change the light on the image sensor (`vignette`, `veiled`,
+`laser_shares`), and some what the camera makes of its grey values (`delivered`).
+"""
+
+import math
+from typing import cast
+
+import cv2
+import numpy as np
+from scipy.signal import fftconvolve
+
+from twin.options import Flaws
+from uwlts.model.errors import DescriptionError
+from uwlts.model.library import merged, validated
+from uwlts.model.sensor import Camera, Sensor
+
+GLARE_REACH = 0.15
+"""Distance over which glare falls to 1 / e, as a share of the image's width: assumed, as wide as a veil looks."""
+_CELLS_PER_REACH = 16
+"""The veil is as smooth as its kernel: cells of a sixteenth of its reach show it to some 1e-3 of itself."""
+LASER_SHARES = {"red": 1.0, "green": 0.083, "blue": 0.008}
+"""Laser light at 635 nm that pixels behind filters see against a red one: 0.041 and 0.004 against 0.496 of the Nikon
+D5100 (Darrodi et al. 2015, J. Opt. Soc. Am. A 32, 381). Filters of machine vision cameras may separate less."""
+_RGGB = (("red", "green"), ("green", "blue"))
+
+
+def as_built(sensor: Sensor, flaws: Flaws) -> Sensor:
+    """The sensor with the flaws of its pixels, its lens and its shutter; DescriptionError where it cannot have them."""
+    if flaws.jpeg and sensor.detector.bits != 8:
+        raise DescriptionError(
+            f"jpeg holds 8-bit images, the sensor '{sensor.name}' gives {sensor.detector.bits} bits: take a sensor "
+            "with detector.bits = 8, or leave jpeg out"
+        )
+    camera = sensor.camera
+    built = {"pixel_aspect": camera.pixel_aspect * flaws.pixel_aspect}
+    lens = {"p1": camera.distortion.p1 + flaws.tangential}
+    shutter = {"shutter": "rolling", "line_time_us": flaws.rolling_shutter} if flaws.rolling_shutter else {}
+    changes = {"camera": built | {"distortion": lens}, "detector": shutter}
+    return validated(Sensor, merged(sensor.model_dump(), changes), f"{sensor.name} with {', '.join(flaws.names())}")
+
+
+def vignette(camera: Camera, loss: float) -> np.ndarray:
+    """Shares (H, W), float32, of the light that passes the lens's mounts: 1 - loss (r / R)^2.
+
+    r is the distance from the principal point, R that of the farthest corner.
+    """
+    cx, cy = camera.principal_point()
+    y, x = np.ogrid[: camera.height_px, : camera.width_px]
+    squared = (x - cx) ** 2 + (y - cy) ** 2
+    return (1 - loss * squared / squared.max()).astype(np.float32)
+
+
+def veiled(light: np.ndarray, share: float) -> np.ndarray:
+    """Light (H, W), a share of which is spread by exp(-r / w) / (2 pi w^2) with w = `GLARE_REACH` image widths.
+
+    No light is lost but what falls beyond the image's borders.
+    """
+    height, width = light.shape
+    cell = max(1, int(GLARE_REACH * width / _CELLS_PER_REACH))
+    rows, columns = -(-height // cell), -(-width // cell)
+    padded = np.pad(light, ((0, rows * cell - height), (0, columns * cell - width)))
+    coarse = cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_AREA)
+    y, x = np.ogrid[1 - rows : rows, 1 - columns : columns]
+    cell_per_reach = cell / (GLARE_REACH * width)
+    kernel = np.exp(-np.hypot(x, y) * cell_per_reach) * cell_per_reach**2 / (2 * math.pi)
+    veil = np.maximum(fftconvolve(coarse, kernel, mode="same"), 0).astype(np.float32)
+    veil = cv2.resize(veil, padded.shape[::-1], interpolation=cv2.INTER_LINEAR)[:height, :width]
+    return np.float32(1 - share) * light + np.float32(share) * veil
+
+
+def laser_shares(height: int, width: int) -> np.ndarray:
+    """Shares (H, W), float32, of laser light at 635 nm behind the filters of a colour image sensor (RGGB)."""
+    cell = np.array([[LASER_SHARES[colour] for colour in row] for row in _RGGB], np.float32)
+    return np.tile(cell, (-(-height // 2), -(-width // 2)))[:height, :width]
+
+
+def delivered(image: np.ndarray, flaws: Flaws) -> np.ndarray:
+    """Grey values (H, W) as the camera gives them: of a colour camera the red channel, compressed or not.
+
+    Colours between the pixels of a filter are interpolated linearly. A compressed colour image keeps brightness at
+    every pixel and colours at every second one only (4:2:0), so that light of one colour is blurred.
+    """
+    if flaws.colour_filter:
+        image = cv2.cvtColor(image, cv2.COLOR_BayerRGGB2BGR)
+    if flaws.jpeg:
+        _, file = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, flaws.jpeg])
+        image = cast(np.ndarray, cv2.imdecode(file, cv2.IMREAD_UNCHANGED))
+    return np.ascontiguousarray(image[..., 2]) if flaws.colour_filter else image
