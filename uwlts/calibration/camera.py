@@ -1,5 +1,6 @@
 """Camera parameters and target poses from images of a flat target, by the stage's displacements or by free poses."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -224,8 +225,12 @@ def solve_camera(
             local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
 
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
+            if group == len(views):
+                return _known_before(intrinsics, global_values)
             return observe(views[group], intrinsics, global_values, local)
 
+        if options.tangential is not None:
+            local = [*local, np.empty(0)]
         fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
         _refuse_undetermined(fit, intrinsics)
         return _solution(images, views, fit, intrinsics, poses)
@@ -247,6 +252,13 @@ def solve_camera(
         f"the offsets of the circles' images did not settle in {_BIAS_ROUNDS} rounds: is the circles' diameter "
         f"{circle_diameter_mm:g} mm?"
     )
+
+
+def _known_before(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
+    """What is known of p1 and p2 before, as residuals in px."""
+    std, sigma_px = intrinsics.options.tangential or (math.inf, 0.0)
+    by_global = np.array([[float(name == own) for name in intrinsics.names] for own in ("p1", "p2")]) * (sigma_px / std)
+    return Observation(by_global @ global_values[:, None], by_global, np.empty((2, 0)))
 
 
 def centre_offsets(
@@ -312,7 +324,8 @@ def _solution(
 ) -> CameraSolution:
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
     residuals = [np.empty((0, 2))] * len(images)
-    for view, local, covariance, misses in zip(views, fit.local, fit.local_covariances, fit.residuals, strict=True):
+    # What is known before is a group of its own, the last.
+    for view, local, covariance, misses in zip(views, fit.local, fit.local_covariances, fit.residuals, strict=False):
         rotation = cv2.Rodrigues(local[:3])[0]
         directions.append(rotation @ view.direction(local[6:]))
         for index in np.unique(view.image):

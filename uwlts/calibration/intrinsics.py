@@ -19,6 +19,8 @@ class CameraOptions:
     distortion: tuple[str, ...] = ("k1", "k2")  # those of k1 to k6, p1 and p2 that are estimated; others are zero
     square_pixels: bool = True  # whether fx and fy are one focal length f
     principal_point_px: tuple[float, float] | None = None  # (cx, cy), optional; given, it is not estimated
+    tangential: tuple[float, float] | None = None  # known before: standard deviation of p1 and p2 about zero, and the
+    # points' in px, over which it is weighed; optional
     soft_limit_px: float | None = None  # distances well beyond it count linearly ("soft L1") rather than squared
 
     def __post_init__(self) -> None:

@@ -2,7 +2,8 @@
 
 Misses of the points of one image go together where the model is not perfect. So a model is chosen by how well it
 predicts images that it was not calibrated from, an image is judged by how far it moves the parameters, and the
-uncertainties follow from what leaving out one image after the other does (the delete-one-group jackknife).
+uncertainties follow from what leaving out one image after the other does (the delete-one-group jackknife). Tangential
+distortion that prediction does not ask for is small, but not known to be zero, and moves the principal point.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from uwlts.calibration.target_images import TargetImage
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
+from uwlts.model.sensor import Uncertainty
 
 _DISTORTIONS = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2", "k3"))
 _RATIONAL = (("k1", "k2", "k4", "k5"), ("k1", "k2", "p1", "p2", "k4", "k5"))  # tried where k3 helps
@@ -27,6 +29,7 @@ _WORSE = 1.0  # standard errors of the mean difference of squares; below, a mode
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
 _SOFT, _OUTLIER = 2.0, 5.0  # robust standard deviations from where a point counts less, and not at all
 _LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
+_LEAST_SCATTER_PX = 1e-6  # of points; drawn ones may have none
 _MOVED = 3.0  # standard uncertainties by which one image may move a parameter
 _FEWEST_IMAGES, _LARGEST_LEFT_OUT = 5, 0.2
 
@@ -36,10 +39,14 @@ Pixels = Literal["auto", "square", "free"]
 
 @dataclass(frozen=True)
 class LensChoice:
-    """What of a lens is estimated; "auto" chooses by prediction of images left out."""
+    """What of a lens is estimated; "auto" chooses by prediction of images left out.
+
+    Where p1 and p2 are not chosen, they are estimated as known to be zero but for a standard deviation ``tangential``.
+    """
 
     distortion: Distortion = "auto"
     pixels: Pixels = "auto"
+    tangential: float = Uncertainty().tangential
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,7 @@ class LensCalibration:
     rejected_share : share of the points that were left out, of the images used
     without : (F,); the solutions from all images used but one, None where they determine none
     candidates : models compared; none if the model was given
+    options : the model that was taken
     covariance : (P, P); of the parameters, with the misses of an image taken to go together
     """
 
@@ -100,8 +108,9 @@ class LensCalibration:
     def values(self) -> dict[str, float]:
         """Every estimated parameter."""
         model = self.solution.model
-        intrinsics = Intrinsics(self.options, width_px=model.width_px, height_px=model.height_px)
-        return dict(zip(intrinsics.names, intrinsics.from_model(model).tolist(), strict=True))
+        known = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
+        known |= model.distortion.model_dump()
+        return {name: known[name] for name in self.solution.parameters}
 
     def std(self) -> dict[str, float]:
         """Standard uncertainty of every estimated parameter."""
@@ -176,14 +185,24 @@ def calibrate_lens(
         for number, inside in enumerate(keep)
         if not _fits(inside)
     }
-    intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
     used = [number for number in range(len(images)) if number not in left_out]
     cleaned = {number: _without_outliers(images[number], keep[number]) for number in used}
+    full = options
+    if (
+        choice.distortion == "auto"
+        and poses != "stage-normal"
+        and choice.tangential > 0
+        and "p1" not in full.distortion
+    ):
+        scatter = _scatter(solved([*cleaned.values()], options, circles=True))
+        names = (*options.distortion, "p1", "p2")
+        full = replace(options, distortion=names, tangential=(choice.tangential, max(scatter, _LEAST_SCATTER_PX)))
+    intrinsics = Intrinsics(full, width_px=width_px, height_px=height_px)
     while True:
         chosen = [cleaned[number] for number in used]
-        solution = solved(chosen, options, circles=True)
+        solution = solved(chosen, full, circles=True)
         centred = _centred(chosen, solution)
-        without = _without_one(centred, solution, lambda i, s: solved(i, options, s, circles=False))
+        without = _without_one(centred, solution, lambda i, s: solved(i, full, s, circles=False))
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
         others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])

@@ -255,7 +255,7 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
         height_px=height_px,
         poses=options.poses,
         approaching=approaching,
-        choice=options.lens,
+        choice=replace(options.lens, tangential=evidence.sensor.uncertainty.tangential),
         circle_diameter_mm=diameter_mm,
     )
     camera, used, names = (

@@ -79,6 +79,28 @@ def test_what_is_given_is_not_chosen():
     assert found.candidates == [] and found.solution.parameters == ("fx", "fy", "cx", "cy", "k1")
 
 
+def test_tangential_distortion_that_is_not_needed_is_known_to_be_small():
+    images = views(3, count=8, distortion=(-0.2, 0.3, 2e-4, -1e-4, 0.0))
+
+    def found(distortion, std):
+        return calibrate_lens(images, width_px=WIDTH, height_px=HEIGHT, choice=LensChoice(distortion, "square", std))
+
+    auto, none, free = found("auto", 5e-4), found(("k1", "k2"), 5e-4), found(("k1", "k2", "p1", "p2"), 5e-4)
+    assert auto.name == "k1 k2, square pixels" and {"p1", "p2"} <= auto.std().keys() and "p1" not in none.std()
+    # Something is known before, so they are known better than images tell, and zero is not known for sure.
+    for name in ("p1", "p2"):
+        assert auto.std()[name] < min(5e-4, free.std()[name])
+        assert abs(auto.values()[name]) < abs(free.values()[name])
+    for name in ("cx", "cy"):
+        assert none.std()[name] < auto.std()[name] < free.std()[name]
+    # Nearly sure to be zero, and not known at all.
+    for std, same in ((1e-9, none), (1e3, free)):
+        limit = found("auto", std)
+        for name, value in same.values().items():
+            assert limit.values()[name] == pytest.approx(value, abs=1e-3 * same.std()[name])
+            assert limit.std()[name] == pytest.approx(same.std()[name], rel=5e-3)
+
+
 def test_an_image_of_another_board_is_left_out_and_named():
     images = views(5)
     images[7] = replace(images[7], points_mm=images[7].points_mm * [1.04, 1.0, 1.0])
