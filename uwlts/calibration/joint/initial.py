@@ -304,7 +304,7 @@ def surface_scan(
         view=stripes.view,
         pixels=pixels[kept],
         across=across,
-        sources={image + n: f"{stripes.source}, at {position:g} mm" for n, position in enumerate(position_mm)},
+        sources={image + n: stripes.image_names()[place] for n, place in enumerate(frames)},
         beside_mm=rotation @ beside[kept].T,
         common_px=np.hypot(BLUR_STD * stripes.blur_px[kept], beside_std(sensor.uncertainty) * np.nan_to_num(beside_px)),
         surface=surface,
@@ -352,7 +352,7 @@ def _surface(
     rotation = transform[:3, :3]
 
     def std(expanded_mm: float | None) -> float:
-        """Standard uncertainty of a certificate's expanded one; infinite where it states none."""
+        """Standard uncertainty of a certificate's expanded one; infinite where it states none, or does not count."""
         return expanded_mm / 2 if sizes_known and expanded_mm else np.inf
 
     def in_camera(point_mm: Sequence[float]) -> np.ndarray:
