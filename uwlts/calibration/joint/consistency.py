@@ -59,6 +59,9 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
             check = "the medium and the step's height in the captures, or --index"
         case StepHeight():
             check = "which standard it is"
+            if value > known:
+                turn = np.degrees(np.arccos(known / value))
+                check += f", and whether it faces the laser: turned by {turn:.1f}° about the stripe it seems so high"
         case LensParameter() | WindowParameter() | SheetParameter() | StageParameter() | TargetParameter():
             check = _CHECK[key]
         case _:

@@ -24,8 +24,8 @@ from uwlts.calibration.joint.scanned_surfaces import (
 )
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.calibration.sheet import fit_sheet, object_frame
+from uwlts.calibration.step_images import label_steps
 from uwlts.calibration.target_images import Placement
-from uwlts.calibration.window import label_step
 from uwlts.metrology.artefacts import evaluate_pipe, evaluate_plane
 from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace
@@ -224,15 +224,15 @@ def _evidence(
 def step_profiles(
     gathered: Gathered, start: Calibration, window: WindowModel | None
 ) -> tuple[list[StepProfileEvidence], dict[StepHeight, Prior], list[str]]:
-    """Evidence of every step image and what is known of heights, by a calibration nearly as sought; warnings."""
-    transform = start.object_transform()
-    usual = gathered.sensor.uncertainty.step_height_mm
-    found, heights, warnings = [], {}, []
-    for number, (step, view) in enumerate(gathered.steps):
-        try:
-            image = label_step(start, window, step)
-        except EvaluationError as error:
-            warnings.append(f"{step.source}: left out, {error}")
+    """Evidence of every step image and what is known of heights, by a calibration nearly as sought; warnings.
+
+    Of a height is known what its certificate states, and how far the standard may be turned about the stripe.
+    """
+    transform, uncertainty = start.object_transform(), gathered.sensor.uncertainty
+    found, heights = [], {}
+    images, warnings = label_steps(start, window, [step for step, _ in gathered.steps], uncertainty=uncertainty)
+    for number, (image, (step, view)) in enumerate(zip(images, gathered.steps, strict=True)):
+        if image is None:
             continue
         on_face = image.labels != StepFace.NEITHER
         height, stated = step.standard.height_mm, step.standard.height_uncertainty_mm
@@ -245,10 +245,13 @@ def step_profiles(
             upward=-transform[:3, 2],
             along=transform[:3, 1],
             height=StepHeight(height),
+            lengthened=image.lengthened,
             image=number,
         )
         found.append(evidence)
-        heights[evidence.height] = Prior(height, stated / 2 if stated else usual)
+        std = np.hypot(stated / 2 if stated else uncertainty.step_height_mm, height * image.lengthened_std)
+        known = heights.get(evidence.height, Prior(height, 0.0))
+        heights[evidence.height] = Prior(height, max(known.std, float(std)))
     return found, heights, warnings
 
 
@@ -257,7 +260,7 @@ def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_val
     points = evidence.on_sheet(parameters, global_values)
     if points is None:
         raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
-    up = evidence.upward @ points.points - evidence.upper * parameters.value(global_values, evidence.height)
+    up = evidence.upward @ points.points - evidence.upper_mm(parameters, global_values)
     slope, offset = np.polyfit(evidence.along @ points.points, up, 1)
     return np.array([-slope, offset / np.hypot(1.0, slope)])
 

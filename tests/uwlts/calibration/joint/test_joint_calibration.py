@@ -159,6 +159,7 @@ def test_every_derivative_is_what_differences_say(view, kind):
             along=frame[:3, 1],
             across=1,
             height=StepHeight(23.0),
+            lengthened=1.02,
             image=0,
         )
         local = np.array([0.02, -390.0])
