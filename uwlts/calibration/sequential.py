@@ -15,6 +15,7 @@ import uwlts
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.figures import camera_figures, lens_figures, sheet_figures, window_figures
+from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.lens import LensCalibration, LensChoice, calibrate_lens, jackknife
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
@@ -361,6 +362,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
         warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")
     if camera.stage_direction is not None:
         nominal = camera_from_object(evidence.sensor)[:3, :3] @ evidence.stage_direction
+        refuse_turned_travel(camera.stage_direction, nominal)
         cosine = camera.stage_direction @ nominal / np.linalg.norm(nominal)
         turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
         if turn > np.degrees(_LARGEST_USUAL_TURN):

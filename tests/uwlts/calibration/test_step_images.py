@@ -108,7 +108,8 @@ def test_one_profile_shows_the_other_turn_only(steps):
 def test_the_joint_estimate_knows_a_height_as_well_as_its_turn():
     """The certificate's 1 µm, and what the turn of the worse of two captures leaves: 1.1e-3 of the height."""
     steps = [*turned_step("one.h5", about_stripe=TURN), *turned_step("two.h5")]
-    seen = gathered(SENSOR, [], [(step, ViewMedium(True, 0)) for step in steps])
+    described = SENSOR.model_copy(update={"uncertainty": Uncertainty()})
+    seen = gathered(described, [], [(step, ViewMedium(True, 0)) for step in steps])
     evidence, heights, warnings = step_profiles(seen, AIR, DESCRIBED)
     images, said = labelled(steps)
     assert warnings == said

@@ -39,12 +39,14 @@ class Series:
     """Images of the target seen through the same, in captures of these names.
 
     ``approaching`` says whether the stage moves the sensor towards the target; None where it moves otherwise.
+    ``directions`` (3,) are those of the captures' stages, OCS.
     """
 
     view: ViewMedium
     found: AirEvidence
     approaching: bool | None
     names: list[str]
+    directions: Sequence[tuple[float, float, float]] = ()
 
     def placements(self, *, free: bool) -> list[Placement]:
         """The images joined by the stage's motion, or one by one."""
@@ -154,7 +156,8 @@ def gather_jointly(
     for view, captures in views.items():
         found = air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
-        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
+        directions = [capture.header.stage_direction for capture in captures]
+        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures], directions))
     for capture in steps:
         view, index = _view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)

@@ -7,7 +7,8 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera import placement_pose, solve_camera
+from uwlts.calibration.camera import placement_pose, solve_camera, stage_direction
+from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
@@ -123,7 +124,8 @@ def series_start(
     Seen paraxially through the window, a pane d away from the pupil, t thick, of the index g, the medium of the index n
     looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
 
-    Raises CalibrationError: a camera without a window in air does not explain the images by and large.
+    Raises CalibrationError: a camera without a window in air does not explain the images by and large, or they are
+    turned or mirrored against the stage.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
     tangential = tuple(key.text for key in added_tangential(options.camera, sensor.uncertainty))
@@ -161,7 +163,21 @@ def series_start(
             piece = _evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)
             start.local.append(np.append(pose, np.zeros(2 + len(piece.images()) if staged else 0)))
+        if free:
+            _refuse_turned_images(part, start.local[-len(part.found.images) :], sensor)
     return start
+
+
+def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: Sensor) -> None:
+    """Refuse free poses (6,) of images in which the stage moves as in turned ones, against its described direction."""
+    target_poses = np.tile(np.eye(4), (len(poses), 1, 1))
+    target_poses[:, :3, 3] = [pose[3:6] for pose in poses]
+    stage_mm, capture = (np.array([getattr(i, n) for i in series.found.images]) for n in ("stage_mm", "placement"))
+    for number, direction in enumerate(series.directions):
+        of_capture = capture == number
+        if of_capture.any():
+            travel = stage_direction(target_poses[of_capture], stage_mm[of_capture])
+            refuse_turned_travel(travel, camera_from_object(sensor)[:3, :3] @ direction)
 
 
 def _index(view: ViewMedium, indices: Sequence[float]) -> float:

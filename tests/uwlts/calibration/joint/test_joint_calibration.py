@@ -241,6 +241,16 @@ def test_a_target_held_by_hand_in_water(noise, thesis):
     assert StageParameter.SCALE not in result.estimate.parameters.keys
 
 
+def test_free_poses_are_refused_where_the_stage_moves_as_in_a_mirror(noise, thesis):
+    """The stage moves along the laser's axis, which is inclined in the camera; described as that in a mirror."""
+    series = target_series(BUILT, window=False, positions=np.linspace(-60, 60, 8), noise=noise, tilts=TILTS, columns=9)
+    rotation, free = camera_from_object(thesis)[:3, :3], replace(OPTIONS, poses="free")
+    mirrored = rotation.T @ ([1.0, -1.0, 1.0] * rotation[:, 2])
+    solve_jointly(gathered(thesis, [replace(series, directions=[(0.0, 0.0, 1.0)])]), options=free)
+    with pytest.raises(CalibrationError, match="turned by 180 deg or mirrored top to bottom: turn the images back"):
+        solve_jointly(gathered(thesis, [replace(series, directions=[tuple(mirrored)])]), options=free)
+
+
 def test_steps_add_the_window_to_a_target_in_air(thesis):
     """The laser's window is square to the sheet here, as the step views need it."""
     laser = BUILT.laser.model_copy(update={"window": BUILT.laser.window.model_copy(update={"tilt_y_deg": 0.0})})

@@ -331,7 +331,16 @@ def renamed(sensor, **changes):
     [
         (lambda s: {"medium": Medium(kind="air")}, CalibrationError, "was taken in air"),
         (lambda s: {"artefact": None}, DescriptionError, "does not describe its step standard"),
-        (lambda s: {"sensor": renamed(s, name="other")}, CalibrationError, "taken by the sensor 'other'"),
+        (
+            lambda s: {"sensor": renamed(s, name="other")},
+            CalibrationError,
+            r"step.h5 is by the sensor 'other', .*right one\?",
+        ),
+        (
+            lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=s.laser.wavelength_nm + 3.0))},
+            CalibrationError,
+            "with a laser of 638 nm, the calibration is for 635 nm",
+        ),
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=520.0))},
             CalibrationError,
