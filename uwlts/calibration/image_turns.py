@@ -40,6 +40,6 @@ def refuse_turned_travel(found: np.ndarray | None, described: np.ndarray) -> Non
     if found is not None and (how := turned_like(found, described)):
         raise CalibrationError(
             f"by the target's poses the stage moves the sensor along {np.round(found, 2).tolist()} (camera: right, "
-            f"down, ahead), by stage_direction along {np.round(described, 2).tolist()}, as it is where the images are {how}: "
-            "turn the images back, or correct stage_direction"
+            f"down, ahead), by stage_direction along {np.round(described, 2).tolist()}, as it is where the images are "
+            f"{how}: turn the images back, or correct stage_direction"
         )
