@@ -150,6 +150,36 @@ def test_the_cost_is_part_of_the_lengths_uncertainty(from_water):
     assert [line for line in advice_lines(from_water) if line.startswith("next: ")]
 
 
+EDGES = {"left": (0, -1), "right": (0, 1), "upper": (1, -1), "lower": (1, 1)}
+
+
+def test_shots_are_where_their_words_say(from_water):
+    """Depths along the laser's axis, in the order of their words; the edge said to be nearer is so, by 20 deg."""
+    frame, corner = from_water.object_transform(), np.abs(TARGET.extent_mm).max()
+    square, tilted, depths = {}, [], {}
+    for shot in next_shots(from_water):
+        if shot.pose is not None:
+            words = shot.words.split(", ")
+            where, depth = words[1].split(" (Z ")
+            depths[where] = float(depth.removesuffix(" mm)"))
+            along = frame[:3, 2] @ (shot.pose[:3, 3] - frame[:3, 3])
+            assert along == pytest.approx(depths[where], abs=0.5)
+            if "edge" in words[2]:
+                tilted.append((where, words[2].split()[0], shot.pose))
+            else:
+                square[where] = shot.pose
+    assert depths["near"] < depths["in the middle"] < depths["far"]
+    for where, edge, pose in tilted:
+        axis, side = EDGES[edge]
+        # The edge's middle in the target's frame, by the camera's axis that it is far along, and its depth.
+        at = side * square[where][axis, :2]
+        at *= corner / np.linalg.norm(at)
+        nearer = square[where][2, :2] @ at - pose[2, :2] @ at
+        # The target is inclined to the camera by 35 deg: sin(55) - sin(35) or sin(35) - sin(15) about x.
+        assert 0.2 * corner < nearer < 0.4 * corner
+    assert len(tilted) >= 6
+
+
 def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
     """Another OCS, turned by 2 deg about X and shifted, gives the same uncertainties at the same points."""
     known, over, _ = of_calibration(from_water)
