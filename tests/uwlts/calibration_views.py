@@ -117,12 +117,12 @@ def step_profile(depth_mm, *, shift_mm=0.0, tilt=0.0, height_mm=STEP_MM, count=1
     return np.column_stack([np.zeros(count), y, depth_mm + z])
 
 
-def nine_steps(*, count=1280):
+def nine_steps(*, count=1280, tilts=(0.01, -0.02, 0.03)):
     """The thesis's nine poses of the step standard: three near, three at the stand-off, three far; OCS."""
     return [
         step_profile(depth, shift_mm=shift, tilt=tilt, count=count)
         for depth in (-50.0, 15.0, 90.0)
-        for shift, tilt in ((-15.0, 0.01), (0.0, -0.02), (12.0, 0.03))
+        for shift, tilt in zip((-15.0, 0.0, 12.0), tilts, strict=True)
     ]
 
 

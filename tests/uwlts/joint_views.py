@@ -84,11 +84,11 @@ def target_series(sensor, *, medium=None, window=True, positions, bow=0.0, noise
     return Series(ViewMedium(window, medium), evidence, None if tilts is not None else True, ["target"])
 
 
-def step_views(sensor: Sensor, *, noise=Noise()):
+def step_views(sensor: Sensor, *, noise=Noise(), tilts=(0.01, -0.02, 0.03)):
     """Nine images of the step standard on the sheet as described, without what the laser's window does to it."""
     standard = StepStandard(height_mm=STEP_MM)
     found = []
-    for profile in nine_steps(count=400):
+    for profile in nine_steps(count=400, tilts=tilts):
         pixels = through_window(sensor, profile, noise_px=noise.stripe_px, rng=noise.rng)
         found.append((StepEvidence(pixels, standard, WATER, "step"), ViewMedium(True, 0)))
     return found

@@ -58,12 +58,20 @@ class AirEvidence:
 
 @dataclass(frozen=True, eq=False)
 class StepEvidence:
-    """A stripe (N, 2) on a step standard, with the standard, the medium's index and where it comes from."""
+    """A stripe (N, 2) on a step standard, with the standard, the medium's index and where it comes from.
+
+    ``travel_mm`` is where the stage has moved the sensor, along the axes of the OCS.
+    """
 
     pixels: np.ndarray
     standard: StepStandard
     medium_index: float
     source: str
+    travel_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def capture(self) -> str:
+        """The capture it comes from."""
+        return self.source.rsplit(", frame ", 1)[0]
 
 
 def air_evidence(
@@ -158,7 +166,9 @@ def step_evidence(
         for frame, image in capture.frames(laser_on=True):
             pixels = _stripe_of(capture, frame, image, stripe, warnings).pixels
             if len(pixels):
-                found.append(StepEvidence(pixels, standard, index, f"{capture.path.name}, frame {frame}"))
+                x, y, z = (float(capture.stage_mm[frame]) * np.array(capture.header.stage_direction)).tolist()
+                source = f"{capture.path.name}, frame {frame}"
+                found.append(StepEvidence(pixels, standard, index, source, (x, y, z)))
             done = _report(progress, "step", done, total)
     return found, warnings
 

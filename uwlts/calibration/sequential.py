@@ -15,12 +15,14 @@ import uwlts
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
 from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.figures import camera_figures, lens_figures, sheet_figures, window_figures
+from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.lens import LensCalibration, LensChoice, calibrate_lens, jackknife
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
-from uwlts.calibration.window import WindowSolution, label_step, solve_window
+from uwlts.calibration.step_images import label_steps
+from uwlts.calibration.window import WindowSolution, solve_window
 from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import CalibrationError, EvaluationError
+from uwlts.model.errors import CalibrationError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
 from uwlts.storage.capture import Capture, source_of
@@ -79,7 +81,7 @@ class CalibrationResult:
     camera: CameraSolution
     stripe_points: StripePoints
     sheet: SheetSolution
-    steps: list[StepEvidence]
+    steps: Sequence[StepEvidence]
     window: WindowSolution | None
     warnings: list[str]
 
@@ -203,20 +205,17 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         sheet=sheet.model,
         camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
     )
-    used, left_out, window = [], [], None
+    used, on_steps, window = [], [], None
     if evidence.window is not None:
         described = WindowModel.described(evidence.window, sensor.laser.wavelength_nm, refractions=options.refractions)
-        for step in evidence.steps:
-            try:
-                used.append(label_step(calibration, described, step))
-            except EvaluationError as error:
-                left_out.append(f"{step.source}: left out, {error}")
+        labelled, on_steps = label_steps(calibration, described, evidence.steps, uncertainty=sensor.uncertainty)
+        used = [image for image in labelled if image is not None]
         if not used:
-            why = "; ".join([*evidence.warnings, *left_out][:3])
+            why = "; ".join([*evidence.warnings, *on_steps][:3])
             raise CalibrationError(f"no step image can be used for the window's distance; {why}")
         window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm)
         figures["window"] = window_figures(window, used)
-    warnings += left_out
+    warnings += on_steps
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
         update={
@@ -363,6 +362,7 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
         warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")
     if camera.stage_direction is not None:
         nominal = camera_from_object(evidence.sensor)[:3, :3] @ evidence.stage_direction
+        refuse_turned_travel(camera.stage_direction, nominal)
         cosine = camera.stage_direction @ nominal / np.linalg.norm(nominal)
         turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
         if turn > np.degrees(_LARGEST_USUAL_TURN):

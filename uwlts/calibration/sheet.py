@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from uwlts.calibration.image_turns import turned_like
 from uwlts.metrology.fits import fit_plane
 from uwlts.metrology.least_squares import fit_robustly
 from uwlts.model.calibration import CameraModel, SheetModel
@@ -19,11 +20,8 @@ _LEAST_SPREAD = 20.0
 _LEAST_SHAPE = 0.01
 _LARGEST_REJECTED = 0.2  # outliers are few; where more points leave the plane, there is none
 _LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this axes are exchanged or signs wrong
-# From here on a normal that lies much closer to where turned images would put it is taken for that.
-_TURNED_IMAGES = np.radians(20)
 _OTHER_UNIT, _LEAST_OFFSET_MM = 5.0, 10.0  # descriptions are rough, but not by this factor
 _CROSSING = 0.3  # cosine from which it is of use to say where the sheet crosses an axis
-_HALF_TURN = np.array([-1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +120,11 @@ def fit_sheet(
         )
     offset = float(plane.normal @ plane.point_mm)
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
-    to_turned = float(np.arccos(min(abs(plane.normal @ (_HALF_TURN * nominal_normal)), 1.0)))
     advice = None
-    if turn > _TURNED_IMAGES and to_turned < turn / 3:
+    if how := turned_like(plane.normal, nominal_normal, either_way=True):
         advice = (
-            ", as it is where the images are turned by 180 deg or mirrored, or the laser stands on the camera's other "
-            "side: turn the images, or correct the description"
+            f", as it is where the images are {how}, or the laser stands on the camera's other side: turn the images, "
+            "or correct the description"
         )
     elif turn > _LARGEST_TURN:
         advice = ": check stripe_along, where the laser stands, and whether the images are turned or mirrored"
@@ -142,6 +139,12 @@ def fit_sheet(
         )
     if nominal_offset_mm is not None and abs(nominal_offset_mm) > _LEAST_OFFSET_MM:
         times = offset / nominal_offset_mm
+        if times < 0:
+            raise CalibrationError(
+                f"the sheet passes the camera at {offset:.1f} mm, by the sensor's description at "
+                f"{nominal_offset_mm:.1f} mm, on the other side: the images are turned by 180 deg or mirrored, or the "
+                "laser stands on the camera's other side; turn the images, or correct the description"
+            )
         if not 1 / _OTHER_UNIT < times < _OTHER_UNIT:
             raise CalibrationError(
                 f"the sheet passes the camera at {offset:.1f} mm, by the sensor's description at "

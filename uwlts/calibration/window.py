@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares, root_scalar
 
-from uwlts.calibration.evidence import StepEvidence
-from uwlts.metrology.step_faces import StepFace, label_step_faces, step_height
+from uwlts.calibration.step_images import StepImage, step_profile
+from uwlts.metrology.step_faces import StepFace, step_height
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
-from uwlts.optics.reconstruction import points_on_sheet
 
 _CURVE_POINTS = 31  # the curve has one valley, several points wide
 _SEARCHED = (0.2, 2.5)  # shares of the described distance, which is measured to better than half
@@ -18,13 +17,6 @@ _SEARCHED = (0.2, 2.5)  # shares of the described distance, which is measured to
 _LEAST_CHANGE = 10.0
 _ROUNDING_MM = 1e-6
 _AT_BOUND = 1e-3  # share of the range; least squares within bounds stop as close to them
-
-
-@dataclass(frozen=True, eq=False)
-class StepImage(StepEvidence):
-    """A stripe on a step standard with the `StepFace` (N,) of every pixel, from `label_step`."""
-
-    labels: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,27 +50,6 @@ class WindowSolution:
     bounds_mm: tuple[float, float]
 
 
-def step_profile(
-    calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
-) -> np.ndarray:
-    """Points (N, 2) of a profile, Y and Z of the OCS in mm, seen through a window; NaN where a ray has no point."""
-    seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
-    object_from_camera = np.linalg.inv(calibration.object_transform())
-    return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
-
-
-def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
-    """Separate the treads at the window's nominal distance, where the profile is true to a few percent.
-
-    Raises EvaluationError: the profile does not show two treads.
-    """
-    points = step_profile(calibration, window, step.pixels, medium_index=step.medium_index)
-    found = np.isfinite(points).all(axis=1)
-    labels = np.full(len(points), int(StepFace.NEITHER), dtype=np.int8)
-    labels[found] = label_step_faces(points[found], height_mm=step.standard.height_mm, edge_mm=step.standard.edge_mm)
-    return StepImage(**vars(step), labels=labels)
-
-
 def solve_window(
     calibration: Calibration,
     window: WindowModel,
@@ -105,7 +76,7 @@ def solve_window(
     low, high = bounds_mm or tuple(share * window.distance_mm for share in _SEARCHED)
     if not 0 < low < high < np.inf:
         raise CalibrationError(f"the window's distance is searched from {low:g} to {high:g} mm; give 0 < low < high")
-    true = np.array([step.standard.height_mm for step in steps])
+    true = np.array([step.height_mm() for step in steps])
     if not (np.isfinite(true) & (true > 0)).all():
         raise CalibrationError(f"the heights of the steps must be positive lengths in mm, not {true.tolist()}")
 
@@ -201,6 +172,6 @@ def _own_distance(
     left = changes[np.argmin(np.abs(tried[changes] - near))]
 
     def error(distance: float) -> float:
-        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.standard.height_mm
+        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.height_mm()
 
     return float(root_scalar(error, bracket=(tried[left], tried[left + 1]), method="brentq", xtol=1e-7).root)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.calibration.evidence import step_evidence
-from uwlts.calibration.window import StepImage, label_step, solve_window, step_profile
+from uwlts.calibration.step_images import StepImage, label_step, step_profile
+from uwlts.calibration.window import solve_window
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import evaluate_spheres

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.uwlts.calibration_views import built_sensor, lattice, lens_of, stage_images, stripes_on_target
+from tests.uwlts.calibration_views import built_sensor, lattice, lens_of, stage_images, stripes_on_target, turn
+from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.sheet import fit_sheet, object_frame, points_on_target
 from uwlts.model.calibration import CameraModel, SheetModel
 from uwlts.model.errors import CalibrationError, RangeError
@@ -127,9 +128,65 @@ def test_measures_in_other_units_are_noticed():
     points = 120.0 * normal + rng.uniform(-50, 50, (200, 2)) @ np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
     for nominal in (100.0, 140.0):
         assert fit_sheet(points, nominal_normal=normal, nominal_offset_mm=nominal).model.offset_mm == pytest.approx(120)
-    for factor in (0.1, 10.0, -1.0):
+    for factor in (0.1, 10.0):
         with pytest.raises(CalibrationError, match="measures must be in mm"):
             fit_sheet(factor * points, nominal_normal=normal, nominal_offset_mm=120.0)
+    with pytest.raises(CalibrationError, match="at -120.0 mm, by .* at 120.0 mm, on the other side: the images are"):
+        fit_sheet(-points, nominal_normal=normal, nominal_offset_mm=120.0)
+
+
+MIRRORED = {"left to right": np.array([-1.0, 1.0, 1.0]), "top to bottom": np.array([1.0, -1.0, 1.0])}
+
+
+@pytest.mark.parametrize("how", MIRRORED)
+def test_mirrored_images_show_where_the_laser_stands_beside_the_cameras_axes(how):
+    """A symmetric board is the same in a mirror. The laser of the second sensor stands to the lower right."""
+    points = stripe_points().points_mm
+    given = {"nominal_normal": LASER.normal, "nominal_offset_mm": float(LASER.normal @ LASER.origin_mm)}
+    if how == "top to bottom":
+        said = "the images are turned by 180 deg or mirrored top to bottom, or the laser stands"
+        with pytest.raises(CalibrationError, match=said):
+            fit_sheet(points * MIRRORED[how], **given)
+    else:
+        # The laser stands above the camera: its mirror image is the same to the tenths of a degree of its mounting.
+        assert fit_sheet(points * MIRRORED[how], **given).turn_rad < np.radians(2)
+    aside = turn(z=np.radians(35.0))
+    given["nominal_normal"] = aside @ LASER.normal
+    assert fit_sheet(points @ aside.T, **given).turn_rad < np.radians(2)
+    with pytest.raises(CalibrationError, match=f"where the images are mirrored {how}, or the laser stands"):
+        fit_sheet(points @ aside.T * MIRRORED[how], **given)
+
+
+def test_a_laser_nearly_along_the_camera_shows_mirrored_images_by_its_side():
+    """A sheet 5 deg from the camera's axis is turned by 10 deg in a mirror, within what descriptions are rough by."""
+    cosine, sine = np.cos(np.radians(5.0)), np.sin(np.radians(5.0))
+    normal, along = np.array([0.0, -cosine, sine]), np.array([0.0, sine, cosine])
+    across, reach = np.random.default_rng(2).uniform(-50, 50, (2, 200, 1))
+    points = 80.0 * normal + across * np.array([1.0, 0.0, 0.0]) + (400.0 + reach) * along
+    given = {"nominal_normal": normal, "nominal_offset_mm": 80.0}
+    assert fit_sheet(points, **given).turn_rad < 1e-6
+    with pytest.raises(CalibrationError, match="at -80.0 mm, .* on the other side: the images are turned"):
+        fit_sheet(points * MIRRORED["top to bottom"], **given)
+
+
+@pytest.mark.parametrize(
+    ("found", "how"),
+    [
+        ((0.1, 0.6, 0.8), ""),
+        ((-0.6, 0.0, 0.8), "turned by 180 deg or mirrored left to right"),
+        ((0.0, 0.0, -1.0), ""),
+        ((0.3, 0.3, -0.9), ""),
+    ],
+)
+def test_a_stage_that_moves_as_in_a_mirror_is_refused(found, how):
+    """Described along (0.6, 0, 0.8); its own error, and one that no mirror explains, is a warning elsewhere."""
+    found, described = np.array(found) / np.linalg.norm(found), np.array([1.2, 0.0, 1.6])
+    refuse_turned_travel(None, described)
+    if not how:
+        refuse_turned_travel(found, described)
+        return
+    with pytest.raises(CalibrationError, match=f"along \\[0.6, 0.0, 0.8\\], as it is where the images are {how}: turn"):
+        refuse_turned_travel(found, described)
 
 
 def test_pixels_and_poses_must_be_finite():

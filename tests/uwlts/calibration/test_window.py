@@ -8,7 +8,8 @@ import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
 from uwlts.calibration.evidence import StepEvidence
-from uwlts.calibration.window import label_step, solve_window
+from uwlts.calibration.step_images import label_step
+from uwlts.calibration.window import solve_window
 from uwlts.calibration.window import step_profile as reconstructed
 from uwlts.metrology.step_faces import StepFace
 from uwlts.model.artefacts import StepStandard

@@ -7,7 +7,7 @@ import numpy as np
 
 from uwlts.calibration.evidence import StepEvidence
 from uwlts.calibration.image_quality import LaserFault
-from uwlts.calibration.window import label_step
+from uwlts.calibration.step_images import label_step
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import EvaluationError, ImageError

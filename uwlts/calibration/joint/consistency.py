@@ -10,11 +10,13 @@ from scipy.stats import chi2
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
 from uwlts.calibration.joint.evidence import SHIFT, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.parameter_keys import (
     LensParameter,
     MediumIndex,
     ParameterKey,
+    ParameterLabel,
     SheetParameter,
     SingleParameter,
     StageParameter,
@@ -57,6 +59,9 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
             check = "the medium and the step's height in the captures, or --index"
         case StepHeight():
             check = "which standard it is"
+            if value > known:
+                turn = np.degrees(np.arccos(known / value))
+                check += f", and whether it faces the laser: turned by {turn:.1f}° about the stripe it seems so high"
         case LensParameter() | WindowParameter() | SheetParameter() | StageParameter() | TargetParameter():
             check = _CHECK[key]
         case _:
@@ -81,6 +86,8 @@ _DOUBTFUL, _WRONG = 4.0, 6.0
 _LEAST_GAIN, _MUCH_GAINED, _FEWEST_GAINED = 0.02, 0.5, 6
 """Information gained over the prior, as a share of its standard uncertainty: the least that is distinguished from
 rounding, the least that makes a parameter count for Birge's ratio, and how many parameters that ratio needs."""
+_ROUGH_SIZE = 2e-3  # share by which sizes that are stated without an uncertainty are usually off
+_ALIKE = 3.0  # standard uncertainties within which sizes are off by the same share
 _FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
 """Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
 _POSITIONS_WRONG, _FEWEST_POSITIONS = 3.0, 4  # the rms of four positions exceeds three sigma once in a million
@@ -233,6 +240,78 @@ def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
             gain = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
             yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
+
+
+@dataclass(frozen=True)
+class SizeDeviation:
+    """A size of a scanned object, found ``off_mm`` larger than described.
+
+    ``std_mm`` is the standard uncertainty stated, infinite where it counts as unknown, ``off_std_mm`` that of the
+    deviation.
+    """
+
+    scan: str
+    quantity: ParameterLabel
+    described_mm: float
+    std_mm: float
+    off_mm: float
+    off_std_mm: float
+
+    def sigmas(self) -> float:
+        """The deviation in standard uncertainties."""
+        return abs(self.off_mm) / self.off_std_mm
+
+    def known(self) -> bool:
+        """Whether a standard uncertainty is stated."""
+        return bool(np.isfinite(self.std_mm))
+
+    def doubtful(self) -> bool:
+        """Whether it is worth a warning; of sizes without a stated uncertainty only where it is large."""
+        return self.sigmas() > _DOUBTFUL and (self.known() or abs(self.off_mm) > _ROUGH_SIZE * self.described_mm)
+
+    def words(self) -> str:
+        """The deviation, and what to check."""
+        found = self.quantity.format_value(self.described_mm + self.off_mm, self.off_std_mm)
+        described = f"{self.described_mm:g}{f' +- {self.std_mm:g}' if self.known() else ''} mm"
+        return (
+            f"{self.scan}: {self.quantity.words} found {found}, described as {described} ({self.off_mm:+.3f} mm or "
+            f"{self.sigmas():.1f} standard uncertainties off): most likely it is described wrongly, check the artefact"
+            + (", or give --unknown-sizes" if self.known() else "; it was estimated")
+        )
+
+
+def size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[SizeDeviation]:
+    """Sizes of what was scanned as an estimate has them to which none was known, against those of the evidence."""
+    found = []
+    for piece, local, covariance in zip(evidence, result.local, result.local_covariances, strict=True):
+        if isinstance(piece, SurfaceScanEvidence):
+            count = piece.surface.parameter_count()
+            sizes = piece.surface.sizes(local[:count])
+            variance = np.einsum("ci,ij,cj->c", sizes.by_local, covariance[:count, :count], sizes.by_local)
+            off_std = np.sqrt(variance + np.where(np.isfinite(sizes.std_mm), sizes.std_mm, 0.0) ** 2)
+            quantities = (ParameterLabel(name, "mm") for name in sizes.names)
+            figures = np.column_stack([sizes.described_mm, sizes.std_mm, sizes.off_mm, off_std]).tolist()
+            found += [
+                SizeDeviation(piece.scan(), *each) for each in zip(quantities, *zip(*figures, strict=True), strict=True)
+            ]
+    return found
+
+
+def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -> list[str]:
+    """Known sizes at least so many standard uncertainties off, the farthest first, in words.
+
+    Where all known sizes are off by the same share, the scale of the calibration may as well be wrong.
+    """
+    known = [each for each in deviations if each.known()]
+    far = sorted((each for each in known if each.sigmas() > least), key=SizeDeviation.sigmas, reverse=True)
+    if not far:
+        return []
+    share, std = np.array([(each.off_mm, each.off_std_mm) for each in known]).T / [each.described_mm for each in known]
+    common = float(np.sum(share / std**2) / np.sum(1 / std**2))
+    words = _some(each.words() for each in far)
+    if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
+        words.append(f"all known sizes are off by the same {100 * common:+.2f} %: check the target's spacings as well")
+    return words
 
 
 def _of_priors(result: Estimate) -> _Found:

@@ -34,14 +34,16 @@ _FIRST_ROUNDS = 30  # then outliers are left out and the rest is solved to its e
 class Estimate:
     """The global parameters, ``values`` (P,) with their ``covariance`` (P, P), and what the evidence says of them.
 
-    ``local``, (b,) each, and ``residuals``, outliers included, are those of every piece of evidence, ``noise`` that of
-    every kind of residual; ``outliers`` is the number left out, ``rounds`` that of all least squares together.
+    ``local``, (b,) each, with ``local_covariances``, (b, b) each, and ``residuals``, outliers included, are those of
+    every piece of evidence, ``noise`` that of every kind of residual; ``outliers`` is the number left out, ``rounds``
+    that of all least squares together.
     """
 
     parameters: Parameters
     values: np.ndarray
     covariance: np.ndarray
     local: list[np.ndarray]
+    local_covariances: list[np.ndarray]
     noise: dict[str, Noise]
     residuals: list[list[Residuals]]
     outliers: int
@@ -106,6 +108,7 @@ def estimate(
                 values=global_values,
                 covariance=fit.covariance / fit.sigma**2,
                 local=local,
+                local_covariances=[each / fit.sigma**2 for each in fit.local_covariances[:-1]],
                 noise=known,
                 residuals=residuals,
                 outliers=sum(int(mask.sum()) for parts in left_out for mask in parts),

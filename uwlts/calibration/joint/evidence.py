@@ -350,7 +350,8 @@ class StepProfileEvidence(StripeEvidence):
     """Stripe pixels on both faces of a step standard in one image; local parameters are the lower face's line.
 
     The faces are planes square to ``upward + slope * along``; the lower one lies at a distance of the local parameters
-    (slope, distance in mm), the upper one higher by the standard's height, which is the global parameter ``height``.
+    (slope, distance in mm), the upper one higher by the standard's height, which is the global parameter ``height``,
+    times ``lengthened``, as the sheet cuts the step at an angle to its normal.
     ``upward``, from the lower face to the upper one, and ``along`` the stripe are unit vectors (3,), camera frame;
     ``upper`` (N,) marks the pixels on the upper face. ``image`` is the number of the image among all of steps.
     """
@@ -360,6 +361,11 @@ class StepProfileEvidence(StripeEvidence):
     along: np.ndarray
     height: StepHeight
     image: int
+    lengthened: float = 1.0
+
+    def upper_mm(self, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
+        """How far (N,) the pixels' faces lie above the lower one within the sheet."""
+        return self.upper * (self.lengthened * parameters.value(global_values, self.height))
 
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         return np.full(2, np.inf)
@@ -370,10 +376,10 @@ class StepProfileEvidence(StripeEvidence):
             return None
         normal, by_slope = leaning(self.upward, self.along[None], local[:1])
         off = Distances(
-            normal @ points.points - local[1] - self.upper * parameters.value(global_values, self.height),
+            normal @ points.points - local[1] - self.upper_mm(parameters, global_values),
             np.broadcast_to(normal[:, None], points.points.shape),
             np.column_stack([by_slope[0] @ points.points, np.full(len(self.pixels), -1.0)]),
-            {self.height: -self.upper.astype(np.float64)},
+            {self.height: -self.lengthened * self.upper},
         )
         columns = np.arange(2)
         return [self.stripe_residuals(parameters, points, off, kind=STEP, local_columns=columns, image=self.image)]

@@ -39,12 +39,14 @@ class Series:
     """Images of the target seen through the same, in captures of these names.
 
     ``approaching`` says whether the stage moves the sensor towards the target; None where it moves otherwise.
+    ``directions`` (3,) are those of the captures' stages, OCS.
     """
 
     view: ViewMedium
     found: AirEvidence
     approaching: bool | None
     names: list[str]
+    directions: Sequence[tuple[float, float, float]] = ()
 
     def placements(self, *, free: bool) -> list[Placement]:
         """The images joined by the stage's motion, or one by one."""
@@ -76,6 +78,19 @@ class ScanStripes:
     artefact: Scanned
     view: ViewMedium
 
+    def image_names(self) -> list[str]:
+        """Capture and place of each of the F images."""
+        return [f"{self.source}, at {position:g} mm" for position in self.stage_mm]
+
+    def without(self, sources: Collection[str]) -> "ScanStripes | None":
+        """The same without the images of these names; None where too many would go."""
+        left_out = np.array([name in sources for name in self.image_names()])
+        seen = np.unique(self.frame)
+        if not _enough(int(np.sum(~left_out[seen])), len(seen)):
+            return None
+        kept, lines = ~left_out[self.frame], ("frame", "line", "centre_px", "width_px", "blur_px", "slopes")
+        return replace(self, **{name: getattr(self, name)[kept] for name in lines})
+
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
@@ -98,7 +113,7 @@ class Gathered:
         return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
     def without(self, sources: Collection[str]) -> "Gathered | None":
-        """The same without the images of these names; None where too many of a series or of the steps would go."""
+        """The same without the images of these names; None where too many of a series, the steps or a scan would go."""
         series = []
         for each in self.series:
             kept = [n for n, name in each.sources(np.arange(len(each.found.images))).items() if name not in sources]
@@ -106,9 +121,10 @@ class Gathered:
                 return None
             series.append(replace(each, found=each.found.only(np.array(kept), [each.found.images[n] for n in kept])))
         steps = [(step, view) for step, view in self.steps if step.source not in sources]
-        if not _enough(len(steps), len(self.steps)):
+        scans = [kept for scan in self.scans if (kept := scan.without(sources)) is not None]
+        if not _enough(len(steps), len(self.steps)) or len(scans) < len(self.scans):
             return None
-        return replace(self, series=series, steps=steps)
+        return replace(self, series=series, steps=steps, scans=scans)
 
     def indices(self, options: CalibrationOptions) -> list[float]:
         """Refractive indices of the media, as described or as the options give them."""
@@ -140,7 +156,8 @@ def gather_jointly(
     for view, captures in views.items():
         found = air_evidence(captures, stripe=options.stripe, progress=progress)
         warnings += found.warnings
-        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures]))
+        directions = [capture.header.stage_direction for capture in captures]
+        series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures], directions))
     for capture in steps:
         view, index = _view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)

@@ -7,7 +7,8 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera import placement_pose, solve_camera
+from uwlts.calibration.camera import placement_pose, solve_camera, stage_direction
+from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
@@ -24,8 +25,8 @@ from uwlts.calibration.joint.scanned_surfaces import (
 )
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.calibration.sheet import fit_sheet, object_frame
+from uwlts.calibration.step_images import label_steps
 from uwlts.calibration.target_images import Placement
-from uwlts.calibration.window import label_step
 from uwlts.metrology.artefacts import evaluate_pipe, evaluate_plane
 from uwlts.metrology.spheres import evaluate_spheres
 from uwlts.metrology.step_faces import StepFace
@@ -123,7 +124,8 @@ def series_start(
     Seen paraxially through the window, a pane d away from the pupil, t thick, of the index g, the medium of the index n
     looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
 
-    Raises CalibrationError: a camera without a window in air does not explain the images by and large.
+    Raises CalibrationError: a camera without a window in air does not explain the images by and large, or they are
+    turned or mirrored against the stage.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
     tangential = tuple(key.text for key in added_tangential(options.camera, sensor.uncertainty))
@@ -161,7 +163,21 @@ def series_start(
             piece = _evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)
             start.local.append(np.append(pose, np.zeros(2 + len(piece.images()) if staged else 0)))
+        if free:
+            _refuse_turned_images(part, start.local[-len(part.found.images) :], sensor)
     return start
+
+
+def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: Sensor) -> None:
+    """Refuse free poses (6,) of images in which the stage moves as in turned ones, against its described direction."""
+    target_poses = np.tile(np.eye(4), (len(poses), 1, 1))
+    target_poses[:, :3, 3] = [pose[3:6] for pose in poses]
+    stage_mm, capture = (np.array([getattr(i, n) for i in series.found.images]) for n in ("stage_mm", "placement"))
+    for number, direction in enumerate(series.directions):
+        of_capture = capture == number
+        if of_capture.any():
+            travel = stage_direction(target_poses[of_capture], stage_mm[of_capture])
+            refuse_turned_travel(travel, camera_from_object(sensor)[:3, :3] @ direction)
 
 
 def _index(view: ViewMedium, indices: Sequence[float]) -> float:
@@ -224,15 +240,15 @@ def _evidence(
 def step_profiles(
     gathered: Gathered, start: Calibration, window: WindowModel | None
 ) -> tuple[list[StepProfileEvidence], dict[StepHeight, Prior], list[str]]:
-    """Evidence of every step image and what is known of heights, by a calibration nearly as sought; warnings."""
-    transform = start.object_transform()
-    usual = gathered.sensor.uncertainty.step_height_mm
-    found, heights, warnings = [], {}, []
-    for number, (step, view) in enumerate(gathered.steps):
-        try:
-            image = label_step(start, window, step)
-        except EvaluationError as error:
-            warnings.append(f"{step.source}: left out, {error}")
+    """Evidence of every step image and what is known of heights, by a calibration nearly as sought; warnings.
+
+    Of a height is known what its certificate states, and how far the standard may be turned about the stripe.
+    """
+    transform, uncertainty = start.object_transform(), gathered.sensor.uncertainty
+    found, heights = [], {}
+    images, warnings = label_steps(start, window, [step for step, _ in gathered.steps], uncertainty=uncertainty)
+    for number, (image, (step, view)) in enumerate(zip(images, gathered.steps, strict=True)):
+        if image is None:
             continue
         on_face = image.labels != StepFace.NEITHER
         height, stated = step.standard.height_mm, step.standard.height_uncertainty_mm
@@ -245,10 +261,13 @@ def step_profiles(
             upward=-transform[:3, 2],
             along=transform[:3, 1],
             height=StepHeight(height),
+            lengthened=image.lengthened,
             image=number,
         )
         found.append(evidence)
-        heights[evidence.height] = Prior(height, stated / 2 if stated else usual)
+        std = np.hypot(stated / 2 if stated else uncertainty.step_height_mm, height * image.lengthened_std)
+        known = heights.get(evidence.height, Prior(height, 0.0))
+        heights[evidence.height] = Prior(height, max(known.std, float(std)))
     return found, heights, warnings
 
 
@@ -257,7 +276,7 @@ def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_val
     points = evidence.on_sheet(parameters, global_values)
     if points is None:
         raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
-    up = evidence.upward @ points.points - evidence.upper * parameters.value(global_values, evidence.height)
+    up = evidence.upward @ points.points - evidence.upper_mm(parameters, global_values)
     slope, offset = np.polyfit(evidence.along @ points.points, up, 1)
     return np.array([-slope, offset / np.hypot(1.0, slope)])
 
@@ -304,7 +323,7 @@ def surface_scan(
         view=stripes.view,
         pixels=pixels[kept],
         across=across,
-        sources={image + n: f"{stripes.source}, at {position:g} mm" for n, position in enumerate(position_mm)},
+        sources={image + n: stripes.image_names()[place] for n, place in enumerate(frames)},
         beside_mm=rotation @ beside[kept].T,
         common_px=np.hypot(BLUR_STD * stripes.blur_px[kept], beside_std(sensor.uncertainty) * np.nan_to_num(beside_px)),
         surface=surface,
@@ -352,7 +371,7 @@ def _surface(
     rotation = transform[:3, :3]
 
     def std(expanded_mm: float | None) -> float:
-        """Standard uncertainty of a certificate's expanded one; infinite where it states none."""
+        """Standard uncertainty of a certificate's expanded one; infinite where it states none, or does not count."""
         return expanded_mm / 2 if sizes_known and expanded_mm else np.inf
 
     def in_camera(point_mm: Sequence[float]) -> np.ndarray:

@@ -9,7 +9,14 @@ from pydantic import JsonValue
 
 from uwlts.calibration.evidence import Progress
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.joint.consistency import Findings, deviations, findings, understated
+from uwlts.calibration.joint.consistency import (
+    Findings,
+    deviations,
+    findings,
+    size_deviations,
+    understated,
+    wrong_sizes,
+)
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.evidence import BENDS, STRETCH
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
@@ -61,6 +68,30 @@ class JointProblem:
     def judged(self) -> tuple[Estimate, Findings]:
         """The estimate and what speaks against it; errors as `estimate`.
 
+        Sizes of what was scanned are first estimated, all of them, and compared with those described: known sizes
+        that are wrong move lens, window and stage, and hardly show in residuals. That is said as soon as nothing else
+        contradicts.
+        """
+        free = [_of_unknown_size(piece) for piece in self.evidence]
+        result, against = replace(self, evidence=free)._judged_as_described()
+        sizes, alone = size_deviations(result, self.evidence), not against.all_against() or bool(self.misfits)
+        doubts = [each.words() for each in sizes if each.doubtful()]
+        if not any(each.known() for each in sizes):
+            return result, replace(against, doubts=doubts + against.doubts)
+        wrong = wrong_sizes(sizes)
+        if not wrong:
+            start = replace(self, global_values=result.values, local=result.local)
+            result, with_sizes = start._judged_as_described()
+            # What only known sizes contradict, they are the cause of.
+            wrong = wrong_sizes(sizes, least=_NOTICED) if alone and with_sizes.all_against() else []
+            against = replace(with_sizes, doubts=doubts + with_sizes.doubts)
+        if alone:
+            against = replace(against, contradictions=wrong + against.contradictions)
+        return result, against
+
+    def _judged_as_described(self) -> tuple[Estimate, Findings]:
+        """The estimate and what speaks against it, with the sizes of what was scanned as the evidence has them.
+
         Where all that was known before is farther off than stated, or the target is bent or stretched more than it is
         known to be, that is taken for as uncertain as it is off, for what the evidence does not show may be as wrong;
         but not where a single parameter contradicts what is known.
@@ -89,6 +120,10 @@ class JointProblem:
                 "the uncertainties stated with it: all are taken for that much larger; check [uncertainty]"
             )
         return result, replace(against, doubts=doubts + against.doubts)
+
+
+def _of_unknown_size(piece: Evidence) -> Evidence:
+    return replace(piece, surface=piece.surface.of_unknown_size()) if isinstance(piece, SurfaceScanEvidence) else piece
 
 
 @dataclass(frozen=True, eq=False)

@@ -323,11 +323,10 @@ def _earlier(calibration: Calibration) -> StoredEstimate:
 
 
 def _refuse_unsuitable(capture: Capture, calibration: Calibration) -> None:
-    check_fits(capture.header, calibration, source=capture.path.name)
+    if doubts := check_fits(capture.header, calibration, source=capture.path.name):
+        raise CalibrationError("; ".join(doubts))
     sensor, wavelength = capture.header.sensor, capture.header.sensor.laser.wavelength_nm
-    if sensor.name != calibration.sensor_name:
-        reason = f"by the sensor '{sensor.name}', the calibration is that of '{calibration.sensor_name}'"
-    elif wavelength != calibration.wavelength_nm:
+    if wavelength != calibration.wavelength_nm:
         reason = f"with a laser of {wavelength:g} nm, the calibration is for {calibration.wavelength_nm:g} nm"
     elif capture.header.medium.kind == "air":
         reason = "in air: the index of new water shows in an image of a step in it"

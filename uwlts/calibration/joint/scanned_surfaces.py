@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -11,6 +11,27 @@ from uwlts.calibration.joint.parameters import Parameters
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.window import leaning
+
+
+@dataclass(frozen=True, eq=False)
+class Sizes:
+    """Sizes in mm that a description states, (c,) each, by their ``names``, and what the local parameters make of them.
+
+    ``off_mm`` is by how much they are larger than ``described_mm``, ``by_local`` (c, k) its derivatives. ``std_mm`` is
+    the standard uncertainty stated, infinite for what counts as unknown.
+    """
+
+    names: tuple[str, ...]
+    described_mm: np.ndarray
+    std_mm: np.ndarray
+    off_mm: np.ndarray
+    by_local: np.ndarray
+
+    def residuals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Those that are known, in standard uncertainties (n,), and their derivatives (n, k)."""
+        known = np.isfinite(self.std_mm)
+        std = self.std_mm[known]
+        return self.off_mm[known] / std, self.by_local[known] / std[:, None]
 
 
 class Surface(ABC):
@@ -23,16 +44,20 @@ class Surface(ABC):
     count: int = 1
 
     @abstractmethod
-    def local_std(self) -> np.ndarray:
-        """Standard uncertainty (k,) of its local parameters before; infinite where nothing is known."""
+    def parameter_count(self) -> int:
+        """Number k of its local parameters, of which nothing is known before but `sizes`."""
 
     @abstractmethod
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         """Of points (3, N) of the scan's pixels, in their order."""
 
-    def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (c,) of calibrated lengths between its parts, in standard uncertainties, and derivatives (c, k)."""
-        return np.empty(0), np.empty((0, len(local)))
+    def sizes(self, local: np.ndarray) -> Sizes:
+        """Its described sizes; none of what has no size."""
+        return Sizes((), np.empty(0), np.empty(0), np.empty(0), np.empty((0, len(local))))
+
+    def of_unknown_size(self) -> Self:
+        """The same with nothing known of its sizes."""
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +79,8 @@ class Spheres(Surface):
     def __post_init__(self) -> None:
         object.__setattr__(self, "count", len(self.diameters_mm))
 
-    def local_std(self) -> np.ndarray:
-        return np.concatenate([np.full(3 * self.count, np.inf), self.diameter_std_mm])
+    def parameter_count(self) -> int:
+        return 4 * self.count
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         away = points - self._centres(local)[self.sphere].T
@@ -68,15 +93,28 @@ class Spheres(Surface):
         by_local[rows, 3 * self.count + self.sphere] = -0.5
         return Distances(distance - radius, outward, by_local)
 
-    def known_lengths(self, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def sizes(self, local: np.ndarray) -> Sizes:
         apart = np.diff(self._centres(local), axis=0)
         length = np.linalg.norm(apart, axis=1)
-        by_local = np.zeros((len(length), len(local)))
+        by_local = np.zeros((self.count + len(length), len(local)))
+        by_local[: self.count, 3 * self.count :] = np.eye(self.count)
         for number, unit in enumerate(apart / length[:, None]):
-            by_local[number, 3 * number : 3 * number + 6] = np.concatenate([-unit, unit])
-        known = np.isfinite(self.spacing_std_mm)
-        std = self.spacing_std_mm[known]
-        return (length - self.spacings_mm)[known] / std, by_local[known] / std[:, None]
+            by_local[self.count + number, 3 * number : 3 * number + 6] = np.concatenate([-unit, unit])
+        spheres = range(1, self.count + 1)
+        return Sizes(
+            (
+                *(f"diameter of sphere {n}" for n in spheres),
+                *(f"spacing of spheres {n} and {n + 1}" for n in spheres[:-1]),
+            ),
+            np.append(self.diameters_mm, self.spacings_mm),
+            np.append(self.diameter_std_mm, self.spacing_std_mm),
+            np.append(local[3 * self.count :], length - self.spacings_mm),
+            by_local,
+        )
+
+    def of_unknown_size(self) -> Self:
+        unknown = {name: np.full_like(getattr(self, name), np.inf) for name in ("diameter_std_mm", "spacing_std_mm")}
+        return replace(self, **unknown)
 
     def _centres(self, local: np.ndarray) -> np.ndarray:
         return local[: 3 * self.count].reshape(-1, 3)
@@ -96,8 +134,8 @@ class Plane(Surface):
     normal: np.ndarray
     across: np.ndarray
 
-    def local_std(self) -> np.ndarray:
-        return np.full(3, np.inf)
+    def parameter_count(self) -> int:
+        return 3
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         normal, by_slopes = leaning(self.normal, self.across, local[:2])
@@ -123,8 +161,15 @@ class Cylinder(Surface):
     diameter_mm: float
     diameter_std_mm: float
 
-    def local_std(self) -> np.ndarray:
-        return np.array([*[np.inf] * 4, self.diameter_std_mm])
+    def parameter_count(self) -> int:
+        return 5
+
+    def sizes(self, local: np.ndarray) -> Sizes:
+        described, std = np.array([self.diameter_mm]), np.array([self.diameter_std_mm])
+        return Sizes(("diameter of the pipe",), described, std, local[4:], np.eye(5)[4:])
+
+    def of_unknown_size(self) -> Self:
+        return replace(self, diameter_std_mm=np.inf)
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
         axis, by_slopes = leaning(self.axis, self.across, local[2:4])
@@ -172,15 +217,19 @@ class SurfaceScanEvidence(StripeEvidence):
     across_stage: np.ndarray
     image: int
 
+    def scan(self) -> str:
+        """The scan's capture."""
+        return self.sources[self.image].rsplit(", at ", 1)[0]
+
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         positions = np.full(len(self.stage_mm), uncertainty.stage_position_mm)
-        return np.concatenate([self.surface.local_std(), positions])
+        return np.append(np.full(self.surface.parameter_count(), np.inf), positions)
 
     def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
         off, by_local = super().known_before(local, uncertainty)
-        lengths, by_surface = self.surface.known_lengths(local[: -len(self.stage_mm)])
-        by_lengths = np.pad(by_surface, ((0, 0), (0, len(self.stage_mm))))
-        return np.concatenate([off, lengths]), np.vstack([by_local, by_lengths])
+        sizes, by_surface = self.surface.sizes(local[: -len(self.stage_mm)]).residuals()
+        by_sizes = np.pad(by_surface, ((0, 0), (0, len(self.stage_mm))))
+        return np.append(off, sizes), np.vstack([by_local, by_sizes])
 
     def lit(self, image: int) -> np.ndarray:
         return self.frame == image - self.image

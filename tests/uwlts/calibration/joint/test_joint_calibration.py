@@ -159,6 +159,7 @@ def test_every_derivative_is_what_differences_say(view, kind):
             along=frame[:3, 1],
             across=1,
             height=StepHeight(23.0),
+            lengthened=1.02,
             image=0,
         )
         local = np.array([0.02, -390.0])
@@ -238,6 +239,16 @@ def test_a_target_held_by_hand_in_water(noise, thesis):
     result = solve_jointly(gathered(thesis, [series]), options=replace(OPTIONS, poses="free"))
     assert max(map(abs, pulls(result).values())) < 4.5
     assert StageParameter.SCALE not in result.estimate.parameters.keys
+
+
+def test_free_poses_are_refused_where_the_stage_moves_as_in_a_mirror(noise, thesis):
+    """The stage moves along the laser's axis, which is inclined in the camera; described as that in a mirror."""
+    series = target_series(BUILT, window=False, positions=np.linspace(-60, 60, 8), noise=noise, tilts=TILTS, columns=9)
+    rotation, free = camera_from_object(thesis)[:3, :3], replace(OPTIONS, poses="free")
+    mirrored = rotation.T @ ([1.0, -1.0, 1.0] * rotation[:, 2])
+    solve_jointly(gathered(thesis, [replace(series, directions=[(0.0, 0.0, 1.0)])]), options=free)
+    with pytest.raises(CalibrationError, match="turned by 180 deg or mirrored top to bottom: turn the images back"):
+        solve_jointly(gathered(thesis, [replace(series, directions=[tuple(mirrored)])]), options=free)
 
 
 def test_steps_add_the_window_to_a_target_in_air(thesis):

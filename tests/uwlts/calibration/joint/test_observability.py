@@ -24,8 +24,6 @@ from uwlts.calibration.target_images import TargetImage
 from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
 from uwlts.targets import parse_target
 
-pytestmark = pytest.mark.slow
-
 BUILT = built_sensor()
 OPTIONS = CalibrationOptions(poses="stage", correct_circles=False)
 
@@ -55,7 +53,8 @@ def from_steps(thesis, *, height_mm):
     known = thesis.uncertainty.model_copy(update={"step_height_mm": height_mm, "window_tilt_deg": 0.01})
     described = thesis.model_copy(update={"uncertainty": known})
     air = target_series(sensor, window=False, positions=np.arange(6) * 46.0 - 200.0, noise=noise(2), columns=15)
-    steps = step_views(sensor, noise=noise(3))
+    # Standards that face the laser, whose heights are as certain as stated.
+    steps = step_views(sensor, noise=noise(3), tilts=(0.0, 0.0, 0.0))
     return solve_jointly(gathered(described, [air], steps), options=OPTIONS).calibration
 
 
@@ -124,6 +123,7 @@ def without(known, key):
     return known.covariance - np.outer(column, column) / column[place]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("height_mm", "pair"),
     [
@@ -148,6 +148,36 @@ def test_the_cost_is_part_of_the_lengths_uncertainty(from_water):
     largest = over.std_mm(known.covariance).max()
     assert 0.3 * largest < found[0].cost_mm <= 1.0001 * largest
     assert [line for line in advice_lines(from_water) if line.startswith("next: ")]
+
+
+EDGES = {"left": (0, -1), "right": (0, 1), "upper": (1, -1), "lower": (1, 1)}
+
+
+def test_shots_are_where_their_words_say(from_water):
+    """Depths along the laser's axis, in the order of their words; the edge said to be nearer is so, by 20 deg."""
+    frame, corner = from_water.object_transform(), np.abs(TARGET.extent_mm).max()
+    square, tilted, depths = {}, [], {}
+    for shot in next_shots(from_water):
+        if shot.pose is not None:
+            words = shot.words.split(", ")
+            where, depth = words[1].split(" (Z ")
+            depths[where] = float(depth.removesuffix(" mm)"))
+            along = frame[:3, 2] @ (shot.pose[:3, 3] - frame[:3, 3])
+            assert along == pytest.approx(depths[where], abs=0.5)
+            if "edge" in words[2]:
+                tilted.append((where, words[2].split()[0], shot.pose))
+            else:
+                square[where] = shot.pose
+    assert depths["near"] < depths["in the middle"] < depths["far"]
+    for where, edge, pose in tilted:
+        axis, side = EDGES[edge]
+        # The edge's middle in the target's frame, by the camera's axis that it is far along, and its depth.
+        at = side * square[where][axis, :2]
+        at *= corner / np.linalg.norm(at)
+        nearer = square[where][2, :2] @ at - pose[2, :2] @ at
+        # The target is inclined to the camera by 35 deg: sin(55) - sin(35) or sin(35) - sin(15) about x.
+        assert 0.2 * corner < nearer < 0.4 * corner
+    assert len(tilted) >= 6
 
 
 def test_lengths_do_not_change_by_how_the_frame_turns(from_water):
@@ -187,6 +217,7 @@ def shot(sensor, pose, view, spoilt):
     return Series(view, evidence, None, ["shot"])
 
 
+@pytest.mark.slow
 def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
     """The uncertainty after it within 20 %, as noise, and so the weights, is estimated anew from all residuals."""
     outlooks = next_shots(from_water)
@@ -205,12 +236,10 @@ def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
     assert "in air" not in every
 
 
-def test_a_single_line_covers_no_area(thesis):
+def test_a_single_line_covers_no_area(from_water):
     """One stripe alone cannot be solved; of a calibration whose outline is a line nothing is said of lengths."""
-    series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise(4), columns=15)
-    calibration = solve_jointly(gathered(thesis, [series]), options=OPTIONS).calibration
-    joint = calibration.joint
+    joint = from_water.joint
     line = joint.covered[0].model_copy(update={"outline_mm": ((-50.0, 10.0), (50.0, 10.0))})
-    calibration = calibration.model_copy(update={"joint": joint.model_copy(update={"covered": (line,)})})
+    calibration = from_water.model_copy(update={"joint": joint.model_copy(update={"covered": (line,)})})
     assert next_shots(calibration) == []
     assert "cover no area" in advice_lines(calibration)[0]

@@ -1,5 +1,6 @@
 """Scans of spheres, planes and pipes as evidence: derivatives, and what form and size give away."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from uwlts.calibration.joint.evidence import STEP, Residuals
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import surface_scan, surface_scans
 from uwlts.calibration.joint.parameters import Parameters, Prior
-from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.joint.procedure import JointProblem, solve_jointly
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
@@ -42,6 +43,7 @@ KINDS = {
 }
 
 SLOPE_NAMES = [key.text for key in SLOPES]
+SIZE_FOUND = re.compile(r"found ([\d.]+), described as .* \(([-+.\d]+) mm or ([\d.]+) standard uncertainties off\)")
 
 
 def parameters(**std):
@@ -121,17 +123,22 @@ def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differe
     assert_derivatives(evidence, model, global_values, local, within=1e-4)
 
 
-def test_known_lengths_are_off_by_their_standard_uncertainties():
-    evidence, local = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
-    local, lengths = true_own("spheres", evidence)[: -len(STAGE)], evidence.surface.known_lengths
-    assert lengths(local)[0] == pytest.approx([0.0], abs=1e-9)
+def test_known_sizes_are_off_by_their_standard_uncertainties():
+    """Diameters of unknown uncertainty do not count, nor does anything of the same spheres of unknown size."""
+    evidence, _ = evidence_of("spheres", artefact=STANDARD.model_copy(update={"spacing_uncertainty_mm": 0.02}))
+    surface = evidence.surface
+    local = true_own("spheres", evidence)[: surface.parameter_count()]
+    assert surface.sizes(local).residuals()[0] == pytest.approx([0.0], abs=1e-9)
     local[3:6] += 0.03 * (local[3:6] - local[:3]) / SPACING
-    off, by_local = lengths(local)
+    local[7] += 0.5
+    assert surface.sizes(local).off_mm == pytest.approx([0.0, 0.5, 0.03], abs=1e-9)
+    off, by_local = surface.sizes(local).residuals()
     assert off == pytest.approx([3.0])
     for place, column in enumerate(by_local.T):
         moved = local.copy()
         moved[place] += 1e-4
-        assert lengths(moved)[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
+        assert surface.sizes(moved).residuals()[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
+    assert len(surface.of_unknown_size().sizes(local).residuals()[0]) == 0
 
 
 class _Held:
@@ -280,6 +287,103 @@ def test_all_kinds_together_with_a_target_in_water(thesis):
     assert max(slopes) < 0.6 * np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
     sources = {image.source.split(",")[0] for image in result.calibration.joint.images}
     assert set(certified) < sources
+
+
+CERTIFIED = {
+    "spheres": {"diameter_uncertainty_mm": 0.01, "spacing_uncertainty_mm": 0.01},
+    "pipe along": {"diameter_uncertainty_mm": 0.02},
+    "pipe across": {"diameter_uncertainty_mm": 0.02},
+}
+
+
+@pytest.fixture(scope="module")
+def target_in_water():
+    drawn = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(5))
+    return target_series(SENSOR, medium=0, positions=np.arange(6) * 30.0 - 100.0, noise=drawn, columns=11)
+
+
+def scanned(kind, **described):
+    """A scan of what it shows, as an artefact that is described otherwise."""
+    drawn = Noise(stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(6))
+    bodies, artefact = KINDS[kind]
+    wrong = artefact.model_copy(update=described)
+    return scan_of(SENSOR, bodies, wrong, stage_mm=STAGE, count=700, noise=drawn, source=f"{kind}.h5")[0]
+
+
+def solved(thesis, target, *scans):
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    return solve_jointly(replace(gathered(thesis, [target]), scans=[*scans]), options=options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "name", "true_mm"),
+    [
+        ("spheres", {"diameters_mm": (50.0, 53.0)}, "diameter of sphere 2", 52.0),
+        ("spheres", {"spacings_mm": (SPACING + 1.0,)}, "spacing of spheres 1 and 2", SPACING),
+        ("pipe along", {"diameter_mm": 221.0}, "diameter of the pipe", 220.0),
+        ("pipe across", {"diameter_mm": 61.0}, "diameter of the pipe", 60.0),
+    ],
+)
+def test_a_size_described_a_millimetre_wrong_is_refused_by_its_name(
+    thesis, target_in_water, kind, wrong, name, true_mm
+):
+    """Certified to 0.02 mm; the scans measure these sizes with standard uncertainties of 0.07 mm at most.
+
+    Taken for right, the window's distance errs by two of its stated uncertainties more, with a doubt about the model.
+    """
+    right = scanned("spheres", **CERTIFIED["spheres"])
+    with pytest.raises(CalibrationError, match="most likely it is described wrongly") as caught:
+        solved(thesis, target_in_water, right, replace(scanned(kind, **wrong, **CERTIFIED[kind]), source="wrong.h5"))
+    said = str(caught.value)
+    found, off, sigmas = (float(text) for text in SIZE_FOUND.search(said).groups())
+    assert said.count("described as") == 1
+    assert f"wrong.h5: {name} found" in said
+    assert abs(found - true_mm) < 0.3
+    assert off == pytest.approx(found - true_mm - 1.0, abs=1e-3)
+    assert sigmas > 10
+
+
+def test_sizes_that_are_all_off_by_the_same_share_may_be_the_targets_fault(thesis, target_in_water):
+    larger = {"diameters_mm": (50.5, 52.52), "spacings_mm": (1.01 * SPACING,)}
+    with pytest.raises(CalibrationError, match=r"all known sizes are off by the same -0\.99 %: check the target's"):
+        solved(thesis, target_in_water, scanned("spheres", **larger, **CERTIFIED["spheres"]))
+
+
+def test_a_wrong_size_without_a_stated_uncertainty_does_no_harm_and_is_told(thesis, target_in_water):
+    """It is estimated; a millimetre is worth a warning, 0.18 % of it is not, though measured to 0.03 %."""
+    result = solved(thesis, target_in_water, scanned("spheres", diameters_mm=(50.09, 53.0)))
+    (said,) = result.warnings
+    assert said.startswith("spheres.h5: diameter of sphere 2 found 5")
+    assert said.endswith("it was estimated")
+    right = solved(thesis, target_in_water, scanned("spheres"))
+    assert right.warnings == []
+    np.testing.assert_allclose(result.calibration.camera.fx_px, right.calibration.camera.fx_px, rtol=1e-5)
+
+
+def test_what_only_a_known_size_contradicts_it_is_the_cause_of(thesis, target_in_water, monkeypatch):
+    """A pipe found 4.5 standard uncertainties too small is a doubt, but not where nothing else explains a misfit."""
+    scan = scanned("pipe along", diameter_mm=220.16, **CERTIFIED["pipe along"])
+    warnings = solved(thesis, target_in_water, scan).warnings
+    assert warnings[0].startswith("pipe along.h5: diameter of the pipe found 220.0")
+    as_described = JointProblem._judged_as_described
+
+    def misfitting(problem):
+        result, against = as_described(problem)
+        known = problem.evidence[-1].surface.diameter_std_mm < np.inf
+        return result, replace(against, misfits={"target": "a misfit"}) if known else against
+
+    monkeypatch.setattr(JointProblem, "_judged_as_described", misfitting)
+    with pytest.raises(CalibrationError, match=r"itself: pipe along.h5: diameter .* off\): most .*; a misfit"):
+        solved(thesis, target_in_water, scan)
+
+
+def test_images_of_a_scan_are_left_out_as_long_as_enough_agree(thesis, target_in_water):
+    seen = replace(gathered(thesis, [target_in_water]), scans=[scanned("spheres")])
+    assert seen.without({"spheres.h5, at 0 mm"}).scans[0].image_names() == seen.scans[0].image_names()
+    (kept,) = seen.without({"spheres.h5, at 0 mm", "spheres.h5, at -18 mm"}).scans
+    assert np.unique(kept.frame).tolist() == sorted({*seen.scans[0].frame.tolist()} - {0, 6})
+    assert len(kept.line) == len(kept.slopes) == np.isin(seen.scans[0].frame, kept.frame).sum()
+    assert seen.without({f"spheres.h5, at {position:g} mm" for position in STAGE[:4]}) is None
 
 
 def test_scans_that_do_not_show_what_they_say_are_left_out():
