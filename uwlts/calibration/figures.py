@@ -51,7 +51,11 @@ def lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVal
     tried: list[JsonValue] = [
         {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates
     ]
+    halves: dict[str, JsonValue] = {
+        name: [each[name] for each in lens.half_values()] for name in lens.std() if lens.half_values()
+    }
     return {
+        "halves": halves,
         "lens_model": lens.name,
         "models_tried": tried,
         "rejected_share": lens.rejected_share,
@@ -60,8 +64,10 @@ def lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVal
     }
 
 
-def sheet_figures(solution: SheetSolution, points: StripePoints) -> dict[str, JsonValue]:
-    """Distances of the stripe points from the sheet, as files hold them."""
+def sheet_figures(
+    solution: SheetSolution, points: StripePoints, halves_apart_rad: float | None
+) -> dict[str, JsonValue]:
+    """Distances of the stripe points from the sheet, as files hold them; the angle between the sheets of halves."""
     return {
         "images": len(np.unique(points.image)),
         "points": len(points.points_mm),
@@ -69,6 +75,7 @@ def sheet_figures(solution: SheetSolution, points: StripePoints) -> dict[str, Js
         "max_mm": solution.max_mm,
         "rejected_share": solution.rejected_share,
         "normal_std_deg": float(np.degrees(solution.normal_std_rad)),
+        "halves_apart_deg": None if halves_apart_rad is None else float(np.degrees(halves_apart_rad)),
         "turn_from_nominal_deg": float(np.degrees(solution.turn_rad)),
     }
 

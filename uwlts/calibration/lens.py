@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
-from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
+from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.target_images import TargetImage
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import CameraModel
@@ -31,6 +31,8 @@ _SOFT, _OUTLIER = 2.0, 5.0  # robust standard deviations from where a point coun
 _LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
 _LEAST_SCATTER_PX = 1e-6  # of points; drawn ones may have none
 _MOVED = 3.0  # standard uncertainties by which one image may move a parameter
+HALVES_APART = 4.0
+"""Standard uncertainties that a parameter from one half of the images may differ from that by the other."""
 _FEWEST_IMAGES, _LARGEST_LEFT_OUT = 5, 0.2
 
 Distortion = Literal["auto"] | tuple[str, ...]
@@ -83,6 +85,7 @@ class LensCalibration:
     moved : (F,); how far leaving out each image used moves a parameter at most, in its standard deviations without it;
         NaN if without it nothing is determined
     rejected_share : share of the points that were left out, of the images used
+    halves : (2,); the solutions from every second image and from the others, None where they determine none
     without : (F,); the solutions from all images used but one, None where they determine none
     candidates : models compared; none if the model was given
     options : the model that was taken
@@ -95,6 +98,7 @@ class LensCalibration:
     left_out: dict[int, str]
     moved: np.ndarray
     without: list[CameraSolution | None]
+    halves: list[CameraSolution | None]
     rejected_share: float
     candidates: list[LensCandidate]
     options: CameraOptions
@@ -107,14 +111,41 @@ class LensCalibration:
 
     def values(self) -> dict[str, float]:
         """Every estimated parameter."""
-        model = self.solution.model
-        known = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
-        known |= model.distortion.model_dump()
-        return {name: known[name] for name in self.solution.parameters}
+        return parameter_values(self.solution)
 
     def std(self) -> dict[str, float]:
         """Standard uncertainty of every estimated parameter."""
         return dict(zip(self.solution.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def half_values(self) -> list[dict[str, float]]:
+        """Every estimated parameter by each half of the images; none where a half determines no camera."""
+        found = [each for each in self.halves if each is not None]
+        return [parameter_values(each) for each in found] if len(found) == 2 else []
+
+    def half_doubts(self) -> list[str]:
+        """What the halves of the images say against the uncertainties, in words.
+
+        Of independent halves the difference has twice the standard uncertainty that is stated of all.
+        """
+        doubts, values = [], self.half_values()
+        for name, std in self.std().items() if values else ():
+            one, two = (each[name] for each in values)
+            apart = abs(two - one) / (2 * std)
+            if apart > HALVES_APART:
+                digits = 6 if name in DISTORTION else 2
+                doubts.append(
+                    f"two halves of the images disagree: {name} is {one:.{digits}f} and {two:.{digits}f}, {apart:.1f} "
+                    "standard uncertainties of such a difference apart: uncertainties are larger than stated"
+                )
+        return doubts
+
+
+def parameter_values(solution: CameraSolution) -> dict[str, float]:
+    """The estimated parameters of a solution."""
+    model = solution.model
+    known = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
+    known |= model.distortion.model_dump()
+    return {name: known[name] for name in solution.parameters}
 
 
 def calibrate_lens(
@@ -142,7 +173,7 @@ def calibrate_lens(
     """
 
     def solved(
-        chosen: Sequence[TargetImage], options: CameraOptions, start: CameraSolution | None = None, *, circles: bool
+        chosen: Sequence[TargetImage], start: CameraSolution | None = None, *, options: CameraOptions, circles: bool
     ) -> CameraSolution:
         return solve_camera(
             chosen,
@@ -160,15 +191,15 @@ def calibrate_lens(
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
         """Points (N,) of each image near to where the lens sees them, found without trust in any of them."""
-        plain = solved(images, options, circles=True)
-        robust = solved(images, replace(options, soft_limit_px=_SOFT * _scatter(plain)), plain, circles=True)
+        plain = solved(images, options=options, circles=True)
+        robust = solved(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
     options, keep = usual, inliers(usual)
     good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        centred = _centred(good, solved(good, usual, circles=True))
+        centred = _centred(good, solved(good, options=usual, circles=True))
         squares: dict[CameraOptions, np.ndarray] = {}
         for further in (tried, _candidates(_RATIONAL, choice, poses)):
             for number, each in enumerate(further):
@@ -194,15 +225,18 @@ def calibrate_lens(
         and choice.tangential > 0
         and "p1" not in full.distortion
     ):
-        scatter = _scatter(solved([*cleaned.values()], options, circles=True))
+        scatter = _scatter(solved([*cleaned.values()], options=options, circles=True))
         names = (*options.distortion, "p1", "p2")
         full = replace(options, distortion=names, tangential=(choice.tangential, max(scatter, _LEAST_SCATTER_PX)))
     intrinsics = Intrinsics(full, width_px=width_px, height_px=height_px)
+    solved_again = partial(solved, options=full, circles=False)
     while True:
         chosen = [cleaned[number] for number in used]
-        solution = solved(chosen, full, circles=True)
+        solution = solved(chosen, options=full, circles=True)
         centred = _centred(chosen, solution)
-        without = _without_one(centred, solution, lambda i, s: solved(i, full, s, circles=False))
+        numbers = np.arange(len(used))
+        all_but_one = [np.delete(numbers, number) for number in numbers]
+        without = _of_some(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
         others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])
@@ -228,6 +262,7 @@ def calibrate_lens(
         left_out=left_out,
         moved=moved,
         without=without,
+        halves=_of_some(centred, solution, [numbers[::2], numbers[1::2]], solved_again),
         rejected_share=float(1.0 - np.mean(np.concatenate([keep[number] for number in used]))),
         candidates=candidates,
         options=options,
@@ -326,18 +361,18 @@ def _chosen(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOpti
     return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual
 
 
-def _without_one(
+def _of_some(
     images: list[TargetImage],
     solution: CameraSolution,
+    chosen: Sequence[np.ndarray],
     solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
 ) -> list[CameraSolution | None]:
-    """The solutions from all images but one; None where they determine none."""
+    """The solutions from some of the images, by their numbers; None where they determine none."""
     found: list[CameraSolution | None] = []
-    for number in range(len(images)):
-        rest = [image for place, image in enumerate(images) if place != number]
-        start = replace(solution, target_poses=np.delete(solution.target_poses, number, axis=0))
+    for numbers in chosen:
         try:
-            found.append(solve(rest, start))
+            start = replace(solution, target_poses=solution.target_poses[numbers])
+            found.append(solve([images[number] for number in numbers], start))
         except CalibrationError:
             found.append(None)
     return found

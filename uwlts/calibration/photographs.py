@@ -149,7 +149,7 @@ def calibrate_camera(
         photographs[places[place]] = Photograph(name, found[place].pixels, reason)
         warnings.append(f"{name}: left out, {reason}")
     warnings += [f"{each.name}: {each.reason}" for each in photographs if not len(each.pixels)]
-    return CameraCalibration(folder, described, lens, photographs, warnings)
+    return CameraCalibration(folder, described, lens, photographs, warnings + lens.half_doubts())
 
 
 def _described_target(folder: Path, path: str | Path | None) -> Target:

@@ -17,7 +17,7 @@ from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_
 from uwlts.calibration.figures import camera_figures, lens_figures, sheet_figures, window_figures
 from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.lens import LensCalibration, LensChoice, calibrate_lens, jackknife
+from uwlts.calibration.lens import HALVES_APART, LensCalibration, LensChoice, calibrate_lens, jackknife
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
 from uwlts.calibration.step_images import label_steps
 from uwlts.calibration.window import WindowSolution, solve_window
@@ -189,12 +189,14 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     sheet = fit_sheet(
         stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
     )
-    figures = {"camera": camera_figures(camera)}
+    figures, apart = {"camera": camera_figures(camera)}, None
+    warnings = [*evidence.warnings, *seen.warnings]
     if seen.lens is not None:
-        sheet = _by_images(sheet, seen.lens, found)
+        sheet, apart = _by_images(sheet, seen.lens, found), _halves_apart_rad(sheet, seen.lens, found)
         figures["camera"] |= lens_figures(seen.lens, found)
-    figures["sheet"] = sheet_figures(sheet, stripe_points)
-    warnings = [*evidence.warnings, *seen.warnings, *_turn_warnings(camera, sheet, evidence)]
+        warnings += [*seen.lens.half_doubts(), *_half_doubts(sheet, apart)]
+    figures["sheet"] = sheet_figures(sheet, stripe_points, apart)
+    warnings += _turn_warnings(camera, sheet, evidence)
     calibration = Calibration(
         sensor_name=sensor.name,
         stripe_along=sensor.camera.stripe_along,
@@ -330,19 +332,47 @@ def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) 
 
     Camera and poses are those without the image, so that their errors, which the points of one image share, count.
     """
-    changes, normal = [], np.array(sheet.model.normal)
-    for number, solution in enumerate(lens.without):
-        stripes = [stripe for place, stripe in enumerate(found.stripes) if place != number]
-        if solution is None or not len(found.stripes[number]):
-            continue
-        with suppress(CalibrationError):
-            points = points_on_target(solution.model, stripes, solution.target_poses, plate_mm=found.target.plate_mm)
-            other = fit_sheet(points.points_mm, nominal_normal=normal)
-            changes.append(np.array(other.model.normal) - normal)
+    normal = np.array(sheet.model.normal)
+    changes = [
+        other - normal
+        for number, solution in enumerate(lens.without)
+        if len(found.stripes[number])
+        and (other := _normal_by(solution, np.delete(np.arange(len(found.stripes)), number), normal, found)) is not None
+    ]
     if len(changes) < _FEWEST_LEFT_OUT:
         return sheet
     std = float(np.sqrt(np.linalg.eigvalsh(jackknife(np.array(changes))).max()))
     return replace(sheet, normal_std_rad=max(sheet.normal_std_rad, std))
+
+
+def _normal_by(
+    solution: CameraSolution | None, numbers: np.ndarray, near: np.ndarray, found: AirEvidence
+) -> np.ndarray | None:
+    """Normal (3,) of the sheet by a camera that was solved from some of the images; None where it determines none."""
+    if solution is None:
+        return None
+    stripes = [found.stripes[number] for number in numbers]
+    with suppress(CalibrationError):
+        points = points_on_target(solution.model, stripes, solution.target_poses, plate_mm=found.target.plate_mm)
+        return np.array(fit_sheet(points.points_mm, nominal_normal=near).model.normal)
+    return None
+
+
+def _halves_apart_rad(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
+    """Angle between the normals of the sheets by two halves of the images, each with its own camera."""
+    numbers, near = np.arange(len(found.stripes)), np.array(sheet.model.normal)
+    one, two = (_normal_by(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
+    return None if one is None or two is None else float(np.arccos(np.clip(one @ two, -1.0, 1.0)))
+
+
+def _half_doubts(sheet: SheetSolution, apart_rad: float | None) -> list[str]:
+    """What the sheets of the halves say against the uncertainty of the normal, in words."""
+    if apart_rad is None or (sigmas := apart_rad / (2 * sheet.normal_std_rad)) <= HALVES_APART:
+        return []
+    return [
+        f"two halves of the images disagree: their sheets are {np.degrees(apart_rad):.3f} deg apart, {sigmas:.1f} "
+        "standard uncertainties of such a difference: uncertainties are larger than stated"
+    ]
 
 
 def _leaning(camera: CameraSolution, freer: CameraSolution) -> list[str]:

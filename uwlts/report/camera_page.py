@@ -68,10 +68,14 @@ def _summary(camera: CameraCalibration) -> list[str]:
         f"{len(lens.used)} of {len(camera.photographs)} images used, {lens.solution.rms_px():.3f} px rms",
         f"{100 * lens.rejected_share:.1f} % of their points left out as outliers",
     ]
-    std = lens.std()
+    std, halves = lens.std(), lens.half_values()
     for name, value in lens.values().items():
         digits, unit = (6, "") if name in DISTORTION else (3, " px")
-        lines.append(f"{name} = {value:.{digits}f} +- {std[name]:.{digits}f}{unit}")
+        by_half = " and ".join(f"{half[name]:.{digits}f}" for half in halves)
+        lines.append(
+            f"{name} = {value:.{digits}f} +- {std[name]:.{digits}f}{unit}"
+            + (f" (by every second image and by the others {by_half})" if halves else "")
+        )
     return lines
 
 

@@ -222,7 +222,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         sheet=("rms_mm", "sheet residual: {:.4f} mm"),
         window=("std_mm", "window: {:.3f} mm standard uncertainty of d"),
     )
-    lines += _image_lines(calibration.figures("camera"))
+    lines += _image_lines(calibration.figures("camera"), calibration.figures("sheet"))
     if (joint := calibration.joint) is not None:
         lines.append("joint estimate, with standard uncertainties after and before:")
         for key, value, std, before in zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True):
@@ -233,7 +233,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _image_lines(camera: Mapping[str, JsonValue]) -> list[str]:
+def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]) -> list[str]:
     """The lens model, and what each image of the target gave; none where a calibration does not hold that."""
     table = camera.get("image_table")
     if not isinstance(table, list):
@@ -253,7 +253,16 @@ def _image_lines(camera: Mapping[str, JsonValue]) -> list[str]:
             )
             moved = f"{moves:11.2f}" if isinstance(moves, float) else f"{'-':>11}"
             lines.append(f"  {points:6}  {rms:9.3f}  {moved}  {stripe:6}  {outliers:8}  {name}")
-    return lines
+    halves, apart = camera.get("halves"), sheet.get("halves_apart_deg")
+    by_half = [
+        f"{name} {one:.6g} and {two:.6g}"
+        for name, pair in (halves.items() if isinstance(halves, dict) else ())
+        if isinstance(pair, list) and len(pair) == 2
+        for one, two in [pair]
+        if isinstance(one, float) and isinstance(two, float)
+    ]
+    by_half += [f"sheets {apart:.3f} deg apart"] if isinstance(apart, float) else []
+    return lines + ([f"by every second image and by the others: {', '.join(by_half)}"] if by_half else [])
 
 
 def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:

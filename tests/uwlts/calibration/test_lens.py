@@ -121,6 +121,18 @@ def test_an_image_that_alone_decides_is_left_out_and_named():
     assert len(reasons) >= 4
 
 
+def test_halves_of_the_images_by_another_focal_length_are_noticed():
+    """A lens that was zoomed from image to image: leaving out single ones states a sixth of the halves' difference."""
+    same, zoomed = views(8, count=18), views(9, count=18, fx=1.02 * F, fy=1.02 * F)
+    alike = lens(views(8, count=36), distortion=("k1", "k2"), pixels="square")
+    assert alike.half_doubts() == []
+    one, two = alike.half_values()
+    assert one["f"] != two["f"] and max(abs(each["f"] - F) for each in (one, two)) < 5 * 1.5 * alike.std()["f"]
+    images = [image for pair in zip(same, zoomed, strict=True) for image in pair]
+    doubts = lens(images, distortion=("k1", "k2"), pixels="square").half_doubts()
+    assert any("two halves of the images disagree: f is" in doubt for doubt in doubts)
+
+
 def test_misplaced_points_are_left_out():
     images = views(6)
     rng = np.random.default_rng(1)

@@ -19,8 +19,13 @@ BARE = altered(built_sensor(), {"camera": {"window": {"mounted": False}}})
 POSITIONS = np.arange(12) * 20.0
 
 
-def calibrated(images: list[TargetImage], at: np.ndarray, *, seed: int, **options) -> CalibrationResult:
+def calibrated(
+    images: list[TargetImage], at: np.ndarray, *, seed: int, spread_px: float = 0.0, **options
+) -> CalibrationResult:
+    """From images and stripes; in every second image the stripe is turned, ``spread_px`` from side to side."""
     stripes = stripes_on_target(BARE, at, noise_px=0.1, rng=np.random.default_rng([seed, 1]))
+    for stripe in stripes[1::2]:
+        stripe[:, 1] += spread_px * (stripe[:, 0] / BARE.camera.width_px - 0.5)
     names = [(0, 2 * number) for number in range(len(images))]
     air = AirEvidence(TARGET, images, names, stripes, [], outliers=[0] * len(images), captures=["air.h5"])
     direction = np.array([0.0, 0.0, 1.0])
@@ -52,6 +57,21 @@ def test_an_image_with_a_wrong_position_is_left_out_and_named():
     lines = "\n".join(calibration_lines(found.calibration))
     assert "lens: k1 k2, square pixels" in lines
     assert "images of the target: 11 used, 1 left out" in lines
+    one, two = found.calibration.figures("camera")["halves"]["f"]
+    assert one != two and abs(one - two) < 8 * std["f"] and f"f {one:.6g} and {two:.6g}" in lines
+    apart = found.calibration.figures("sheet")["halves_apart_deg"]
+    assert 0 < apart < 8 * np.degrees(found.sheet.normal_std_rad) and f"sheets {apart:.3f} deg apart" in lines
+
+
+def test_halves_of_the_images_with_different_sheets_are_noticed():
+    """Leaving out single images states what the halves differ by over the root of 24, the number of images."""
+    positions = np.arange(24) * 10.0
+    images, poses, _ = stage_images(
+        BARE, positions=positions, noise_px=0.05, rng=np.random.default_rng(3), points=lattice()
+    )
+    assert calibrated(images, poses, seed=3).warnings == []
+    (warning,) = calibrated(images, poses, seed=3, spread_px=2.0).warnings
+    assert warning.startswith("two halves of the images disagree: their sheets are 0.")
 
 
 def test_a_stage_beside_the_normal_is_noticed_and_taken_for_no_other_lens():
