@@ -43,7 +43,7 @@ def test_circles_out_of_focus_are_found_where_they_are():
         def image_of(moved, points=points, pose=pose):
             """Pixels for a change of pose (6,), p1 and focal length."""
             wider = matrix + np.diag([moved[7], moved[7], 0.0])
-            return seen(points, pose + moved[:6], wider, distortion + moved[6] * np.eye(5)[2]).ravel()
+            return seen(points, pose + moved[:6], wider, distortion + moved[6] * np.eye(8)[2]).ravel()
 
         steps = np.diag([1e-4] * 6 + [1e-5, 0.1])
         by_all = np.stack([image_of(step) - image_of(-step) for step in steps], axis=1) / (2 * steps.sum(axis=1))

@@ -13,6 +13,7 @@ from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.channels import is_formula, one_channel
+from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.storage.import_.description import (
     NAME,
     ImportDescription,
@@ -23,6 +24,7 @@ from uwlts.storage.import_.description import (
 from uwlts.storage.import_.images import bits_of, grey_values, read_image, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe.recording import BLACK, WHITE, is_black, shown_stripe, white_share
+from uwlts.targets import parse_target
 
 _SIZE_ADVICE = {
     (True, True): "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
@@ -194,6 +196,11 @@ def import_images(
         part_path(out).unlink(missing_ok=True)
         raise
     warnings = content.warnings()
+    if header.target is not None:
+        lamps = [folder / row.file for row in frames if row.light == "lamp"]
+        channel, wavelength = given.lamp_channel or given.channel, header.sensor.laser.wavelength_nm
+        target = parse_target(header.target)
+        warnings += chromatic_warnings(lamps, target, lamp_channel=channel, wavelength_nm=wavelength)
     if unmatched := matched.unmatched:
         few = ", ".join(unmatched[:3])
         warnings.append(f"{len(unmatched)} images of the folder are left out, as nothing says what they are: {few}")
