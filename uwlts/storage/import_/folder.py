@@ -196,10 +196,10 @@ def import_images(
         part_path(out).unlink(missing_ok=True)
         raise
     warnings = content.warnings()
-    if header.target is not None:
+    if given.target is not None:
         lamps = [folder / row.file for row in frames if row.light == "lamp"]
         channel, wavelength = given.lamp_channel or given.channel, header.sensor.laser.wavelength_nm
-        target = parse_target(header.target)
+        target = parse_target(given.target)
         warnings += chromatic_warnings(lamps, target, lamp_channel=channel, wavelength_nm=wavelength)
     if unmatched := matched.unmatched:
         few = ", ".join(unmatched[:3])
