@@ -212,8 +212,8 @@ def _pytest() -> list[str]:
     return [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
 
 
-def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int, console: Console) -> list[Result]:
-    """Try mutants of a package."""
+def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int, console: Console) -> Iterator[Result]:
+    """Try mutants of a package, one result after the other."""
     with tempfile.TemporaryDirectory() as temporary:
         folders: SimpleQueue[Path] = SimpleQueue()
         for worker in range(workers):
@@ -228,7 +228,7 @@ def of_package(package: str, mutants: list[Mutant], *, slow: bool, workers: int,
                 folders.put(folder)
 
         with ThreadPoolExecutor(workers) as pool:
-            return list(track(pool.map(one, mutants), package, total=len(mutants), console=console))
+            yield from track(pool.map(one, mutants), package, total=len(mutants), console=console)
 
 
 def read(path: Path) -> list[Result]:
@@ -243,7 +243,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="draw others by another number")
     parser.add_argument("--again", type=Path, help="try the survivors of these results on all tests")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each package")
+    parser.add_argument("--out", type=Path, default=Path("mutants.json"), help="results, written after each mutant")
     options = parser.parse_args()
     if unknown := set(options.packages) - TESTS.keys():
         parser.error(f"no tests are named for {', '.join(sorted(unknown))}: choose from {', '.join(TESTS)}")
@@ -254,9 +254,9 @@ def main() -> None:
         else:
             mutants = drawn(package, options.sample, random.Random(f"{options.seed} {package}"))
         slow = options.again is not None
-        tried_now = of_package(package, mutants, slow=slow, workers=options.workers, console=console)
-        results = [each for each in results if each.mutant not in mutants] + tried_now
-        options.out.write_text(json.dumps([asdict(result) for result in results], indent=1))
+        for result in of_package(package, mutants, slow=slow, workers=options.workers, console=console):
+            results = [each for each in results if each.mutant != result.mutant] + [result]
+            options.out.write_text(json.dumps([asdict(each) for each in results], indent=1))
     table = Table("package", "mutants", "killed", "survived", "not run", "score")
     for package in dict.fromkeys(result.mutant.package for result in results):
         count = Counter(result.outcome for result in results if result.mutant.package == package)

@@ -1,4 +1,4 @@
-"""What real recordings show beside the effects of an ordinary rendering; see `twin.options.Flaws`.
+"""Flaws of real recordings, which an ordinary rendering does not have; see `twin.options.Flaws`.
 
 Some are built into the sensor (`as_built`), some change the light on the image sensor (`vignette`, `veiled`,
 `laser_shares`), and some what the camera makes of its grey values (`delivered`).

@@ -160,6 +160,11 @@ class CameraSolution:
     stopped: str
     bias_px: list[np.ndarray] | None = None
 
+    def values(self) -> dict[str, float]:
+        """Every estimated parameter."""
+        known = self.model.parameters()
+        return {name: known[name] for name in self.parameters}
+
     def std(self) -> dict[str, float]:
         """Standard deviation of every estimated parameter."""
         return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
@@ -324,8 +329,9 @@ def _solution(
 ) -> CameraSolution:
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
     residuals = [np.empty((0, 2))] * len(images)
-    # What is known before is a group of its own, the last.
-    for view, local, covariance, misses in zip(views, fit.local, fit.local_covariances, fit.residuals, strict=False):
+    # What is known before is a group of its own, behind those of the views.
+    own = (each[: len(views)] for each in (fit.local, fit.local_covariances, fit.residuals))
+    for view, local, covariance, misses in zip(views, *own, strict=True):
         rotation = cv2.Rodrigues(local[:3])[0]
         directions.append(rotation @ view.direction(local[6:]))
         for index in np.unique(view.image):

@@ -51,11 +51,8 @@ def lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVal
     tried: list[JsonValue] = [
         {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates
     ]
-    halves: dict[str, JsonValue] = {
-        name: [each[name] for each in lens.half_values()] for name in lens.std() if lens.half_values()
-    }
     return {
-        "halves": halves,
+        "halves": [{**half} for half in lens.half_values()],
         "lens_model": lens.name,
         "models_tried": tried,
         "rejected_share": lens.rejected_share,

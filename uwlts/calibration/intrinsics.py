@@ -77,9 +77,8 @@ class Intrinsics:
 
     def from_model(self, model: CameraModel) -> np.ndarray:
         """The estimated parameters (P,) of a camera model."""
-        distortion = model.distortion.model_dump()
-        start = zip(self.names, self.from_matrix(model.matrix()), strict=True)
-        return np.array([distortion.get(name, value) for name, value in start])
+        known = model.parameters()
+        return np.array([known[name] for name in self.names])
 
     def model(self, estimated: np.ndarray) -> CameraModel:
         """The camera model."""

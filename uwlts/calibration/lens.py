@@ -111,7 +111,7 @@ class LensCalibration:
 
     def values(self) -> dict[str, float]:
         """Every estimated parameter."""
-        return parameter_values(self.solution)
+        return self.solution.values()
 
     def std(self) -> dict[str, float]:
         """Standard uncertainty of every estimated parameter."""
@@ -120,32 +120,30 @@ class LensCalibration:
     def half_values(self) -> list[dict[str, float]]:
         """Every estimated parameter by each half of the images; none where a half determines no camera."""
         found = [each for each in self.halves if each is not None]
-        return [parameter_values(each) for each in found] if len(found) == 2 else []
+        return [each.values() for each in found] if len(found) == 2 else []
 
     def half_doubts(self) -> list[str]:
-        """What the halves of the images say against the uncertainties, in words.
-
-        Of independent halves the difference has twice the standard uncertainty that is stated of all.
-        """
+        """What the halves of the images say against the uncertainties of the parameters, in words."""
         doubts, values = [], self.half_values()
         for name, std in self.std().items() if values else ():
             one, two = (each[name] for each in values)
-            apart = abs(two - one) / (2 * std)
-            if apart > HALVES_APART:
-                digits = 6 if name in DISTORTION else 2
-                doubts.append(
-                    f"two halves of the images disagree: {name} is {one:.{digits}f} and {two:.{digits}f}, {apart:.1f} "
-                    "standard uncertainties of such a difference apart: uncertainties are larger than stated"
-                )
+            digits = 6 if name in DISTORTION else 2
+            doubts += half_doubt(f"{name} is {one:.{digits}f} and {two:.{digits}f}", apart=abs(two - one), std=std)
         return doubts
 
 
-def parameter_values(solution: CameraSolution) -> dict[str, float]:
-    """The estimated parameters of a solution."""
-    model = solution.model
-    known = {"f": model.fx_px, "fx": model.fx_px, "fy": model.fy_px, "cx": model.cx_px, "cy": model.cy_px}
-    known |= model.distortion.model_dump()
-    return {name: known[name] for name in solution.parameters}
+def half_doubt(found: str, *, apart: float, std: float) -> list[str]:
+    """A warning where two halves of the images are further ``apart`` than a standard uncertainty ``std`` of all allows.
+
+    Of independent halves the difference has twice the standard uncertainty of all.
+    """
+    if apart <= HALVES_APART * 2 * std:
+        return []
+    sigmas = apart / (2 * std)
+    return [
+        f"two halves of the images disagree: {found}, {sigmas:.1f} standard uncertainties of such a difference apart: "
+        "uncertainties are larger than stated"
+    ]
 
 
 def calibrate_lens(

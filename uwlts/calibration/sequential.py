@@ -17,7 +17,7 @@ from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_
 from uwlts.calibration.figures import camera_figures, lens_figures, sheet_figures, window_figures
 from uwlts.calibration.image_turns import refuse_turned_travel
 from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.lens import HALVES_APART, LensCalibration, LensChoice, calibrate_lens, jackknife
+from uwlts.calibration.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
 from uwlts.calibration.sheet import SheetSolution, StripePoints, fit_sheet, object_frame, points_on_target
 from uwlts.calibration.step_images import label_steps
 from uwlts.calibration.window import WindowSolution, solve_window
@@ -194,7 +194,10 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     if seen.lens is not None:
         sheet, apart = _by_images(sheet, seen.lens, found), _halves_apart_rad(sheet, seen.lens, found)
         figures["camera"] |= lens_figures(seen.lens, found)
-        warnings += [*seen.lens.half_doubts(), *_half_doubts(sheet, apart)]
+        warnings += seen.lens.half_doubts()
+        if apart is not None:
+            words = f"their sheets are {np.degrees(apart):.3f} deg apart"
+            warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
     figures["sheet"] = sheet_figures(sheet, stripe_points, apart)
     warnings += _turn_warnings(camera, sheet, evidence)
     calibration = Calibration(
@@ -363,16 +366,6 @@ def _halves_apart_rad(sheet: SheetSolution, lens: LensCalibration, found: AirEvi
     numbers, near = np.arange(len(found.stripes)), np.array(sheet.model.normal)
     one, two = (_normal_by(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
     return None if one is None or two is None else float(np.arccos(np.clip(one @ two, -1.0, 1.0)))
-
-
-def _half_doubts(sheet: SheetSolution, apart_rad: float | None) -> list[str]:
-    """What the sheets of the halves say against the uncertainty of the normal, in words."""
-    if apart_rad is None or (sigmas := apart_rad / (2 * sheet.normal_std_rad)) <= HALVES_APART:
-        return []
-    return [
-        f"two halves of the images disagree: their sheets are {np.degrees(apart_rad):.3f} deg apart, {sigmas:.1f} "
-        "standard uncertainties of such a difference: uncertainties are larger than stated"
-    ]
 
 
 def _leaning(camera: CameraSolution, freer: CameraSolution) -> list[str]:

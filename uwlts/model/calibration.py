@@ -75,6 +75,11 @@ class CameraModel(Description):
         """Camera matrix K (3, 3)."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
+    def parameters(self) -> dict[str, float]:
+        """All parameters by their names, f among them, the mean of fx and fy."""
+        f = {"f": (self.fx_px + self.fy_px) / 2, "fx": self.fx_px, "fy": self.fy_px}
+        return f | {"cx": self.cx_px, "cy": self.cy_px} | self.distortion.model_dump()
+
     def coefficients(self) -> np.ndarray:
         """Distortion coefficients (8,) in OpenCV's order k1 k2 p1 p2 k3 k4 k5 k6."""
         return np.array(list(self.distortion.model_dump().values()))

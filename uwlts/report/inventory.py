@@ -19,6 +19,7 @@ from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics import design as formulas
+from uwlts.report.numbers import numbers_in
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.calibration_file import read_calibration, read_polynomials
@@ -254,13 +255,8 @@ def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]
             moved = f"{moves:11.2f}" if isinstance(moves, float) else f"{'-':>11}"
             lines.append(f"  {points:6}  {rms:9.3f}  {moved}  {stripe:6}  {outliers:8}  {name}")
     halves, apart = camera.get("halves"), sheet.get("halves_apart_deg")
-    by_half = [
-        f"{name} {one:.6g} and {two:.6g}"
-        for name, pair in (halves.items() if isinstance(halves, dict) else ())
-        if isinstance(pair, list) and len(pair) == 2
-        for one, two in [pair]
-        if isinstance(one, float) and isinstance(two, float)
-    ]
+    one, two = map(numbers_in, halves) if isinstance(halves, list) and len(halves) == 2 else ({}, {})
+    by_half = [f"{name} {one[name]:.6g} and {two[name]:.6g}" for name in one if name in two]
     by_half += [f"sheets {apart:.3f} deg apart"] if isinstance(apart, float) else []
     return lines + ([f"by every second image and by the others: {', '.join(by_half)}"] if by_half else [])
 

@@ -57,7 +57,7 @@ def test_an_image_with_a_wrong_position_is_left_out_and_named():
     lines = "\n".join(calibration_lines(found.calibration))
     assert "lens: k1 k2, square pixels" in lines
     assert "images of the target: 11 used, 1 left out" in lines
-    one, two = found.calibration.figures("camera")["halves"]["f"]
+    one, two = (half["f"] for half in found.calibration.figures("camera")["halves"])
     assert one != two and abs(one - two) < 8 * std["f"] and f"f {one:.6g} and {two:.6g}" in lines
     apart = found.calibration.figures("sheet")["halves_apart_deg"]
     assert 0 < apart < 8 * np.degrees(found.sheet.normal_std_rad) and f"sheets {apart:.3f} deg apart" in lines

@@ -10,7 +10,7 @@ from uwlts.storage.import_.channels import one_channel
 from uwlts.storage.import_.images import read_image
 from uwlts.targets import Target
 
-_MOST_IMAGES, _FEWEST_POINTS = 3, 8
+_MOST_IMAGES, _MOST_TRIED, _FEWEST_POINTS = 3, 6, 8
 _OTHER_NUMBERS_PX = 5.0  # colours are never so far apart: points of a symmetric target were numbered in two ways
 _LEAST_PX, _SIGMAS = 0.1, 5.0  # from where two colours count as apart in the image's corners
 _BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
@@ -28,20 +28,21 @@ def chromatic_warnings(
 ) -> list[str]:
     """What speaks against taking the target from ``lamp_channel`` and the stripe from the laser's colour, in words.
 
-    Of some of the lamp images, in the order given. The points of one colour are those of the other, moved and magnified
+    Of the first of the lamp images. The points of one colour are those of the other, moved and magnified
     about the image's middle, as lateral chromatic aberration and a colour filter array do.
     """
     colour = laser_colour(wavelength_nm)
     if lamp_channel in (None, colour):
         return []
     pairs, size = [], np.zeros(2)
-    for path in images:
+    for path in images[:_MOST_TRIED]:
         raw = read_image(path)
         if raw.ndim == 2:
             return []
-        seen = [_seen(target, one_channel(raw, name, name=path.name)) for name in (lamp_channel, colour)]
-        both = sorted(seen[0].keys() & seen[1].keys())
-        lamp, laser = (np.array([points[place] for place in both]).reshape(-1, 2) for points in seen)
+        in_lamp = _seen(target, one_channel(raw, lamp_channel, name=path.name))
+        in_laser = _seen(target, one_channel(raw, colour, name=path.name)) if in_lamp else {}
+        both = sorted(in_lamp.keys() & in_laser.keys())
+        lamp, laser = (np.array([points[place] for place in both]).reshape(-1, 2) for points in (in_lamp, in_laser))
         if len(both) >= _FEWEST_POINTS and np.median(np.abs(laser - lamp)) < _OTHER_NUMBERS_PX:
             size = np.array(raw.shape[1::-1])
             pairs.append((lamp, laser))

@@ -1,4 +1,4 @@
-"""What is said of estimates made by hand: limits of doubts and contradictions, figures and advice in words."""
+"""Texts for estimates written by hand: when doubts and contradictions appear, and which figures and advice they hold."""
 
 import re
 from dataclasses import replace
@@ -213,9 +213,9 @@ def test_a_stage_that_does_not_move_as_described_is_told(staged, tilt_deg, error
     piece, local = staged
     local = np.concatenate([local[:6], [np.tan(np.radians(tilt_deg)), 0.0], errors_mm])
     result, _ = estimate_of(local=[local], residuals=[[]])
-    told = findings(result, [piece], sensor=SENSOR).contradictions
-    assert len(told) == (0 if said is None else 1)
-    assert all(words.startswith(said) for words in told)
+    found = findings(result, [piece], sensor=SENSOR).contradictions
+    assert len(found) == (0 if said is None else 1)
+    assert all(words.startswith(said) for words in found)
 
 
 def test_a_step_that_seems_too_high_may_not_face_the_laser():
