@@ -1,4 +1,4 @@
-"""Texts for estimates written by hand: when doubts and contradictions appear, and which figures and advice they hold."""
+"""Texts for estimates written by hand: when doubts and contradictions appear, which figures and advice they hold."""
 
 import re
 from dataclasses import replace
