@@ -119,7 +119,8 @@ def stripe_at(
     cosine_squared = 1 / (1 + a * a + b * b)
     lens = math.pi / 4 / (number * number) * cosine_squared * cosine_squared
     per_radiance = lens * p.window_passes / (p.medium_index * p.medium_index)
-    electrons = 1e-3 * p.pixel_mm * p.pixel_mm * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
+    pixel_area = p.pixel_mm * p.pixel_mm / p.pixel_aspect
+    electrons = 1e-3 * pixel_area * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
     rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
     ambient = p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons
     ambient = ambient * xp.exp(-p.extinction_per_mm * back)
@@ -435,7 +436,7 @@ def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> lis
     """The first reason why each of N designs cannot work, "" for those that can."""
     n = len(figures.coverage)
     one = partial(_each, designs=n)
-    corner = np.hypot(p.width_px, p.height_px) / 2 * p.pixel_mm / p.focal_mm
+    corner = np.hypot(p.width_px, p.height_px / p.pixel_aspect) / 2 * p.pixel_mm / p.focal_mm
     glass = corner / snell_root(np, p.window_index, corner)
     cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
     spread = np.tan(p.fan_half_rad)

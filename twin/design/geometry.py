@@ -188,9 +188,10 @@ def length_outside_mm(xp: ModuleType, window: WindowGeometry, path: Path) -> Arr
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole with distortion as in `uwlts.model.sensor.Distortion`: focal length and principal point in px."""
+    """A pinhole with distortion as in `uwlts.model.sensor.Distortion`: focal lengths and principal point in px."""
 
-    focal_px: Array
+    fx_px: Array
+    fy_px: Array
     cx: Array
     cy: Array
     k1: Array
@@ -205,7 +206,7 @@ class Lens:
     @classmethod
     def of(cls, camera: Camera) -> Lens:
         """That of a camera's description."""
-        return cls(camera.focal_length_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
+        return cls(*camera.focal_lengths_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
 
     def radial(self, r2: Array) -> tuple[Array, Array]:
         """Radial factor of the distortion at squares of the radius, and twice its derivative by them."""
@@ -238,7 +239,7 @@ def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
 
 def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     """Rays (N, 3) of pixels (N, 2); distortion undone by fixed-point steps. NaN where they do not converge."""
-    wanted = (pixels - (lens.cx, lens.cy)) / lens.focal_px
+    wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx_px, lens.fy_px)
     found = wanted.copy()
     missed = np.full(len(found), np.inf)
     with np.errstate(all="ignore"):
@@ -247,7 +248,7 @@ def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
             image = np.stack([x, y], axis=1)
             missed = np.abs(image - wanted).max(axis=1)
             found += (wanted - image) / radial[:, None]
-        found[~(missed * lens.focal_px < _UNDISTORTED_PX)] = np.nan
+        found[~(missed * lens.fx_px < _UNDISTORTED_PX)] = np.nan
     return np.column_stack([found, np.ones(len(found))])
 
 
@@ -261,12 +262,12 @@ def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> I
     _, slope = lens.radial(r2)
     mixed = slope * a * b + 2 * lens.p1 * a + 2 * lens.p2 * b
     jacobian = (
-        lens.focal_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),
-        lens.focal_px * mixed,
-        lens.focal_px * mixed,
-        lens.focal_px * (radial + slope * b * b + 2 * lens.p2 * a + 6 * lens.p1 * b),
+        lens.fx_px * (radial + slope * a * a + 2 * lens.p1 * b + 6 * lens.p2 * a),
+        lens.fx_px * mixed,
+        lens.fy_px * mixed,
+        lens.fy_px * (radial + slope * b * b + 2 * lens.p2 * a + 6 * lens.p1 * b),
     )
-    return ImagePoints(lens.focal_px * x + lens.cx, lens.focal_px * y + lens.cy, path, (a, b), jacobian)
+    return ImagePoints(lens.fx_px * x + lens.cx, lens.fy_px * y + lens.cy, path, (a, b), jacobian)
 
 
 def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:

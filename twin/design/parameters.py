@@ -43,6 +43,7 @@ class SensorArrays:
     width_px: Array
     height_px: Array
     pixel_mm: Array
+    pixel_aspect: Array
     focal_mm: Array
     principal_px: tuple[Array, Array]
     distortion: tuple[Array, ...]
@@ -114,7 +115,8 @@ class SensorArrays:
 
     def lens(self) -> Lens:
         """The camera's lens."""
-        return Lens(self.focal_mm / self.pixel_mm, *self.principal_px, *self.distortion)
+        fx = self.focal_mm / self.pixel_mm
+        return Lens(fx, self.pixel_aspect * fx, *self.principal_px, *self.distortion)
 
     def _normal(self, xp: ModuleType) -> Vector:
         """Unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""
@@ -155,7 +157,7 @@ class SensorArrays:
         return whole * xp.sqrt(lens) * pixel
 
     def grain_px(self) -> Array:
-        """Size of speckle grains, lambda N (1 + m), in px."""
+        """Size of speckle grains, lambda N (1 + m), in px; along y, too, where pixels are not square."""
         return self.wavelength_mm * self.working_f_number() / self.pixel_mm
 
     def _averaged(self, xp: ModuleType, series: Chebyshev) -> Array:
@@ -231,6 +233,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         "pixel_mm": 1e-3 * camera.pixel_size_um,
+        "pixel_aspect": camera.pixel_aspect,
         "focal_mm": camera.focal_length_mm,
         "f_number": camera.f_number,
         "focus_mm": camera.focus_distance_mm,

@@ -82,7 +82,7 @@ class LineOfSight:
         side = np.linspace(-0.5, 0.5, 41)
         edge = np.concatenate([[(t, -0.5), (t, 0.5), (-0.5, t), (0.5, t)] for t in side])
         pixels = (edge + 0.5) * (camera.width_px - 1, camera.height_px - 1)
-        slopes = (pixels - camera.principal_point()) / camera.focal_length_px()
+        slopes = (pixels - camera.principal_point()) / camera.focal_lengths_px()
         rays = np.column_stack([slopes, np.ones(len(slopes))]) @ rotation
         pupil = -rotation.T @ self.pose[:3, 3]
         length = np.full(len(rays), 1e6)
@@ -91,7 +91,7 @@ class LineOfSight:
         return np.minimum(hits.max(axis=0), 1.25 * self.depth_mm(z) * self._diagonal_slope() / 2)
 
     def _diagonal_slope(self) -> float:
-        return math.hypot(self.camera.width_px, self.camera.height_px) / self.camera.focal_length_px()
+        return 2 * self.camera.corner_slope()
 
 
 def longest_run(flags: np.ndarray | list[bool]) -> slice:

@@ -316,8 +316,7 @@ class Renderer:
         """
         length = dr.select(segment.valid, segment.si.t, self.design.standoff_mm)
         x, y = self.view.slopes(mi.Point3f(segment.origin + segment.direction * length))
-        camera = self.sensor.camera
-        corner = math.hypot(camera.width_px, camera.height_px) / 2 / camera.focal_length_px()
+        corner = self.sensor.camera.corner_slope()
         squared = dr.square(x / corner - _SPOT_ASIDE) + dr.square(y / corner)
         return dr.exp(math.log(1 - self._uneven_lamp) * squared)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.model.errors import DesignError
-from uwlts.model.sensor import Camera, Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor, Window
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,10 @@ class SheetView:
 
 
 def _half_width_mm(
-    camera: Camera, medium_index: float, wavelength_nm: float, side_px: float, depth_mm: np.ndarray
+    window: Window, medium_index: float, wavelength_nm: float, half_slope: float, depth_mm: np.ndarray
 ) -> np.ndarray:
-    """Half the width of the view of an image side at depths outside an untilted window, by Snell's law."""
-    window = camera.window
-    sine = math.sin(math.atan(0.5 * side_px / camera.focal_length_px()))
+    """Half the width of a view of that half slope in air, at depths outside an untilted window, by Snell's law."""
+    sine = math.sin(math.atan(half_slope))
     slopes = [s / math.sqrt(1 - s * s) for s in (sine, sine / window.index(wavelength_nm), sine / medium_index)]
     return slopes[0] * window.distance_mm + slopes[1] * window.thickness_mm + slopes[2] * depth_mm
 
@@ -97,15 +96,16 @@ def view_of_sheet(sensor: Sensor, medium: Medium) -> SheetView:
     index = medium.refractive_index(wavelength)
     outer = camera.window.distance_mm + camera.window.thickness_mm
     standoff = camera_from_object(sensor)[2, 3] - outer
-    across, along, axis = camera.width_px, camera.height_px, 0
+    fx, fy = camera.focal_lengths_px()
+    across, along, axis = camera.width_px / fx / 2, camera.height_px / fy / 2, 0
     if camera.stripe_along == "width":
         across, along, axis = along, across, 1
     depth = np.linspace(0.0, 10 * standoff, 20001)
     sheet = (pose.normal @ pose.origin_mm - pose.normal[2] * (depth + outer)) / pose.normal[axis]
-    seen = np.abs(sheet) <= _half_width_mm(camera, index, wavelength, across, depth)
+    seen = np.abs(sheet) <= _half_width_mm(camera.window, index, wavelength, across, depth)
     if not seen.any():
         raise DesignError("the sheet never crosses the camera's view: change baseline, angle or focal length")
-    length = 2 * _half_width_mm(camera, index, wavelength, along, np.array([standoff]))[0]
+    length = 2 * _half_width_mm(camera.window, index, wavelength, along, np.array([standoff]))[0]
     return SheetView(float(standoff), float(length), float(depth[seen][0]), float(depth[seen][-1]))
 
 
@@ -117,8 +117,7 @@ def check_design(sensor: Sensor, medium: Medium) -> SheetView:
     camera, laser = sensor.camera, sensor.laser
     window = camera.window
     if window.mounted:
-        diagonal = math.hypot(camera.width_px, camera.height_px)
-        half = _half_width_mm(camera, 1.0, laser.wavelength_nm, diagonal, np.zeros(1))[0]
+        half = _half_width_mm(window, 1.0, laser.wavelength_nm, camera.corner_slope(), np.zeros(1))[0]
         needed = 2 * half + camera.focal_length_mm / camera.f_number
         if needed > window.aperture_diameter_mm:
             raise DesignError(

@@ -149,6 +149,11 @@ class Camera(Description):
         """Focal lengths in pixels along x and y."""
         return self.focal_length_px(), self.pixel_aspect * self.focal_length_px()
 
+    def corner_slope(self) -> float:
+        """Slope in air of the rays to the corners of the image, its middle being the principal point."""
+        fx, fy = self.focal_lengths_px()
+        return math.hypot(self.width_px / fx, self.height_px / fy) / 2
+
     def lines(self) -> int:
         """Number of profile lines in an image: its columns if the stripe runs along the width, else its rows."""
         return self.width_px if self.stripe_along == "width" else self.height_px

@@ -306,7 +306,7 @@ def nominal_setup(sensor: Sensor, medium: Medium) -> tuple[Triangulation, float]
     """The sensor's triangulation behind its window, and Z along the laser's axis per depth along the camera's.
 
     A laser placed by its axis, or rolled, counts as the baseline and angle at which its sheet meets the plane of the
-    image's middle line across the stripe and the pupil. Lens distortion and tilts are left out.
+    image's middle line across the stripe and the pupil. Lens distortion and tilts are left out, pixels are square.
     DesignError where the sheet does not cross the camera's axis before the window, the stripe runs along the other side
     of the image, or no window keeps the medium out.
     """

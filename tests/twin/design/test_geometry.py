@@ -17,6 +17,7 @@ from uwlts.optics.design import depth_per_pixel_mm, line_length_mm, nominal_setu
 
 TILTED = {"camera": {"window": {"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}}}
 
+OBLONG = {"camera": {"pixel_aspect": 1.05}}
 RATIONAL = {"camera": {"distortion": {"p1": 0.004, "k3": 0.05, "k4": 0.6, "k5": -0.2, "k6": 0.3}}}
 
 
@@ -63,16 +64,19 @@ def test_points_appear_where_light_of_least_time_comes_from(thesis_as_built, cha
     np.testing.assert_allclose(view.slopes[1].ravel(), rays[:, 1] / rays[:, 2], atol=1e-8)
 
 
-def test_distortion_is_opencvs(thesis_as_built):
-    camera = altered(thesis_as_built, RATIONAL).camera
-    slopes = np.random.default_rng(4).uniform(-0.4, 0.4, (2, 100))
-    x, y, _ = g.distorted(g.Lens.of(camera), *slopes)
-    points, coefficients = np.vstack([slopes, np.ones(100)]).T, np.array(list(camera.distortion.model_dump().values()))
-    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
-    np.testing.assert_allclose(np.stack([x, y], axis=1), seen, atol=1e-14)
+def test_the_lens_is_opencvs(thesis_as_built):
+    camera = altered(thesis_as_built, {"camera": OBLONG["camera"] | RATIONAL["camera"]}).camera
+    (fx, fy), (cx, cy), lens = camera.focal_lengths_px(), camera.principal_point(), g.Lens.of(camera)
+    points, coefficients = points_of_sheet(thesis_as_built), np.array(list(camera.distortion.model_dump().values()))
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    none = g.WindowGeometry((0.0, 0.0, 1.0), 0.0, 0.0, 1.0, 1.0)
+    seen = g.seen(np, lens, none, column(points))
+    np.testing.assert_allclose(np.stack([seen.x, seen.y], axis=1), expected, atol=1e-9)
+    np.testing.assert_allclose(g.directions_of(lens, expected), points / points[:, 2:], atol=1e-6)
 
 
-@pytest.mark.parametrize("changes", [{}, TILTED, RATIONAL])
+@pytest.mark.parametrize("changes", [{}, TILTED, OBLONG, RATIONAL])
 def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
     sensor = altered(thesis_as_built, changes)
     points, p, step = points_of_sheet(sensor), numbers(sensor), 1e-3
@@ -87,6 +91,17 @@ def test_pixels_per_mm_are_the_differences_of_pixels(thesis_as_built, changes):
         np.testing.assert_allclose(dx, (ahead.x - behind.x) / (2 * step), atol=1e-6)
         np.testing.assert_allclose(dy, (ahead.y - behind.y) / (2 * step), atol=1e-6)
         assert np.abs(dx).max() > 0.1
+
+
+@pytest.mark.parametrize(("along", "shorter"), [("width", 1.0), ("height", 1.05)])
+def test_the_line_of_pixels_that_are_not_square(thesis, along, shorter):
+    square = altered(thesis, {"camera": {"stripe_along": along}, "volume": {"near_mm": 300.0, "far_mm": 350.0}})
+    oblong = altered(square, OBLONG)
+    lengths = [figures_of(numbers(s), reflectance=0.5, water_depth_m=100.0)[0].line_mm.item() for s in (square, oblong)]
+    views = [view_of_sheet(s, s.media["water"]).line_length_mm for s in (square, oblong)]
+    # Snell's law makes angles out of slopes, which are 0.3 at most.
+    assert lengths[0] / lengths[1] == pytest.approx(shorter, rel=5e-3)
+    assert views[0] / views[1] == pytest.approx(shorter, rel=5e-3)
 
 
 @pytest.mark.parametrize("medium", ["water", "air"])

@@ -150,7 +150,7 @@ def test_a_missing_or_binary_file(tmp_path: Path):
 def test_the_sensor_takes_them_over():
     sensor = load_sensor("thesis")
     filled = with_intrinsics(sensor, KNOWN, source="camera.yaml")
-    assert filled.camera.focal_length_px() == pytest.approx(2451.0, rel=1e-12)
+    assert filled.camera.focal_lengths_px() == pytest.approx((KNOWN.fx_px, KNOWN.fy_px), rel=1e-12)
     assert filled.camera.principal_point() == (640.5, 511.25) and filled.camera.distortion == KNOWN.distortion
     assert filled.laser == sensor.laser and filled.media == sensor.media
 
@@ -160,6 +160,6 @@ def test_intrinsics_of_another_camera_are_refused():
     other = KnownCamera(2451.0, 2451.0, 512.0, 640.0, Distortion(), (1024, 1280))
     with pytest.raises(DescriptionError, match="1024 x 1280 pixels, the sensor's are 1280 x 1024"):
         with_intrinsics(sensor, other, source="camera.yaml")
-    oblong = KnownCamera(2451.0, 2500.0, 640.0, 512.0, Distortion(), None)
-    with pytest.raises(DescriptionError, match="the focal lengths are 2451.0 and 2500.0 px"):
+    oblong = KnownCamera(2000.0, 2500.0, 640.0, 512.0, Distortion(), None)
+    with pytest.raises(DescriptionError, match=r"pixel_aspect.*1\.25"):
         with_intrinsics(sensor, oblong, source="camera.yaml")

@@ -15,8 +15,6 @@ from uwlts.model.sensor import Distortion, Sensor
 _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
-# Nominal data hold one focal length; a calibration of square pixels differs by less.
-_LARGEST_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -62,10 +60,9 @@ def read_intrinsics(path: Path) -> KnownCamera:
 
 
 def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
-    """The sensor with focal length, principal point and distortion of a known camera.
+    """The sensor with focal lengths, principal point and distortion of a known camera.
 
-    DescriptionError where the camera has another image size, or pixels that are not square: a description has one
-    focal length.
+    DescriptionError where the camera has another image size, or focal lengths that differ by more than pixels do.
     """
     camera = sensor.camera
     if known.size_px is not None and known.size_px != (camera.width_px, camera.height_px):
@@ -73,14 +70,9 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
             f"{source} is for images of {' x '.join(map(str, known.size_px))} pixels, the sensor's are "
             f"{camera.width_px} x {camera.height_px}: give the intrinsics of this camera at this size"
         )
-    focal = (known.fx_px + known.fy_px) / 2
-    if abs(known.fx_px - known.fy_px) > _LARGEST_ASPECT * focal:
-        raise DescriptionError(
-            f"{source}: the focal lengths are {known.fx_px:.1f} and {known.fy_px:.1f} px; a description has one, for "
-            "square pixels: calibrate with square pixels, or check the file"
-        )
     changes = {
-        "focal_length_mm": 1e-3 * focal * camera.pixel_size_um,
+        "focal_length_mm": 1e-3 * known.fx_px * camera.pixel_size_um,
+        "pixel_aspect": known.fy_px / known.fx_px,
         "principal_point_px": [known.cx_px, known.cy_px],
         "distortion": known.distortion.model_dump(),
     }
