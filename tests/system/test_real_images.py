@@ -73,7 +73,7 @@ def test_the_chessboard_gives_the_authors_camera(tmp_path: Path):
         width_px=960,
         height_px=1280,
         poses="free",
-        options=CameraOptions(square_pixels=False, distortion=("k1", "k2", "p1", "p2", "k3")),
+        options=CameraOptions(pixel_aspect=None, distortion=("k1", "k2", "p1", "p2", "k3")),
     )
     # The author's figures, all five coefficients estimated: 1430.39 and 1429.67 px for the image's sides, 0.0272 and
     # -0.231. From the same images, by other corners: agreement is to about a standard deviation (of k2, the worst).

@@ -16,9 +16,10 @@ WATER = 1.3312
 
 @dataclass(frozen=True)
 class Lens:
-    """Pinhole with radial distortion, as the thesis calibrates it, and more of it that a lens may have."""
+    """Pinhole with the distortion that a description may have."""
 
-    f: float
+    fx: float
+    fy: float
     cx: float
     cy: float
     k1: float
@@ -26,14 +27,18 @@ class Lens:
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
 
     def pixels(self, rays):
         x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
         square = x**2 + y**2
         radial = 1 + self.k1 * square + self.k2 * square**2 + self.k3 * square**3
+        radial /= 1 + self.k4 * square + self.k5 * square**2 + self.k6 * square**3
         along = x * radial + 2 * self.p1 * x * y + self.p2 * (square + 2 * x**2)
         down = y * radial + self.p1 * (square + 2 * y**2) + 2 * self.p2 * x * y
-        return np.column_stack([self.f * along + self.cx, self.f * down + self.cy])
+        return np.column_stack([self.fx * along + self.cx, self.fy * down + self.cy])
 
 
 def built_sensor() -> Sensor:
@@ -43,8 +48,7 @@ def built_sensor() -> Sensor:
 
 def lens_of(sensor: Sensor) -> Lens:
     camera = sensor.camera
-    d = camera.distortion
-    return Lens(camera.focal_length_px(), *camera.principal_point(), d.k1, d.k2, d.p1, d.p2, d.k3)
+    return Lens(*camera.focal_lengths_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
 
 
 def inside(pixels, sensor: Sensor):

@@ -70,7 +70,8 @@ def calibrate(
         those that predict images of the target left out best; with stage-normal k1 and k2; jointly k1 and k2, p1
         and p2 as far as the description leaves them open, and k3 where images misfit without.
     pixels : {"auto", "square", "free"}
-        Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one.
+        Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one. Of one, the
+        other follows by the sensor's ``pixel_aspect``.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the captures.
     stripe : StripeOptions or dict, optional
@@ -103,7 +104,9 @@ def calibrate(
     options = CalibrationOptions(
         refractions=refractions,
         poses=poses,
-        camera=CameraOptions(("k1", "k2") if distortion == "auto" else distortion, square_pixels=pixels != "free"),
+        camera=CameraOptions(
+            ("k1", "k2") if distortion == "auto" else distortion, pixel_aspect=None if pixels == "free" else 1.0
+        ),
         lens=LensChoice(distortion, pixels),
         stripe=stripe,
         medium_index=index,

@@ -202,8 +202,8 @@ def solve_camera(
     ----------
     width_px, height_px : size of the images
     poses : {"stage-normal", "stage", "free"}; "stage-normal" (the thesis): one pose per placement of the target, d is
-        the target's normal. "stage": d is estimated too, for each placement; needs square pixels. "free": one pose per
-        image, stage positions unused
+        the target's normal. "stage": d is estimated too, for each placement; needs pixels of known shape. "free": one
+        pose per image, stage positions unused
     approaching : whether growing stage positions bring the sensor nearer to the target; unused by "free"
     start : a solution for nearly the same pixels, with the same options and poses
     circle_diameter_mm : the pixels are centres of the images of circles of this diameter; their offsets from the images
@@ -290,9 +290,9 @@ def _accepted(
         if len(images) < 3:
             raise CalibrationError(f"free poses need at least 3 target images; there are {len(images)}")
         return placements(images, approaching=None)
-    if poses == "stage" and not options.square_pixels:
+    if poses == "stage" and options.pixel_aspect is None:
         raise CalibrationError(
-            "a free stage direction and pixels that are not square cannot be separated: give square pixels, or "
+            "a free stage direction and the pixels' shape cannot be separated: give square pixels, or "
             "poses='stage-normal' or 'free'"
         )
     views = placements(images, approaching=approaching)

@@ -1,12 +1,12 @@
 """Camera parameters that a calibration estimates, and the camera model that they give."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from uwlts.model.calibration import CameraModel
 from uwlts.model.parameter_keys import LensParameter
-from uwlts.model.sensor import Distortion
+from uwlts.model.sensor import Camera, Distortion
 
 DISTORTION = tuple(Distortion.model_fields)
 """Names of the coefficients in OpenCV's order."""
@@ -17,7 +17,7 @@ class CameraOptions:
     """Camera parameters that are estimated."""
 
     distortion: tuple[str, ...] = ("k1", "k2")  # those of k1 to k6, p1 and p2 that are estimated; others are zero
-    square_pixels: bool = True  # whether fx and fy are one focal length f
+    pixel_aspect: float | None = 1.0  # fy / fx where it is known, f being fx; None: both are estimated
     principal_point_px: tuple[float, float] | None = None  # (cx, cy), optional; given, it is not estimated
     tangential: tuple[float, float] | None = None  # known before: standard deviation of p1 and p2 about zero, and the
     # points' in px, over which it is weighed; optional
@@ -29,6 +29,10 @@ class CameraOptions:
             raise ValueError(f"distortion takes each of {', '.join(DISTORTION)} once, not {self.distortion}")
         if self.soft_limit_px is not None and not self.soft_limit_px > 0:
             raise ValueError(f"soft_limit_px must be positive, not {self.soft_limit_px}")
+
+    def described(self, camera: Camera) -> "CameraOptions":
+        """These options, with the pixels' described shape where it is not estimated."""
+        return self if self.pixel_aspect is None else replace(self, pixel_aspect=camera.pixel_aspect)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +49,10 @@ class Intrinsics:
     def __post_init__(self) -> None:
         order = ("fx", "fy", "cx", "cy", *DISTORTION)
         centre = self.options.principal_point_px
-        names = [*(("f",) if self.options.square_pixels else ("fx", "fy")), *(() if centre else ("cx", "cy"))]
+        names = [*(("fx", "fy") if self.options.pixel_aspect is None else ("f",)), *(() if centre else ("cx", "cy"))]
         names += [name for name in DISTORTION if name in self.options.distortion]
-        rows = [[float(name == row or (name == "f" and row in ("fx", "fy"))) for name in names] for row in order]
+        of_f = {"fx": 1.0, "fy": self.options.pixel_aspect or 1.0}
+        rows = [[of_f.get(row, 0.0) if name == "f" else float(name == row) for name in names] for row in order]
         object.__setattr__(self, "names", tuple(names))
         object.__setattr__(self, "map", np.array(rows))
         object.__setattr__(self, "fixed", np.array([0.0, 0.0, *(centre or (0.0, 0.0)), *(0.0 for _ in DISTORTION)]))
@@ -72,7 +77,7 @@ class Intrinsics:
     def from_matrix(self, matrix: np.ndarray) -> np.ndarray:
         """Start (P,) from a camera matrix of whatever skew and aspect, without distortion."""
         fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-        values = {"f": (fx + fy) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        values = {"f": (fx + fy / (self.options.pixel_aspect or 1.0)) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
         return np.array([values.get(name, 0.0) for name in self.names])
 
     def from_model(self, model: CameraModel) -> np.ndarray:

@@ -44,11 +44,13 @@ class LensChoice:
     """What of a lens is estimated; "auto" chooses by prediction of images left out.
 
     Where p1 and p2 are not chosen, they are estimated as known to be zero but for a standard deviation ``tangential``.
+    Pixels that are not free are of ``pixel_aspect``, fy over fx.
     """
 
     distortion: Distortion = "auto"
     pixels: Pixels = "auto"
     tangential: float = Uncertainty().tangential
+    pixel_aspect: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class LensCandidate:
 
     def parameters(self) -> int:
         """Number of parameters that are estimated."""
-        return len(self.options.distortion) + (3 if self.options.square_pixels else 4)
+        return len(self.options.distortion) + (4 if self.options.pixel_aspect is None else 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +187,7 @@ def calibrate_lens(
         )
 
     tried = _candidates(_DISTORTIONS, choice, poses)
-    usual = tried[0] if len(tried) == 1 else CameraOptions(("k1", "k2"), square_pixels=choice.pixels != "free")
+    usual = tried[0] if len(tried) == 1 else _candidates((("k1", "k2"),), replace(choice, distortion="auto"), poses)[0]
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
         """Points (N,) of each image near to where the lens sees them, found without trust in any of them."""
@@ -270,15 +272,17 @@ def calibrate_lens(
 
 def _name(options: CameraOptions) -> str:
     coefficients = " ".join(options.distortion) or "no distortion"
-    return f"{coefficients}, {'square' if options.square_pixels else 'free'} pixels"
+    shape = {None: "free pixels", 1.0: "square pixels"}
+    return f"{coefficients}, {shape.get(options.pixel_aspect) or f'pixels of aspect {options.pixel_aspect:g}'}"
 
 
 def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
     any_of = (("k1", "k2"),) if poses == "stage-normal" else any_of
     sets = any_of if choice.distortion == "auto" else (choice.distortion,)
-    any_shape = (True, False) if poses == "free" else (True,)
-    shapes = {"auto": any_shape, "square": (True,), "free": (False,)}[choice.pixels]
-    return [CameraOptions(names, square_pixels=shape) for names in sets for shape in shapes]
+    known = choice.pixel_aspect
+    any_shape = (known, None) if poses == "free" else (known,)
+    shapes = {"auto": any_shape, "square": (known,), "free": (None,)}[choice.pixels]
+    return [CameraOptions(names, pixel_aspect=shape) for names in sets for shape in shapes]
 
 
 def _scatter(solution: CameraSolution) -> float:

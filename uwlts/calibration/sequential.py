@@ -252,14 +252,25 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
         solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
     )
     if options.lens is None:
-        return _Seen(solved(air.images, poses=options.poses, options=options.camera, start=start), None, air, [])
+        return _Seen(
+            solved(
+                air.images, poses=options.poses, options=options.camera.described(evidence.sensor.camera), start=start
+            ),
+            None,
+            air,
+            [],
+        )
     lens = calibrate_lens(
         air.images,
         width_px=width_px,
         height_px=height_px,
         poses=options.poses,
         approaching=approaching,
-        choice=replace(options.lens, tangential=evidence.sensor.uncertainty.tangential),
+        choice=replace(
+            options.lens,
+            tangential=evidence.sensor.uncertainty.tangential,
+            pixel_aspect=evidence.sensor.camera.pixel_aspect,
+        ),
         circle_diameter_mm=diameter_mm,
     )
     camera, used, names = (
@@ -268,7 +279,7 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
         air.names(),
     )
     warnings = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
-    if options.poses == "stage-normal" and lens.options.square_pixels:
+    if options.poses == "stage-normal" and lens.options.pixel_aspect is not None:
         warnings += _leaning(camera, solved(used.images, poses="stage", options=lens.options))
     return _Seen(camera, lens, used, warnings)
 

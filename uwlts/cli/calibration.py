@@ -87,7 +87,8 @@ def calibrate(
         distortion: Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and
             free those that predict images left out best; with stage-normal k1 and k2; jointly k1 and k2, p1 and
             p2 as far as the description leaves them open, and k3 where images misfit without.
-        pixels: Whether pixels are square or free to be not; auto: as distortion, with free poses; else square.
+        pixels: Whether pixels are square, or else as the sensor's description says, or free to be not; auto: as
+            distortion, with free poses; else square.
         camera: Guided: address of the camera, in place of the plan's.
         stage: Guided: serial port of the stage, in place of the plan's.
         port: Guided: port of the page for the browser; the next free one is taken if it is in use.

@@ -76,8 +76,8 @@ class CameraModel(Description):
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def parameters(self) -> dict[str, float]:
-        """All parameters by their names, f among them, the mean of fx and fy."""
-        f = {"f": (self.fx_px + self.fy_px) / 2, "fx": self.fx_px, "fy": self.fy_px}
+        """All parameters by their names; f, where the pixels' shape is known, is fx."""
+        f = {"f": self.fx_px, "fx": self.fx_px, "fy": self.fy_px}
         return f | {"cx": self.cx_px, "cy": self.cy_px} | self.distortion.model_dump()
 
     def coefficients(self) -> np.ndarray:

@@ -465,7 +465,7 @@ def on_plane(sensor, depth):
     """Plate coordinates (H, W, 2) of all pixels' rays in air, in the OCS's X and Y."""
     lens, frame = lens_of(sensor), camera_from_object(sensor)
     v, u = np.mgrid[: sensor.camera.height_px, : sensor.camera.width_px]
-    rays = np.stack([(u - lens.cx) / lens.f, (v - lens.cy) / lens.f, np.ones(u.shape)], axis=-1) @ frame[:3, :3]
+    rays = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(u.shape)], axis=-1) @ frame[:3, :3]
     origin = -frame[:3, :3].T @ frame[:3, 3]
     return origin[:2] + rays[..., :2] * ((depth - origin[2]) / rays[..., 2])[..., None]
 

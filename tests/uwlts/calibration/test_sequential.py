@@ -40,7 +40,7 @@ def plate_image(pose, rng):
     bright = np.zeros(SHAPE)
     for dv in steps:
         for du in steps:
-            rays = np.stack([(u + du - lens.cx) / lens.f, (v + dv - lens.cy) / lens.f, np.ones(SHAPE)], axis=-1)
+            rays = np.stack([(u + du - lens.cx) / lens.fx, (v + dv - lens.cy) / lens.fy, np.ones(SHAPE)], axis=-1)
             points = rays * (pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2]))[..., None] - pose[:3, 3]
             x, y = np.moveaxis(points @ pose[:3, :2], -1, 0)
             i, j = np.rint(x / 9.375), np.rint(y / 9.372)
@@ -120,7 +120,7 @@ def test_the_sensor_is_found(result):
     camera, lens = result.calibration.camera, lens_of(SENSOR)
     # Centres of drawn circles are good to 0.01 px a coordinate; by the reported covariance, f and c then to 0.02 px.
     assert result.camera.rms_px() < 0.03
-    assert camera.fx_px == pytest.approx(lens.f, abs=0.1)
+    assert camera.fx_px == pytest.approx(lens.fx, abs=0.1)
     assert (camera.cx_px, camera.cy_px) == (pytest.approx(lens.cx, abs=0.1), pytest.approx(lens.cy, abs=0.1))
     # One pixel is 0.3 mm at the target; stripes are good to 0.01 px.
     laser = laser_pose(SENSOR)

@@ -50,7 +50,7 @@ def test_an_image_with_a_wrong_position_is_left_out_and_named():
     # Its stripe goes with it.
     assert len(found.air.images) == len(found.air.stripes) == 11 and (0, 8) not in found.air.frames
     std, lens = found.camera.std(), lens_of(BARE)
-    assert found.camera.model.fx_px == pytest.approx(lens.f, abs=4 * std["f"])
+    assert found.camera.model.fx_px == pytest.approx(lens.fx, abs=4 * std["f"])
     assert std["f"] < 0.2
     table = found.calibration.figures("camera")["image_table"]
     assert [row["image"] for row in table] == [f"air.h5, frame {2 * n}" for n in range(12) if n != 4]
@@ -86,7 +86,7 @@ def test_a_stage_beside_the_normal_is_noticed_and_taken_for_no_other_lens():
     freer = calibrated(images, poses, seed=2, poses="stage")
     assert freer.warnings == []
     assert "lens: k1 k2, square pixels, the best of 6 models" in "\n".join(calibration_lines(freer.calibration))
-    assert freer.camera.model.fx_px == pytest.approx(lens_of(BARE).f, abs=4 * freer.camera.std()["f"])
+    assert freer.camera.model.fx_px == pytest.approx(lens_of(BARE).fx, abs=4 * freer.camera.std()["f"])
 
 
 @pytest.mark.slow

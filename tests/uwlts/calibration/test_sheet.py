@@ -20,8 +20,8 @@ OFFSET = float(LASER.normal @ LASER.origin_mm)
 CAMERA = CameraModel(
     width_px=1280,
     height_px=1024,
-    fx_px=LENS.f,
-    fy_px=LENS.f,
+    fx_px=LENS.fx,
+    fy_px=LENS.fy,
     cx_px=LENS.cx,
     cy_px=LENS.cy,
     distortion=Distortion(k1=LENS.k1, k2=LENS.k2),

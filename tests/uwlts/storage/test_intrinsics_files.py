@@ -1,5 +1,6 @@
 """Cameras that OpenCV and ROS calibrated, in every writing that is about; those that are no such camera are refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -150,9 +151,11 @@ def test_a_missing_or_binary_file(tmp_path: Path):
 def test_the_sensor_takes_them_over():
     sensor = load_sensor("thesis")
     filled = with_intrinsics(sensor, KNOWN, source="camera.yaml")
-    assert filled.camera.focal_lengths_px() == pytest.approx((KNOWN.fx_px, KNOWN.fy_px), rel=1e-12)
+    assert filled.camera.focal_lengths_px() == pytest.approx((2451.0, 2451.0), rel=1e-12)
     assert filled.camera.principal_point() == (640.5, 511.25) and filled.camera.distortion == KNOWN.distortion
     assert filled.laser == sensor.laser and filled.media == sensor.media
+    oblong = with_intrinsics(sensor, replace(KNOWN, fy_px=2500.0), source="camera.yaml")
+    assert oblong.camera.focal_lengths_px() == pytest.approx((KNOWN.fx_px, 2500.0), rel=1e-12)
 
 
 def test_intrinsics_of_another_camera_are_refused():

@@ -46,7 +46,7 @@ class Setting:
     def intrinsics(self) -> Intrinsics:
         """The camera parameters that are estimated."""
         camera = self.sensor.camera
-        return Intrinsics(self.camera, width_px=camera.width_px, height_px=camera.height_px)
+        return Intrinsics(self.camera.described(camera), width_px=camera.width_px, height_px=camera.height_px)
 
 
 def nominal_camera(setting: Setting) -> CameraModel:

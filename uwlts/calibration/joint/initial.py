@@ -128,8 +128,9 @@ def series_start(
     turned or mirrored against the stage.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
-    tangential = tuple(key.text for key in added_tangential(options.camera, sensor.uncertainty))
-    extended = replace(options.camera, distortion=(*options.camera.distortion, *tangential))
+    camera = options.camera.described(sensor.camera)
+    tangential = tuple(key.text for key in added_tangential(camera, sensor.uncertainty))
+    extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
     staged = not free and base.approaching is not None
@@ -139,7 +140,7 @@ def series_start(
         height_px=height_px,
         poses="stage-normal" if staged else "free",
         approaching=bool(base.approaching),
-        options=options.camera,
+        options=camera,
     )
     rms = seen.image_rms_px()
     explained = np.median(rms) <= max(_LARGEST_MISFIT_PX, _LARGEST_MISFIT * seen.model.fx_px)

@@ -27,12 +27,14 @@ from uwlts.calibration.joint.stored_estimate import calibration_of
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
 from uwlts.model.errors import CalibrationError
-from uwlts.model.parameter_keys import TargetParameter
+from uwlts.model.parameter_keys import LensParameter, TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
-_CLEARLY_LESS = 0.9  # scatter with a richer lens, over that without
+_RICHER = (("k3",), ("p1", "p2"), ("p1", "p2", "k3"))  # besides k1 and k2
+_RATIONAL = (("k4", "k5"), ("p1", "p2", "k4", "k5"))  # tried where k3 helps
+_CLEARLY_LESS = 0.9  # scatter with free pixels, over that without
 _NOTICED = 3.0  # standard uncertainties: what is taken for more uncertain loses little where that was chance
 
 
@@ -225,7 +227,7 @@ class _Attempt:
         Where images still show something that the model lacks, all residuals of an image count as one. What contradicts
         the description is left to be refused.
         """
-        attempt = self._with_richer_lens() if self.against.all_against() else self
+        attempt = self._with_richer_lens()
         if attempt.against.contradictions:
             return attempt
         for _ in range(_ROUNDS_LEFT_OUT):
@@ -244,36 +246,58 @@ class _Attempt:
         return None if fewer.against.contradictions else fewer
 
     def _with_richer_lens(self) -> "_Attempt":
-        """With k3, or with pixels that are not square, or both: what removes contradictions, or a share of the scatter.
+        """With more distortion, pixels of any shape, or both, where that explains the evidence better.
 
-        Only what the options leave open. Pixels are not freed for contradictions alone: a spacing described wrongly
-        along one side looks like them.
+        Only what the options leave open. Pixels of a sensor on a stage are not freed for contradictions alone: a
+        spacing described wrongly along one side looks like them.
         """
-        best, choice, camera = self, self.options.lens, self.options.camera
+        choice, camera, best, added = self.options.lens, self.options.camera, self, ()
         if choice is None or choice.distortion != "auto":
             return best
-        richer = best._with_lens(replace(camera, distortion=(*camera.distortion, "k3")), "k3")
-        if richer is not None and (
-            len(richer.against.all_against()) < len(best.against.all_against()) or richer._fits_better_than(best)
-        ):
-            best = richer
-        if best.against.misfits and choice.pixels == "auto":
-            free = replace(best.options.camera, square_pixels=False)
-            richer = best._with_lens(free, "pixels that are not square")
-            if richer is not None and richer._fits_better_than(best):
-                best = richer
-        return best
+        odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=_NOTICED))
+        for further in (_RICHER, _RATIONAL) if odd or self.against.all_against() else ():
+            tried = [(best, added)]
+            for names in further:
+                richer = best._with_lens(replace(camera, distortion=(*camera.distortion, *names)))
+                tried += [] if richer is None else [(richer, names)]
+            best, added = _explaining_best(tried)
+            if "k3" not in added:
+                break
+        free_poses = self.options.poses == "free"
+        if choice.pixels == "auto" and (free_poses or best.against.misfits):
+            free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
+            if free is not None and (free_poses or free._scatter() < _CLEARLY_LESS * best._scatter()):
+                best, added = _explaining_best([(best, added), (free, (*added, "free pixels"))])
+        if not added:
+            return best
+        said = f"the lens was given {', '.join(added)}: without, images and description contradict each other"
+        return replace(best, said=(*best.said, said))
 
-    def _with_lens(self, camera: CameraOptions, name: str) -> "_Attempt | None":
-        said = f"the lens was given {name}, without which the evidence contradicts itself"
+    def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
+        """With another lens; None where that is not determined, or the evidence contradicts what is described."""
         try:
-            richer = _Attempt.at(self.gathered, replace(self.options, camera=camera), (*self.said, said))
+            richer = _Attempt.at(self.gathered, replace(self.options, camera=camera), self.said)
         except CalibrationError:
             return None
         return None if richer.against.contradictions else richer
 
-    def _fits_better_than(self, other: "_Attempt") -> bool:
-        return bool(other.against.misfits) and self._scatter() < _CLEARLY_LESS * other._scatter()
+    def _criterion(self, like: Estimate) -> float:
+        """-2 ln of the likelihood, and the cost of parameters of which nothing is known before.
+
+        With as many independent residuals as ``like`` has.
+        """
+        number = {
+            kind: sum(len(part.values) for parts in like.residuals for part in parts if part.kind == kind)
+            / (noise.together + noise.besides)
+            for kind, noise in like.noise.items()
+        }
+        result, parameters = self.result, self.result.parameters
+        scatter = sum(2 * n * np.log(result.noise[kind].sigma_px) for kind, n in number.items())
+        off = [(result.values - parameters.prior_mean()) / parameters.prior_std()]
+        for piece, local in zip(self.problem.evidence, result.local, strict=True):
+            off.append(piece.known_before(local, self.problem.sensor.uncertainty)[0])
+        known = np.sum(np.concatenate(off) ** 2)
+        return float(scatter + known + np.isinf(parameters.prior_std()).sum() * np.log(sum(number.values())))
 
     def _scatter(self) -> float:
         """Geometric mean of the scatter of the target's points and stripes, px."""
@@ -296,6 +320,17 @@ class _Attempt:
         )
         against = replace(against, unfit={}, misfits={})
         return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
+
+
+def _explaining_best(tried: Sequence[tuple[_Attempt, tuple[str, ...]]]) -> tuple[_Attempt, tuple[str, ...]]:
+    """Of attempts from the same evidence, each with what its lens was given, the one that explains it best.
+
+    That is by the Bayesian information criterion, with as many independent residuals as in the one of least scatter.
+    What contradicts the description explains nothing.
+    """
+    tried = [each for each in tried if not each[0].against.contradictions] or tried
+    like = min((attempt for attempt, _ in tried), key=_Attempt._scatter).result
+    return min(tried, key=lambda each: each[0]._criterion(like))
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:

@@ -185,7 +185,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     covariance = joint.covariance_matrix()
     options = CameraOptions(
         distortion=tuple(name for name in DISTORTION if parameter_of(name) in keys),
-        square_pixels=LensParameter.F in keys,
+        pixel_aspect=camera.fy_px / camera.fx_px if LensParameter.F in keys else None,
         principal_point_px=None if LensParameter.CX in keys else (camera.cx_px, camera.cy_px),
     )
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)

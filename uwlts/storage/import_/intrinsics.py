@@ -17,6 +17,9 @@ _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "di
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
 
 
+_SQUARE = 0.005  # calibrations of square pixels find focal lengths that differ by less
+
+
 @dataclass(frozen=True)
 class KnownCamera:
     """Focal lengths and principal point in px, distortion, and the image size (width, height) where it is given."""
@@ -70,9 +73,12 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
             f"{source} is for images of {' x '.join(map(str, known.size_px))} pixels, the sensor's are "
             f"{camera.width_px} x {camera.height_px}: give the intrinsics of this camera at this size"
         )
+    fx, fy = known.fx_px, known.fy_px
+    if abs(fy / fx - 1) < _SQUARE:
+        fx = fy = (fx + fy) / 2
     changes = {
-        "focal_length_mm": 1e-3 * known.fx_px * camera.pixel_size_um,
-        "pixel_aspect": known.fy_px / known.fx_px,
+        "focal_length_mm": 1e-3 * fx * camera.pixel_size_um,
+        "pixel_aspect": fy / fx,
         "principal_point_px": [known.cx_px, known.cy_px],
         "distortion": known.distortion.model_dump(),
     }
