@@ -68,7 +68,7 @@ def calibrate(
     distortion : "auto" or tuple of str
         The coefficients among k1 to k6, p1 and p2 to estimate; the others are 0. auto: with the poses stage and free
         those that predict images of the target left out best; with stage-normal k1 and k2; jointly k1 and k2, p1
-        and p2 as far as the description leaves them open, and k3 where images misfit without.
+        and p2 as far as the description leaves them open, and more where the images contradict that.
     pixels : {"auto", "square", "free"}
         Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one. Of one, the
         other follows by the sensor's ``pixel_aspect``.

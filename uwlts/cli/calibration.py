@@ -86,7 +86,7 @@ def calibrate(
             with a free direction, as always in the joint calibration. free: every image has a pose of its own.
         distortion: Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and
             free those that predict images left out best; with stage-normal k1 and k2; jointly k1 and k2, p1 and
-            p2 as far as the description leaves them open, and k3 where images misfit without.
+            p2 as far as the description leaves them open, and more where the images contradict that.
         pixels: Whether pixels are square, or else as the sensor's description says, or free to be not; auto: as
             distortion, with free poses; else square.
         camera: Guided: address of the camera, in place of the plan's.
