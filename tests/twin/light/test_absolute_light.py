@@ -1,6 +1,7 @@
 """How much light the twin shows, in absolute units: windows, sheet, water, camera and lamp against closed forms."""
 
 import math
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -225,3 +226,30 @@ def test_a_plate_under_the_lamp_shows_reflectance_times_irradiance_over_pi(thesi
     expected = 0.45 * 3e-6 / math.pi * camera_factor(sensor, medium, points)[inside]
     # Half a pixel of rounding is 0.1 mm or 2e-4 rad, by which cos^4 changes by less than 4 * 2e-4 * tan 18 deg.
     np.testing.assert_allclose(image[uv[inside, 1], uv[inside, 0]], expected, rtol=3e-4)
+
+
+@pytest.mark.parametrize("light", ["day", "lamp"])
+def test_turbid_water_veils_what_day_and_lamp_light(thesis, light):
+    """Duntley's equation; of the lamp's light, Henyey and Greenstein's share that returns."""
+    lamps = {"irradiance_w_per_m2": 3.0, "ambient_w_per_m2": 2.0}
+    sensor = altered(thesis, {"lamp": lamps, "camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}})
+    g, z, reflectance = 0.7, 30.0, 0.45
+    medium = clear(0.5, 2.0, phase="henyey-greenstein", asymmetry=g)
+    renderer = Renderer(
+        sensor, medium, scene_of(plate(z, reflectance=reflectance)), effects=replace(NONE, ambient=True, haze=True)
+    )
+    image = renderer.irradiance(light, sensor_at(), spp=4)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-60, 40, 11), np.linspace(-70, 70, 11)))
+    points = np.stack([x, y, np.full_like(x, z)], axis=1)
+    uv = np.rint(image_of(sensor, medium, points)).astype(int)
+    inside = (uv >= 0).all(axis=1) & (uv[:, 0] < 320) & (uv[:, 1] < 256)
+    assert inside.sum() > 80
+    rays, _, way = oracle_paths(sensor, medium, points)
+    left = np.exp(-extinction(medium) * way)
+    returns = {"day": 1.0, "lamp": (1 - g) / (2 * g) * ((1 + g) / math.hypot(1, g) - 1)}[light]
+    veil = returns * medium.scattering_per_mm(635.0) / extinction(medium) * (1 - left)
+    irradiance = {"day": 2e-6, "lamp": 3e-6}[light]
+    expected = irradiance / math.pi * (reflectance * left + veil) * lens_factor(sensor, medium, rays)
+    # Half a pixel is 0.4 mm or 1e-3 rad: cos^4 changes by up to 1.3e-3, the way's 1.3 extinctions by up to 0.5e-3.
+    np.testing.assert_allclose(image[uv[inside, 1], uv[inside, 0]], expected[inside], rtol=2e-3)
+    assert 0.03 < np.median(veil / (reflectance * left)) < 10
