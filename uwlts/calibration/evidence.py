@@ -60,7 +60,8 @@ class AirEvidence:
 class StepEvidence:
     """A stripe (N, 2) on a step standard, with the standard, the medium's index and where it comes from.
 
-    ``travel_mm`` is where the stage has moved the sensor, along the axes of the OCS.
+    ``index_std`` is the index's standard uncertainty, ``travel_mm`` where the stage has moved the sensor, along the
+    axes of the OCS.
     """
 
     pixels: np.ndarray
@@ -68,6 +69,7 @@ class StepEvidence:
     medium_index: float
     source: str
     travel_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    index_std: float = 0.0
 
     def capture(self) -> str:
         """The capture it comes from."""
@@ -161,14 +163,17 @@ def step_evidence(
         except ValidationError as error:
             problems = problems_of(error).removeprefix(": ")
             raise DescriptionError(f"{capture.path.name} does not describe its step standard: {problems}") from error
-        wavelength = capture.header.sensor.laser.wavelength_nm
-        index = capture.header.medium.refractive_index(wavelength) if medium_index is None else medium_index
+        wavelength, known = capture.header.sensor.laser.wavelength_nm, capture.header.sensor.uncertainty
+        index, index_std = medium_index, known.index
+        if index is None:
+            index = capture.header.medium.refractive_index(wavelength)
+            index_std = capture.header.medium.index_uncertainty(wavelength, known)
         for frame, image in capture.frames(laser_on=True):
             pixels = _stripe_of(capture, frame, image, stripe, warnings).pixels
             if len(pixels):
                 x, y, z = (float(capture.stage_mm[frame]) * np.array(capture.header.stage_direction)).tolist()
                 source = f"{capture.path.name}, frame {frame}"
-                found.append(StepEvidence(pixels, standard, index, source, (x, y, z)))
+                found.append(StepEvidence(pixels, standard, index, source, (x, y, z), index_std))
             done = _report(progress, "step", done, total)
     return found, warnings
 

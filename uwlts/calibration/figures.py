@@ -82,9 +82,11 @@ def window_figures(solution: WindowSolution, steps: Sequence[StepEvidence]) -> d
     return {
         "images": [step.source for step in steps],
         "distance_mm": solution.model.distance_mm,
-        "std_mm": solution.std_mm,
+        "std_mm": solution.uncertainty_mm,
+        "left_over_std_mm": solution.std_mm,
         "scatter_std_mm": solution.scatter_std_mm,
         "per_height": solution.per_height,
+        "per_index": solution.per_index,
         "heights_mm": solution.heights_mm.tolist(),
         "errors_mm": solution.errors_mm.tolist(),
         "height_std_mm": solution.height_std_mm.tolist(),

@@ -218,7 +218,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         if not used:
             why = "; ".join([*evidence.warnings, *on_steps][:3])
             raise CalibrationError(f"no step image can be used for the window's distance; {why}")
-        window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm)
+        window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm, known=sensor.uncertainty)
         figures["window"] = window_figures(window, used)
     warnings += on_steps
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}

@@ -1,5 +1,6 @@
 """Images of a step standard: the faces in each, and how far the standard is turned from facing the laser."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -38,6 +39,11 @@ class StepImage(StepEvidence):
     def height_mm(self) -> float:
         """The step's calibrated height within the sheet."""
         return self.lengthened * self.standard.height_mm
+
+    def height_std_mm(self, known: Uncertainty) -> float:
+        """Standard uncertainty of that height: of the certificate, or as usually known, and of the turn."""
+        stated = self.standard.height_uncertainty_mm
+        return math.hypot(stated / 2 if stated else known.step_height_mm, self.standard.height_mm * self.lengthened_std)
 
 
 def step_profile(

@@ -1,7 +1,8 @@
 """Distance of the camera's window from images of a step standard in the medium (thesis, sections 3.2.2 and 4.8.1)."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares, root_scalar
@@ -10,12 +11,15 @@ from uwlts.calibration.step_images import StepImage, step_profile
 from uwlts.metrology.step_faces import StepFace, step_height
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
+from uwlts.model.sensor import Uncertainty
 
 _CURVE_POINTS = 31  # the curve has one valley, several points wide
 _SEARCHED = (0.2, 2.5)  # shares of the described distance, which is measured to better than half
 # Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
 _LEAST_CHANGE = 10.0
 _ROUNDING_MM = 1e-6
+_INDEX_STEP = 1e-5  # for the derivative by the index
+_USUALLY_KNOWN = Uncertainty()
 _AT_BOUND = 1e-3  # share of the range; least squares within bounds stop as close to them
 
 
@@ -31,6 +35,9 @@ class WindowSolution:
     std_mm : standard deviation of the distance from the height errors left over; None with a single image
     scatter_std_mm : standard deviation that the scatter of the points alone gives
     per_height : shift of the distance per shift of the calibrated height, if all images use the same step
+    per_index : shift of the distance per shift of the index, if all images are taken in the same medium
+    uncertainty_mm : standard uncertainty of the distance, from the errors left over, or the scatter of a single image,
+        and those of the calibrated height and the medium's index, which all images share
     image_distances_mm : (S,); distance that each image alone gives (thesis, Table 4); NaN where none within the bounds
         does.
     curve_mm : (C, 2); tried distances and root mean square height error, NaN where a point cannot be reconstructed
@@ -45,6 +52,8 @@ class WindowSolution:
     std_mm: float | None
     scatter_std_mm: float
     per_height: float
+    per_index: float
+    uncertainty_mm: float
     image_distances_mm: np.ndarray
     curve_mm: np.ndarray
     bounds_mm: tuple[float, float]
@@ -56,12 +65,14 @@ def solve_window(
     steps: Sequence[StepImage],
     *,
     bounds_mm: tuple[float, float] | None = None,
+    known: Uncertainty = _USUALLY_KNOWN,
 ) -> WindowSolution:
     """Window distance that minimises the mean square height error over all step images.
 
     A coarse scan finds the valley, Gauss-Newton within the bounds its bottom. The calibration's camera, sheet and OCS
     are used, not its window; of ``window`` everything but the distance stays. ``bounds_mm`` (low, high) are the
-    distances to search, by default 0.2 to 2.5 times the nominal one.
+    distances to search, by default 0.2 to 2.5 times the nominal one. ``known`` says how well heights are known that
+    have no certificate.
 
     Raises
     ------
@@ -121,15 +132,26 @@ def solve_window(
         )
     own = zip(steps, scanned[usable].T - true[:, None], strict=True)
     squares, freedom = float(slopes @ slopes), len(steps) - 1
+    std = float(np.sqrt(errors @ errors / freedom / squares)) if freedom else None
+    scatter_std = float(np.linalg.norm(slopes * height_std)) / squares
+    denser = [replace(step, medium_index=step.medium_index + _INDEX_STEP) for step in steps]
+    by_index = (_heights(calibration, window, denser, distance)[:, 0] - measured) / _INDEX_STEP
+    per_height, per_index = float(slopes.sum()) / squares, -float(slopes @ by_index) / squares
+    height_std_mm = max(step.height_std_mm(known) for step in steps)
+    index_std = max(step.index_std for step in steps)
     return WindowSolution(
         model=window.model_copy(update={"distance_mm": distance}),
         heights_mm=measured,
         errors_mm=errors,
         height_std_mm=height_std,
         slopes=slopes,
-        std_mm=float(np.sqrt(errors @ errors / freedom / squares)) if freedom else None,
-        scatter_std_mm=float(np.linalg.norm(slopes * height_std)) / squares,
-        per_height=float(slopes.sum()) / squares,
+        std_mm=std,
+        scatter_std_mm=scatter_std,
+        per_height=per_height,
+        per_index=per_index,
+        uncertainty_mm=math.hypot(
+            scatter_std if std is None else std, per_height * height_std_mm, per_index * index_std
+        ),
         image_distances_mm=np.array(
             [_own_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
         ),

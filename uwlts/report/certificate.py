@@ -240,7 +240,9 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
         return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
     std = numbers_in(calibration.figures("camera").get("std"))
-    values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
+    values = (
+        {"f": camera.fx_px} if "f" in std or camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
+    )
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
     rows = [_row(parameter_of(name), value, std.get(name)) for name, value in values.items()]

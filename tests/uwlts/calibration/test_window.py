@@ -15,6 +15,7 @@ from uwlts.metrology.step_faces import StepFace
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
 from uwlts.model.errors import CalibrationError, EvaluationError, RangeError
+from uwlts.model.sensor import Uncertainty
 from uwlts.optics.nominal import nominal_calibration
 
 SENSOR = built_sensor()
@@ -96,6 +97,27 @@ def test_a_wrong_height_shifts_the_distance_as_stated():
     shift = wrong.model.distance_mm - solution.model.distance_mm
     assert shift == pytest.approx(0.02 * solution.per_height, rel=0.02)
     assert 0.5 < shift < 1.5
+
+
+def test_a_wrong_index_shifts_the_distance_as_stated():
+    denser = [replace(step, medium_index=WATER + 2e-4) for step in clean_steps(PLATE)]
+    solution, wrong = (solve_window(AIR, PLATE, images) for images in (clean_steps(PLATE), denser))
+    shift = wrong.model.distance_mm - solution.model.distance_mm
+    # Water 2 K warmer.
+    assert shift == pytest.approx(2e-4 * solution.per_index, rel=0.02)
+    assert abs(shift) > 0.1
+
+
+def test_the_uncertainty_holds_what_all_images_share():
+    known = Uncertainty(step_height_mm=0.004)
+    images = [replace(step, index_std=1e-4) for step in clean_steps(PLATE)]
+    certified = [
+        replace(step, standard=step.standard.model_copy(update={"height_uncertainty_mm": 0.02})) for step in images
+    ]
+    for steps_used, height_std_mm in ((images, 0.004), (certified, 0.01)):
+        solution = solve_window(AIR, PLATE, steps_used, known=known)
+        shared = (height_std_mm * solution.per_height, 1e-4 * solution.per_index)
+        assert solution.uncertainty_mm == pytest.approx(np.hypot(*shared), rel=1e-6)
 
 
 def test_a_single_image_has_no_deviation_of_its_own():

@@ -252,7 +252,7 @@ def step_profiles(
         if image is None:
             continue
         on_face = image.labels != StepFace.NEITHER
-        height, stated = step.standard.height_mm, step.standard.height_uncertainty_mm
+        height = step.standard.height_mm
         evidence = StepProfileEvidence(
             view=view,
             pixels=image.pixels[on_face],
@@ -266,9 +266,8 @@ def step_profiles(
             image=number,
         )
         found.append(evidence)
-        std = np.hypot(stated / 2 if stated else uncertainty.step_height_mm, height * image.lengthened_std)
         known = heights.get(evidence.height, Prior(height, 0.0))
-        heights[evidence.height] = Prior(height, max(known.std, float(std)))
+        heights[evidence.height] = Prior(height, max(known.std, image.height_std_mm(uncertainty)))
     return found, heights, warnings
 
 
