@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import block, clear, image_of, plate, scene_of, sensor_at
+from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.options import NONE
 from twin.recording.studio import true_stripe
@@ -61,6 +62,21 @@ def test_a_stripe_lit_and_seen_by_way_of_a_mirror_shows_at_its_mirrored_points(t
 def test_light_by_way_of_a_mirror_twice_goes_with_its_share_squared(thesis):
     half, whole = (brightness(thesis, share).sum() for share in (SHARE / 2, SHARE))
     assert whole / half == pytest.approx(4.0, rel=1e-4)
+
+
+def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(thesis):
+    """The exposure is the mean of still ones at places along the way, the outermost with half the weight."""
+    renderer = Renderer(thesis, clear(), hidden(SHARE), effects=replace(EFFECTS, motion=True))
+    way = Travel(direction=np.array([1.0, 0.0, 0.0]), exposure_mm=4.0, row_mm=0.0, middle_row=0.0)
+    moving = renderer.irradiance("laser", sensor_at(), spp=64, travel=way).astype(float)
+    still = [renderer.irradiance("laser", sensor_at(x=x), spp=64).astype(float) for x in np.linspace(-2.0, 2.0, 9)]
+    mean = np.average(still, axis=0, weights=[0.5, *[1.0] * 7, 0.5])
+    assert moving.sum() == pytest.approx(mean.sum(), rel=2e-3)
+    rows = np.arange(len(mean))
+    centre, expected = ((rows @ image).sum() / image.sum() for image in (moving, mean))
+    assert centre == pytest.approx(expected, abs=0.05)
+    first, last = ((rows @ image).sum() / image.sum() for image in (still[0], still[-1]))
+    assert abs(first - last) > 3.0
 
 
 def test_the_straight_stripe_is_the_same_with_a_mirror(thesis):
