@@ -21,6 +21,7 @@ from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import load_calibration
@@ -68,6 +69,7 @@ class ScanProgress:
         return said
 
 
+@keeps_inputs
 def scan(
     plan: str | Path | ScanPlan,
     out: str | Path,
@@ -131,8 +133,7 @@ def scan(
     if address is None or port is None:
         what = "camera" if address is None else "stage"
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
-    if not resume:
-        refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite)
     if calibration:
         if not watch:
             raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
@@ -165,7 +166,9 @@ def scan(
         )
         known_ms, before_s = left_over(out) if resume else ({}, 0.0)
         seen = ScanProgress(exposure_ms=known_ms)
-        writer = stack.enter_context(CaptureWriter(out, header, dtype=dtype, overwrite=overwrite, resume=resume))
+        writer = stack.enter_context(
+            CaptureWriter(out, header, dtype=dtype, plan=plan.recorded(), overwrite=overwrite, resume=resume)
+        )
         begun = len(writer)
         if begun == len(shots):
             return seen
