@@ -113,7 +113,8 @@ def _photographs(folder: Path) -> Path:
         image[30 + number] = 200
         assert cv2.imwrite(str(folder / f"laser{number}.png"), image)
     (folder / "import.toml").write_text(
-        'sensor = "sensor.toml"\nmedium = "water"\nlaser = "laser*.png"\n[stage]\nstart_mm = 0.0\nstep_mm = 1.0\ndirection = [1.0, 0.0, 0.0]\n',
+        'sensor = "sensor.toml"\nmedium = "water"\nlaser = "laser*.png"\n'
+        "[stage]\nstart_mm = 0.0\nstep_mm = 1.0\ndirection = [1.0, 0.0, 0.0]\n",
         encoding="utf-8",
     )
     (folder / "sensor.toml").write_text(

@@ -12,7 +12,7 @@ from uwlts.model.errors import DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
-from uwlts.storage.files import written_aside
+from uwlts.storage.files import differences, written_aside
 from uwlts.storage.one_writer import one_writer
 from uwlts.storage.truth import truth_path
 
@@ -204,7 +204,8 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, re
         return
     how = f"that {PLAN} does not describe"
     if isinstance(known, dict):
-        how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
+        others = ", ".join(key for key in plan if known.get(key) != plan[key])
+        how = f"made with another {others} ({differences(known, plan)})"
     if found and not overwrite:
         raise DescriptionError(
             f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start afresh"

@@ -80,6 +80,7 @@ def scan(
     unlock: bool = False,
     watch: bool = False,
     calibration: str | Path | None = None,
+    port: int = 8080,
     resume: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -108,6 +109,8 @@ def scan(
         Show the recording in a browser meanwhile, as `watch` does.
     calibration : str or Path, optional
         Calibration of any kind for the cloud on that page.
+    port : int
+        Port of that page; the next free one is taken if it is in use.
     resume, overwrite : bool
         Continue an interrupted scan; replace an existing capture.
     progress : callable, optional
@@ -129,8 +132,8 @@ def scan(
         The file exists, or cannot be written.
     """
     plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
-    address, port = camera or plan.camera, stage or plan.stage.port
-    if address is None or port is None:
+    address, serial_port = camera or plan.camera, stage or plan.stage.port
+    if address is None or serial_port is None:
         what = "camera" if address is None else "stage"
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
     refuse_unsuitable(out, overwrite=overwrite)
@@ -145,8 +148,8 @@ def scan(
         f"{len(positions_mm)} positions from {positions_mm[0]:g} to {positions_mm[-1]:g} mm, {images} images to take"
     )
     with ExitStack() as stack:
-        page = stack.enter_context(PageBeside(out, calibration=calibration, say=report)) if watch else None
-        moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
+        page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
+        moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
         if home:
             moved.home()
         elif unlock:

@@ -9,7 +9,6 @@ While it is being recorded the file is called ``NAME.part`` and every frame is f
 an interrupted recording keeps all its complete frames; closing it gives it its name.
 """
 
-import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,8 +24,16 @@ from uwlts.model.command_files import note_input, note_made, refuse_input
 from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import CaptureHeader, Table
-from uwlts.storage.files import refuse_unsuitable, sha256_of
-from uwlts.storage.hdf5_file import UnfinishedFile, has_writer, read_label, read_plan, write_label, write_plan
+from uwlts.storage.files import differences, refuse_unsuitable, sha256_of
+from uwlts.storage.hdf5_file import (
+    UnfinishedFile,
+    forget_plan,
+    has_writer,
+    read_label,
+    read_plan,
+    write_label,
+    write_plan,
+)
 from uwlts.storage.one_writer import one_writer
 
 FORMAT = "uwlts-capture"
@@ -36,8 +43,6 @@ _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (),
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 # Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
 _MARGIN_BYTES = 2**18
-_SHOWN, _BRIEF = 3, 80
-"""Entries that are named where a recording is another, and characters of each value."""
 
 
 @dataclass(frozen=True)
@@ -57,34 +62,14 @@ def part_path(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
 
-def _finish(path: Path) -> None:
-    """Remove the plan, and cut off space that was claimed and not used, as HDF5 does when a file is opened again."""
-    with h5py.File(path, "r+", locking=False) as file:
-        file.attrs.pop("plan", None)
+def _cut_to_used(path: Path) -> None:
+    """Cut off space that was claimed and not used, as HDF5 does when a file is opened and closed once more."""
+    h5py.File(path, "r+", locking=False).close()
 
 
-def recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None) -> Table:
+def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None) -> Table:
     """What a recording is to hold, as JSON."""
     return {"plan": plan, "images": str(dtype), "header": header.model_dump(mode="json")}
-
-
-def differences(there: object, now: object, *, entry: str = "") -> list[str]:
-    """Entries in which two JSON values differ, each with both values; ``there`` is what is stored."""
-    if isinstance(there, dict) and isinstance(now, dict):
-        return [
-            line
-            for key in dict.fromkeys((*now, *there))
-            for line in differences(there.get(key), now.get(key), entry=f"{entry}.{key}".removeprefix("."))
-        ]
-    if there == now:
-        return []
-    return [f"{entry} is {_brief(there)} in it, {_brief(now)} now"]
-
-
-def _brief(value: object) -> str:
-    """A JSON value in one short text."""
-    text = "not stated" if value is None else json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
 
 
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
@@ -141,12 +126,11 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             unfinished = Capture(self._part)
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
-        there = recording_table(unfinished.header, unfinished.dtype, unfinished.plan())
-        if others := differences(there, recording_table(self.header, self._dtype, self._plan)):
+        there = _recording_table(unfinished.header, unfinished.dtype, unfinished.plan())
+        if others := differences(there, _recording_table(self.header, self._dtype, self._plan)):
             unfinished.close()
-            shown = others[:_SHOWN] + [f"and {len(others) - _SHOWN} more"] * (len(others) > _SHOWN)
             raise CaptureError(
-                f"{self._part} belongs to another recording: {'; '.join(shown)}. Go on with the plan of that one, give "
+                f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
                 "another name, or --overwrite to start afresh"
             )
         return unfinished
@@ -180,8 +164,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
                 for frame in unfinished:
                     self._store(frame)
-            # Once more, which cuts off space that was claimed and not used.
-            h5py.File(fresh, "r+", locking=False).close()
+            _cut_to_used(fresh)
             os.replace(fresh, self._part)
         finally:
             fresh.unlink(missing_ok=True)
@@ -250,7 +233,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         with self._claimed, self._storage():
             self._file.close()
             if kind is None:
-                _finish(self._part)
+                if self._plan is not None:
+                    forget_plan(self._part)
+                _cut_to_used(self._part)
                 os.replace(self._part, self.path)
                 note_made(self.path)
 

@@ -22,6 +22,8 @@ from uwlts.storage.one_writer import one_writer
 _PATIENCE_S = 10.0
 """How long a file that another process writes is waited for at the end of the work; results are written in less, and
 several machines may write those of one sweep."""
+_SHOWN, _BRIEF = 3, 80
+"""Entries that are named where two descriptions differ, and characters of each value."""
 
 
 @contextmanager
@@ -152,6 +154,31 @@ def write_model(path: str | Path, model: BaseModel, *, format: str, version: int
     content = {"format": format, "version": version} | model.model_dump(mode="json")
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def differences(there: object, now: object) -> str:
+    """Words for the entries in which two JSON values differ, each with both values; empty where they are the same.
+
+    ``there`` is what a file holds, ``now`` what is wanted.
+    """
+    found = list(_different(there, now, ""))
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    return "; ".join(
+        [*(f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in found[:_SHOWN])] + more
+    )
+
+
+def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in dict.fromkeys((*now, *there)):
+            yield from _different(there.get(key), now.get(key), f"{entry}.{key}" if entry else f"{key}")
+    elif there != now:
+        yield entry, there, now
+
+
+def _brief(value: object) -> str:
+    text = "not stated" if value is None else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
 
 
 def json_text(content: object, *, indent: int | None = None, ascii: bool = True) -> str:

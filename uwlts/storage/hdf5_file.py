@@ -68,6 +68,14 @@ def read_plan(file: h5py.File) -> Table | None:
         raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
 
 
+def forget_plan(path: str | Path) -> None:
+    """Remove the plan from a file that is finished."""
+    with h5py.File(path, "r+", locking=False) as file:
+        # HDF5 leaves the bytes of what is removed in the file.
+        file.attrs.modify("plan", np.bytes_(b" " * file.attrs.get_id("plan").dtype.itemsize))
+        del file.attrs["plan"]
+
+
 def format_of(path: str | Path) -> str | None:
     """Format of an HDF5 file by its label; None where it cannot be opened or has none."""
     try:

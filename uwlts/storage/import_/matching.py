@@ -162,7 +162,12 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "
             "'laser*.png' and lamp = 'lamp*.png', or a table with a column light"
         )
-    laser = _with_backgrounds(folder, [name for name in files if _matches(name, given.background)], given, laser)
+    laser = _with_backgrounds(
+        folder,
+        [name for name in files if _matches(name, given.background) and not _matches(name, given.ignore)],
+        given,
+        laser,
+    )
     described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)}
     unmatched = [name for name in files if name not in described and not _matches(name, given.ignore)]
     return Matched(laser, lamp, unmatched)
