@@ -172,6 +172,9 @@ def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, ob
     if isinstance(there, dict) and isinstance(now, dict):
         for key in dict.fromkeys((*now, *there)):
             yield from _different(there.get(key), now.get(key), f"{entry}.{key}" if entry else f"{key}")
+    elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
+        for place, (old, new) in enumerate(zip(there, now, strict=True)):
+            yield from _different(old, new, f"{entry}[{place}]")
     elif there != now:
         yield entry, there, now
 
