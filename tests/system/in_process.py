@@ -6,6 +6,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 
 import pytest
+from cyclopts import App
 
 from uwlts import cli
 from uwlts.runtime import console
@@ -13,11 +14,16 @@ from uwlts.runtime import console
 
 def uwlts(*arguments: object) -> subprocess.CompletedProcess[str]:
     """How ``uwlts`` with these arguments ended, and what it said."""
-    words, said, errors = ["uwlts", *map(str, arguments)], StringIO(), StringIO()
+    return run_program(cli.app, "uwlts", *arguments)
+
+
+def run_program(app: App, program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """How a program with these arguments ended, and what it said."""
+    words, said, errors = [program, *map(str, arguments)], StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(errors):
         patch.setattr(sys, "argv", words)
         try:
-            code = console.run(cli.app)
+            code = console.run(app)
         except SystemExit as ended:
             code = ended.code
     return subprocess.CompletedProcess(words, code, said.getvalue(), errors.getvalue())

@@ -254,7 +254,9 @@ def test_overwriting_renders_anew(copied: Path, rendered: tuple[Path, Progress],
 )
 def test_another_plan_is_refused_and_nothing_is_lost(copied: Path, described: Path, how: dict, differing: str):
     before = contents(copied)
-    with pytest.raises(DescriptionError, match=rf"made with another {differing}: give another folder.*--overwrite"):
+    with pytest.raises(
+        DescriptionError, match=rf"made with another {differing} \(.* in it, .* now\): give another folder.*--overwrite"
+    ):
         record(described, copied, **how)
     assert contents(copied) == before
 
@@ -274,7 +276,10 @@ def test_recordings_of_an_unknown_plan_are_refused(copied: Path, described: Path
 def test_overwriting_does_not_mix_plans(copied: Path, described: Path):
     """Campaigns of seeds that are not asked for would stay as they were rendered."""
     before = contents(copied)
-    with pytest.raises(DescriptionError, match=r"would keep recordings made with another spp, such as .*campaign-0"):
+    with pytest.raises(
+        DescriptionError,
+        match=r"would keep recordings made with another spp \(spp is \d+ in it, \d+ now\), such as .*campaign-0",
+    ):
         record(described, copied, spp=3, seeds=range(1, 2), overwrite=True)
     assert contents(copied) == before
 

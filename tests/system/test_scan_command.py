@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import uwlts
 from tests.system.small_board import small_sensor, turned_board
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene
+from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import extract_stripe
@@ -177,6 +179,33 @@ def test_plans_that_cannot_be_done_are_refused_before_anything_moves(served, fol
     assert done.returncode == 2
     assert says in done.stderr and "Traceback" not in done.stderr
     assert served.controller.state().position_mm == before and not (tmp_path / "scan.h5").exists()
+
+
+def test_a_scan_is_resumed_only_by_its_own_plan(served, folder, tmp_path):
+    out = tmp_path / "scan.h5"
+
+    def stop(done: int, _: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    plan = written(folder, served, top="laser_ms = 0.3")
+    with pytest.raises(KeyboardInterrupt):
+        uwlts.scan(plan, out, home=True, progress=stop)
+    before = part_path(out).read_bytes()
+    for changed, says in (
+        (
+            written(folder, served, name="farther", top="laser_ms = 0.3", step_mm=3.0),
+            "plan.stage.step_mm is 2.0 in it, 3.0",
+        ),
+        (written(folder, served, name="longer", top="laser_ms = 0.5"), "plan.laser_ms is 0.3 in it, 0.5 now"),
+    ):
+        with pytest.raises(CaptureError, match=re.escape(says)):
+            uwlts.scan(changed, out, home=True, resume=True)
+        assert part_path(out).read_bytes() == before
+    slower = written(folder, served, name="slower", top="laser_ms = 0.3\ncheck_steps = false", feed_mm_per_min=600.0)
+    uwlts.scan(slower, out, home=True, resume=True)
+    with Capture(out) as scan:
+        assert len(scan) == COUNT
 
 
 def test_another_camera_than_described_is_refused(served, folder, tmp_path):

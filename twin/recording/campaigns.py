@@ -12,7 +12,8 @@ from uwlts.model.errors import DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
-from uwlts.storage.files import written_aside
+from uwlts.storage.files import differences, written_aside
+from uwlts.storage.one_writer import one_writer
 from uwlts.storage.truth import truth_path
 
 PLAN = "plan.json"
@@ -149,6 +150,25 @@ def _record_all(
     progress: Callable[[int, int], None],
 ) -> None:
     """Render what is not complete into a folder that keeps to a plan; ``recorded`` is the pattern of its captures."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    # Two at once would take each other's unfinished recordings for interrupted ones.
+    with one_writer(folder / PLAN):
+        _work(jobs, folder, plan, recorded=recorded, workers=workers, overwrite=overwrite, progress=progress)
+
+
+def _work(
+    jobs: list[_Job],
+    folder: Path,
+    plan: dict[str, object],
+    *,
+    recorded: str,
+    workers: int | None,
+    overwrite: bool,
+    progress: Callable[[int, int], None],
+) -> None:
     files = {file for job in jobs for file in job.files}
     _keep_to_plan(folder, plan, files, recorded=recorded, overwrite=overwrite)
     for place in {job.path.parent for job in jobs}:
@@ -172,7 +192,6 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, re
     text = json.dumps(plan, indent=2) + "\n"
     plan = json.loads(text)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         found = set(folder.glob(recorded))
         content = path.read_bytes() if path.is_file() else b"null"
     except OSError as error:
@@ -185,7 +204,8 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, re
         return
     how = f"that {PLAN} does not describe"
     if isinstance(known, dict):
-        how = f"made with another {', '.join(key for key in plan if known.get(key) != plan[key])}"
+        others = ", ".join(key for key in plan if known.get(key) != plan[key])
+        how = f"made with another {others} ({differences(known, plan)})"
     if found and not overwrite:
         raise DescriptionError(
             f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start afresh"

@@ -35,7 +35,7 @@ def commands(out: Path) -> list[tuple[str, str]]:
             capture, cloud = f"{folder}/{scan}", f"{folder}/{scan}{suffix}"
             made = f"{capture}.h5 --calibration {calibration} --out {cloud}.ply --overwrite"
             rows.append(("reconstruct", f"uwlts reconstruct {made}"))
-            judged = f"--out {cloud}.evaluation.json --coloured {cloud}.ply --overwrite"
+            judged = f"--out {cloud}.evaluation.json --coloured {cloud}-coloured.ply --overwrite"
             rows.append(("evaluate", f"uwlts evaluate {cloud}.ply --truth {capture}.truth.h5 {judged}"))
     rows.append(("report", f"uwlts report {folder} --reference thesis --overwrite"))
     return rows

@@ -13,6 +13,7 @@ import numpy as np
 
 from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import load_sensor, validated
 from uwlts.model.sensor import Medium, Sensor
@@ -109,6 +110,7 @@ def render(
     )
 
 
+@keeps_inputs
 def simulate(
     scene: AnyScene,
     *,

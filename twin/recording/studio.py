@@ -24,7 +24,7 @@ from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
-from uwlts.model.sensor import Medium, Sensor
+from uwlts.model.sensor import Medium, Sensor, Table
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 
@@ -377,7 +377,14 @@ def record_scene(
     shots = list(scene.motion.shots())
     truths: list[FrameTruth] = []
     dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
-    with CaptureWriter(path, header, dtype=dtype, overwrite=overwrite, resume=resume) as writer:
+    # Whoever measures must not learn it, so it is not in the finished capture.
+    plan: Table = {
+        "scene": scene.model_dump(mode="json"),
+        "as_built": studio.sensor.model_dump(mode="json"),
+        "seed": studio.options.seed,
+        "spp": studio.options.spp,
+    }
+    with CaptureWriter(path, header, dtype=dtype, plan=plan, overwrite=overwrite, resume=resume) as writer:
         done = len(writer)
         for index, shot in enumerate(shots):
             truths.append(studio.truth(shot))

@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
 from twin.scene.description import AnyObject, Flat, Placed, Printed
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
 from uwlts.model.media import check_range
 
@@ -106,6 +107,7 @@ def read_grey(path: str | Path) -> np.ndarray:
     """
     if not Path(path).is_file():
         raise DescriptionError(f"no texture at {path}")
+    note_input(path)
     try:
         picture = mi.Bitmap(str(path))
         # A picture marked as gamma-coded would be made linear by the conversion.

@@ -29,6 +29,7 @@ from twin.scene.description import (
 )
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
 from twin.scene.shapes import bowed_plate, head_surface, weld_surface
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
 
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -222,6 +223,7 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     path = thing.path
     if not Path(path).is_file():
         raise DescriptionError(f"no mesh at {path}")
+    note_input(path)
     try:
         loaded = trimesh.load(path, force="scene")
     except (ValueError, NotImplementedError, OSError) as error:

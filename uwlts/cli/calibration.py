@@ -371,7 +371,7 @@ def verify(capture: Path, *, calibration: Path, limit: float | None = None) -> N
         limit: Largest permissible error in mm.
     """
     verification = uwlts.verify(capture, calibration, limit_mm=limit)
-    print(verification.text)
+    show([verification.text, *verification.not_shown])
     print("pass" if verification.passed else "FAIL")
     if not verification.passed:
         sys.exit(1)

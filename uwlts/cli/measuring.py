@@ -34,6 +34,7 @@ def scan(
     unlock: Flag = False,
     watch: Flag = False,
     calibration: Path | None = None,
+    port: int = 8080,
     resume: Flag = False,
     overwrite: Flag = False,
 ) -> None:
@@ -53,7 +54,8 @@ def scan(
         unlock: Take the stage's position as it is, without homing.
         watch: Show the recording in a browser meanwhile, as uwlts watch does.
         calibration: Watched: calibration of the sensor, or one by polynomials, for the cloud.
-        resume: Continue an interrupted scan.
+        port: Watched: port of the page; the next free one is taken if it is in use.
+        resume: Continue an interrupted scan; refused where the plan is another than the one it began with.
         overwrite: Replace an existing capture.
     """
     with progress_bar(f"scanning {plan.stem}") as progress:
@@ -66,6 +68,7 @@ def scan(
             unlock=unlock,
             watch=watch,
             calibration=calibration,
+            port=port,
             resume=resume,
             overwrite=overwrite,
             progress=progress,

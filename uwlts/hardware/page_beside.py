@@ -23,8 +23,8 @@ class PageBeside:
     ``say`` is called with the line that states the page's address, from another thread.
     """
 
-    def __init__(self, capture: Path, *, calibration: str | Path | None, say: Callable[[str], None]):
-        command = [sys.executable, "-m", "uwlts.cli", "watch", str(capture)]
+    def __init__(self, capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]):
+        command = [sys.executable, "-m", "uwlts.cli", "watch", str(capture), "--port", str(port)]
         self._command = [*command, "--calibration", str(calibration)] if calibration else command
         self._say = say
         self._process: subprocess.Popen[str] | None = None

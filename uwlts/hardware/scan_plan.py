@@ -145,6 +145,14 @@ class ScanPlan(RigPlan):
             artefact=self.artefact,
         )
 
+    def recorded(self) -> Table:
+        """What the plan says of the images to take, as JSON; not by which camera and port, nor how the stage moves."""
+        aside = {"title", "sensor", "camera", "check_steps"}
+        table = self.model_dump(mode="json", exclude=aside)
+        for key in ("port", "feed_mm_per_min", "settle_s"):
+            del table["stage"][key]
+        return table
+
     def zero_dn(self, sensor: Sensor) -> int:
         """Grey value of no difference in laser images from which a background is subtracted; 0 without one."""
         return sensor.detector.full_scale_dn() + 1 if self.background else 0

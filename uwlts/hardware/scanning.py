@@ -21,6 +21,7 @@ from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import load_calibration
@@ -68,6 +69,7 @@ class ScanProgress:
         return said
 
 
+@keeps_inputs
 def scan(
     plan: str | Path | ScanPlan,
     out: str | Path,
@@ -78,6 +80,7 @@ def scan(
     unlock: bool = False,
     watch: bool = False,
     calibration: str | Path | None = None,
+    port: int = 8080,
     resume: bool = False,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -106,6 +109,8 @@ def scan(
         Show the recording in a browser meanwhile, as `watch` does.
     calibration : str or Path, optional
         Calibration of any kind for the cloud on that page.
+    port : int
+        Port of that page; the next free one is taken if it is in use.
     resume, overwrite : bool
         Continue an interrupted scan; replace an existing capture.
     progress : callable, optional
@@ -127,12 +132,11 @@ def scan(
         The file exists, or cannot be written.
     """
     plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
-    address, port = camera or plan.camera, stage or plan.stage.port
-    if address is None or port is None:
+    address, serial_port = camera or plan.camera, stage or plan.stage.port
+    if address is None or serial_port is None:
         what = "camera" if address is None else "stage"
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
-    if not resume:
-        refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite)
     if calibration:
         if not watch:
             raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
@@ -144,8 +148,8 @@ def scan(
         f"{len(positions_mm)} positions from {positions_mm[0]:g} to {positions_mm[-1]:g} mm, {images} images to take"
     )
     with ExitStack() as stack:
-        page = stack.enter_context(PageBeside(out, calibration=calibration, say=report)) if watch else None
-        moved, opened = stack.enter_context(GrblStage(port)), stack.enter_context(open_camera(address))
+        page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
+        moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
         if home:
             moved.home()
         elif unlock:
@@ -165,7 +169,9 @@ def scan(
         )
         known_ms, before_s = left_over(out) if resume else ({}, 0.0)
         seen = ScanProgress(exposure_ms=known_ms)
-        writer = stack.enter_context(CaptureWriter(out, header, dtype=dtype, overwrite=overwrite, resume=resume))
+        writer = stack.enter_context(
+            CaptureWriter(out, header, dtype=dtype, plan=plan.recorded(), overwrite=overwrite, resume=resume)
+        )
         begun = len(writer)
         if begun == len(shots):
             return seen

@@ -11,6 +11,7 @@ from uwlts.metrology.artefacts import evaluate_cloud
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.errors import EvaluationError, RangeError
+from uwlts.model.sensor import Vector
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, opened_capture
 
@@ -66,9 +67,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Verification:
-    """Verdicts on all calibrated quantities of an artefact."""
+    """Verdicts on all calibrated quantities of an artefact, and what such an artefact cannot show."""
 
     verdicts: tuple[Verdict, ...]
+    not_shown: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -109,6 +111,7 @@ def verify(
             raise EvaluationError(f"{scan.path.name} does not say what it shows: its header needs an artefact")
         artefact = parse_artefact(scan.header.artefact)
         cloud = reconstruct(scan, calibration)
+        not_shown = not_shown_by(artefact.kind, scan.stage_mm, scan.header.stage_direction)
     evaluation = evaluate_cloud(cloud, artefact)
     known = figure_uncertainties(cloud, evaluation)
     verdicts = tuple(
@@ -125,4 +128,22 @@ def verify(
     )
     if not verdicts:
         raise EvaluationError(f"the artefact '{artefact.kind}' has no calibrated size to verify by")
-    return Verification(verdicts)
+    return Verification(verdicts, not_shown)
+
+
+_ACROSS = 0.1
+"""Share of a stage's motion along the sheet below which a reversed stage makes a mirror image rather than a shear."""
+
+
+def not_shown_by(kind: str, stage_mm: np.ndarray, direction: Vector) -> tuple[str, ...]:
+    """What the sizes of an artefact of a kind say nothing of.
+
+    ``stage_mm`` (F,) are the positions of its images, ``direction`` is that in which the stage moves the sensor, OCS.
+    """
+    x, y, z = direction
+    if len(np.unique(stage_mm)) < 2 or np.hypot(y, z) > _ACROSS * abs(x):
+        return ()
+    return (
+        "not shown: whether the stage moves as its direction says or the other way; the sizes of an artefact "
+        f"({kind}) are the same in a mirror image. Look once at the cloud of something with lettering",
+    )

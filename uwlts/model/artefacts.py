@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, problems_of
 from uwlts.model.sensor import Description, NotNegative, Positive
 
@@ -80,6 +81,7 @@ def read_artefact(path: str | Path) -> Artefact:
 
     CaptureError, DescriptionError or EvaluationError where it cannot be read, is no TOML, or describes no artefact.
     """
+    note_input(path)
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:

@@ -12,6 +12,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.model.sensor import Description, Sensor, Table
 
@@ -48,6 +49,7 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     """Table of a TOML file with its ``base`` filled in; nested tables are merged, everything else is replaced."""
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
+    note_input(path)
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 
 import uwlts
 from uwlts.measurement.evaluation import TruthComparisons
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import OutputError
 from uwlts.report import plot
 from uwlts.report.gather import (
@@ -37,6 +38,7 @@ from uwlts.report.page_toolkit import (
 from uwlts.report.pictures import MeasurementPictures, draw_pictures, write_pictures
 from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table
+from uwlts.storage.files import refuse_unsuitable
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
 _CAPTIONS = {
@@ -62,6 +64,7 @@ class Report:
         return summary_table(self.campaign, self.reference)
 
 
+@keeps_inputs
 def write_report(
     folder: str | Path,
     *,
@@ -98,6 +101,7 @@ def write_report(
     campaign = gather_campaign(folder)
     published = load_reference(reference) if reference else None
     page = Path(out or campaign.folder / "report.html")
+    refuse_unsuitable(page, overwrite=overwrite)
     report = Report(page, page.with_name("summary.json"), campaign, published)
     write_summary(report.summary, campaign, published, overwrite=overwrite)
     drawn = draw_pictures(campaign)

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from uwlts.calibration.joint.observability import regions
 from uwlts.calibration.joint.stored_estimate import require_joint
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import OutputError
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
@@ -30,7 +30,6 @@ from uwlts.report.page_toolkit import (
     COLOURS,
     INK,
     MISSING,
-    json_beside,
     legend_below,
     new_figure,
     refuse_unsuitable_page,
@@ -44,6 +43,7 @@ from uwlts.storage.calibration_file import read_calibration
 _WORST_IMAGES = 5
 
 
+@keeps_inputs
 def write_certificate(
     calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
 ) -> tuple[Path, AnyCertificate]:
@@ -68,7 +68,7 @@ def write_certificate(
     Raises
     ------
     OutputError
-        A file exists and ``overwrite`` is not given, cannot be written, or is the calibration itself.
+        A file exists and ``overwrite`` is not given, cannot be written, or is one of the calibrations.
     CaptureError
         A calibration cannot be read.
     CalibrationError
@@ -76,8 +76,6 @@ def write_certificate(
     """
     source = Path(calibration)
     page = Path(out or source.with_name(f"{source.stem}.certificate.html"))
-    if source.resolve() in (json_beside(page).resolve(), page.resolve()):
-        raise OutputError(f"the certificate's JSON beside {page} would replace the calibration; give another name")
     refuse_unsuitable_page(page, example="cert.html", overwrite=overwrite)
     known = read_calibration(source)
     content = certificate_of(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))

@@ -198,6 +198,9 @@ def cloud_lines(cloud: PointCloud) -> list[str]:
     return lines + [f"{key}: {value}" for key, value in cloud.metadata.items()]
 
 
+_MEDIA = {"air": "air", "fresh": "fresh water", "sea": "sea water", "custom": "the medium of its images"}
+
+
 def calibration_lines(calibration: Calibration) -> list[str]:
     """Parameters and residuals of a calibration."""
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
@@ -209,7 +212,9 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         f"sheet: normal {', '.join(f'{x:.6f}' for x in sheet.normal)}, offset {sheet.offset_mm:.4f} mm",
     ]
     if window is None:
-        lines.append("window: none; for use in air only")
+        kind = _MEDIA[calibration.medium_kind]
+        view = "" if calibration.medium_kind == "air" else ", as seen from a single viewpoint"
+        lines.append(f"window: none; for use in {kind} only{view}")
     else:
         glass = (
             f", glass {window.thickness_mm:g} mm of index {window.glass_index:.4f}" if window.refractions == 2 else ""

@@ -19,7 +19,14 @@ from uwlts.calibration.model_comparison.comparison import (
     PolynomialScore,
     Score,
 )
-from uwlts.calibration.model_comparison.held_out import DIMENSIONS, INSIDE, OUTSIDE, Candidate, distortion_words
+from uwlts.calibration.model_comparison.held_out import (
+    DIMENSIONS,
+    FEWEST_HELD,
+    INSIDE,
+    OUTSIDE,
+    Candidate,
+    distortion_words,
+)
 from uwlts.report.numbers import fixed, small_length
 from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
 from uwlts.storage.files import json_text
@@ -182,10 +189,19 @@ _PARTS = {
 }
 
 
-def adds(choice: Choice, candidate: Candidate, other: Candidate, where: str) -> tuple[float, float] | None:
-    """Additional misses of a model against another, in quadrature, mm with standard error; None where it is as good."""
-    tally = choice.tallies[where]
-    if choice.no_worse(candidate, other, where):
+_OF_THE_WINDOW = {"refractions", "window_tilt"}
+"""What bends rays in a medium and hardly in air: only images in a medium tell that it is not needed."""
+
+
+def adds(
+    choice: Choice, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False
+) -> tuple[float, float] | None:
+    """Additional misses of a model against another, in quadrature, mm with standard error; None where it is as good.
+
+    They are those in all images held out, or only those in a medium.
+    """
+    tally = (choice.wet_tallies if wet else choice.tallies)[where]
+    if choice.no_worse(candidate, other, where, wet=wet):
         return None
     difference, std = tally.beyond(choice.number(candidate), choice.number(other))
     root = float(difference**0.5)
@@ -200,8 +216,17 @@ def verdicts(choice: Choice) -> list[str]:
         without = known.get(replace(usual, **{name: DIMENSIONS[name][0]}))
         if without is None:
             continue
+        by_window = name in _OF_THE_WINDOW
         loss = f"there is no calibration, {without.reason}" if without.reason else _costs(choice, without, usual)
-        found = f"needed: {lacking} {loss}" if loss else f"not needed: {lacking} images held out are predicted as well"
+        if not loss and by_window and not choice.wet_tallies:
+            said.append(
+                f"whether {part} is needed is not shown: of the images held out {min(choice.wet.values())} are in "
+                f"water, at least {FEWEST_HELD} inside and outside the calibrated volume are needed"
+            )
+            continue
+        loss = loss or (_costs(choice, without, usual, wet=True) if by_window else "")
+        seen = f"{sum(choice.wet.values())} images held out in water" if by_window else "images held out"
+        found = f"needed: {lacking} {loss}" if loss else f"not needed: {lacking} {seen} are predicted as well"
         said.append(f"{part} is {found}")
     return [*said, _of_distortion(choice, list(known)), *_chosen(choice)]
 
@@ -219,15 +244,16 @@ def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
     return said
 
 
-def _costs(choice: Choice, without: JudgedModel, usual: Candidate) -> str:
+def _costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool = False) -> str:
     """Ways of holding out in which a model is worse, and by how much; empty where it is as good."""
-    found = {where: adds(choice, without.candidate, usual, where) for where in without.scores}
+    found = {where: adds(choice, without.candidate, usual, where, wet=wet) for where in without.scores}
     parts = [
         f"{small_length(cost[0])} ± {small_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"
         for where, cost in found.items()
         if cost is not None
     ]
-    return f"points are missed by a further {' and '.join(parts)} the calibrated volume" if parts else ""
+    where = " in water" if wet else ""
+    return f"points{where} are missed by a further {' and '.join(parts)} the calibrated volume" if parts else ""
 
 
 def _chosen(choice: Choice) -> list[str]:

@@ -1,6 +1,7 @@
 """Progress bars and error messages of both commands on the terminal."""
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from cyclopts import App, CycloptsError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from uwlts.model.command_files import command_files
 from uwlts.model.errors import Error
 from uwlts.runtime.interrupts import interrupts_kept
 
@@ -31,11 +33,14 @@ def run(app: App) -> int:
 
     A wrong command line is explained by cyclopts, on standard error like all errors.
     """
-    # Ctrl-C would end the program before anything can be said.
-    app.suppress_keyboard_interrupt = False
+    # A shell starts what a script puts in the background with SIGINT ignored, and a laser could not be stopped by it.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with interrupts_kept():
-            app(sys.argv[1:], exit_on_error=False, print_error=True, result_action="return_value")
+            command, bound, _ = app.parse_args(sys.argv[1:], exit_on_error=False, print_error=True)
+            with command_files(bound.arguments):
+                command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
     except CycloptsError:
         return USER_ERROR

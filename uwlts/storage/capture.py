@@ -20,11 +20,21 @@ import h5py
 import hdf5plugin
 import numpy as np
 
+from uwlts.model.command_files import note_input, note_made, refuse_input
 from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import CaptureHeader, Table
-from uwlts.storage.files import refuse_unsuitable, sha256_of
-from uwlts.storage.hdf5_file import UnfinishedFile, has_writer, read_label, write_label
+from uwlts.storage.files import differences, refuse_unsuitable, sha256_of
+from uwlts.storage.hdf5_file import (
+    UnfinishedFile,
+    forget_plan,
+    has_writer,
+    read_label,
+    read_plan,
+    write_label,
+    write_plan,
+)
+from uwlts.storage.one_writer import one_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 1
@@ -57,6 +67,11 @@ def _cut_to_used(path: Path) -> None:
     h5py.File(path, "r+", locking=False).close()
 
 
+def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None) -> Table:
+    """What a recording is to hold, as JSON."""
+    return {"plan": plan, "images": str(dtype), "header": header.model_dump(mode="json")}
+
+
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
     dataset = file.get(name)
     if not isinstance(dataset, h5py.Dataset) or dataset.ndim == 0:
@@ -67,21 +82,33 @@ def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
-    OutputError where the file exists (give ``overwrite``), a part is left over (give ``resume`` or ``overwrite``), or
-    storage fails; CaptureError for ``resume`` of a part that is damaged or belongs to another recording.
+    ``plan`` says, as JSON, what is to be recorded beyond what the header states; it is kept in the part and not in the
+    finished capture. OutputError where the file exists (give ``overwrite``), is an input of the running command or is
+    being written by another process, a part is left over (give ``resume`` or ``overwrite``), or storage fails;
+    CaptureError for ``resume`` of a part that is damaged, or of another header or plan.
     """
 
     def __init__(
-        self, path: str | Path, header: CaptureHeader, *, dtype: np.dtype, overwrite: bool = False, resume: bool = False
+        self,
+        path: str | Path,
+        header: CaptureHeader,
+        *,
+        dtype: np.dtype,
+        plan: Table | None = None,
+        overwrite: bool = False,
+        resume: bool = False,
     ):
-        self.path, self.header = Path(path), header
+        self.path, self.header, self._plan = Path(path), header, plan
         self._part = part_path(self.path)
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
-        with self._storage():
+        with self._storage(), ExitStack() as claimed:
             refuse_unsuitable(self.path, overwrite=overwrite)
+            claimed.enter_context(one_writer(self.path))
+            if not resume:
+                refuse_input(self._part)
             if self._part.exists() and not (resume or overwrite):
                 raise OutputError(
                     f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite"
@@ -91,6 +118,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             # Nothing is locked: whoever looks at a running recording must not stop it.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
+            self._claimed = claimed.pop_all()
 
     def _left_over(self) -> "Capture":
         """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
@@ -98,10 +126,13 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             unfinished = Capture(self._part)
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
-        headers = unfinished.header.model_dump_json(), self.header.model_dump_json()
-        if headers[0] != headers[1] or unfinished.dtype != self._dtype:
+        there = _recording_table(unfinished.header, unfinished.dtype, unfinished.plan())
+        if others := differences(there, _recording_table(self.header, self._dtype, self._plan)):
             unfinished.close()
-            raise CaptureError(f"{self._part} belongs to another recording; give --overwrite to start afresh")
+            raise CaptureError(
+                f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
+                "another name, or --overwrite to start afresh"
+            )
         return unfinished
 
     def _begin(self, unfinished: "Capture | Sequence[Frame]") -> None:
@@ -115,6 +146,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
                 write_label(self._file, format=FORMAT, version=VERSION, header=self.header)
+                if self._plan is not None:
+                    write_plan(self._file, self._plan)
                 # The checksum finds damage that the compression would decode to a different picture.
                 self._file.create_dataset(
                     "frames",
@@ -197,11 +230,14 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise OutputError(f"cannot write {self.path}: {reason}{kept}") from error
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        with self._storage():
+        with self._claimed, self._storage():
             self._file.close()
             if kind is None:
+                if self._plan is not None:
+                    forget_plan(self._part)
                 _cut_to_used(self._part)
                 os.replace(self._part, self.path)
+                note_made(self.path)
 
 
 def _what_is_wrong(error: Exception) -> str:
@@ -241,6 +277,7 @@ class Capture(AbstractContextManager["Capture"]):
         self.path = Path(path)
         if not self.path.is_file():
             raise CaptureError(f"no capture at {self.path}")
+        note_input(self.path)
         try:
             unfinished = not self.finished or has_writer(self.path)
             self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
@@ -295,6 +332,10 @@ class Capture(AbstractContextManager["Capture"]):
     def finished(self) -> bool:
         """Whether the recording was closed, rather than interrupted."""
         return self.path.suffix != ".part"
+
+    def plan(self) -> Table | None:
+        """The plan of an unfinished recording; None where it has none."""
+        return read_plan(self.file)
 
     def image(self, index: int) -> np.ndarray:
         """Image (H, W) of a frame; raises CaptureError where its data are damaged."""

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.files import written_aside
@@ -179,6 +180,7 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
         The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
     """
     path = Path(path)
+    note_input(path)
     try:
         return _read_hdf5(path) if _in_hdf5(path) else _read_ply(path)
     except CaptureError as error:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import tomli_w
 
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import OutputError, SetupError
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud, write_cloud
@@ -26,6 +27,7 @@ HEADER, TABLE = "header.json", "frames.csv"
 _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 
 
+@keeps_inputs
 def export(
     file: str | Path,
     out: str | Path,

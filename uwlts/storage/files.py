@@ -15,7 +15,15 @@ from typing import TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
+from uwlts.model.command_files import hold_until_end, note_input, note_made, refuse_input
 from uwlts.model.errors import CaptureError, OutputError, problems_of
+from uwlts.storage.one_writer import one_writer
+
+_PATIENCE_S = 10.0
+"""How long a file that another process writes is waited for at the end of the work; results are written in less, and
+several machines may write those of one sweep."""
+_SHOWN, _BRIEF = 3, 80
+"""Entries that are named where two descriptions differ, and characters of each value."""
 
 
 @contextmanager
@@ -26,10 +34,16 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     the suffix, by which some libraries choose the format. It is removed whatever exception leaves the body, and an
     existing file at `path` is untouched until the new one is complete. Without ``overwrite`` an existing file is
     refused, before the body runs and again at the end. A symbolic link is followed. OutputError where the folder is
-    missing or not writable, the file exists, `path` is a folder or a device, or the disk is full: for any OSError.
+    missing or not writable, the file exists, is an input of the running command or is being written by another process,
+    `path` is a folder or a device, or the disk is full: for any OSError.
     """
     target = Path(os.path.realpath(path))
-    refuse_unsuitable(target, overwrite=overwrite)
+    _require_suitable(target, overwrite=overwrite)
+    with one_writer(target, patience_s=_PATIENCE_S):
+        yield from _aside(target, overwrite=overwrite)
+
+
+def _aside(target: Path, *, overwrite: bool) -> Iterator[Path]:
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
     try:
         # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
@@ -39,8 +53,9 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     try:
         yield aside
         _flush(aside, os.O_RDWR)
-        refuse_unsuitable(target, overwrite=overwrite)
+        _require_suitable(target, overwrite=overwrite)
         os.replace(aside, target)
+        note_made(target)
         # Only POSIX systems can open a folder, to make the renaming itself last.
         if os.name == "posix":
             _flush(target.parent, os.O_RDONLY)
@@ -51,11 +66,20 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 
 def refuse_unsuitable(target: Path, *, overwrite: bool) -> None:
-    """Raise OutputError where nothing may be written; commands ask before the work and not only after it."""
+    """Raise OutputError where nothing may be written; commands ask before the work and not only after it.
+
+    From here until the running command ends, other processes are refused the same output.
+    """
+    _require_suitable(target, overwrite=overwrite)
+    hold_until_end(Path(os.path.realpath(target)), one_writer)
+
+
+def _require_suitable(target: Path, *, overwrite: bool) -> None:
     if not target.parent.is_dir():
         raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
     if target.exists() and not target.is_file():
         raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
+    refuse_input(target)
     if target.exists() and not overwrite:
         raise OutputError(f"{target} exists already; give another name, or --overwrite to replace it")
 
@@ -81,6 +105,7 @@ def _flush(path: Path, flags: int) -> None:
 
 def sha256_of(path: str | Path) -> str:
     """Hash of a file in hexadecimal; CaptureError where it cannot be read."""
+    note_input(path)
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -93,6 +118,7 @@ AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
 def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
     """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
+    note_input(path)
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -128,6 +154,34 @@ def write_model(path: str | Path, model: BaseModel, *, format: str, version: int
     content = {"format": format, "version": version} | model.model_dump(mode="json")
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def differences(there: object, now: object) -> str:
+    """Words for the entries in which two JSON values differ, each with both values; empty where they are the same.
+
+    ``there`` is what a file holds, ``now`` what is wanted.
+    """
+    found = list(_different(there, now, ""))
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    return "; ".join(
+        [*(f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in found[:_SHOWN])] + more
+    )
+
+
+def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in dict.fromkeys((*now, *there)):
+            yield from _different(there.get(key), now.get(key), f"{entry}.{key}" if entry else f"{key}")
+    elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
+        for place, (old, new) in enumerate(zip(there, now, strict=True)):
+            yield from _different(old, new, f"{entry}[{place}]")
+    elif there != now:
+        yield entry, there, now
+
+
+def _brief(value: object) -> str:
+    text = "not stated" if value is None else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
 
 
 def json_text(content: object, *, indent: int | None = None, ascii: bool = True) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 
 from uwlts.model.errors import CaptureError, Error
 from uwlts.model.library import validated
-from uwlts.model.sensor import Description
+from uwlts.model.sensor import Description, Table
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -51,6 +51,29 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
         raise CaptureError(f"{path} is damaged: its header is not JSON: {error}") from error
     except Error as error:
         raise CaptureError(str(error)) from error
+
+
+def write_plan(file: h5py.File, plan: Table) -> None:
+    """State in an unfinished file what it is to hold, as JSON."""
+    file.attrs["plan"] = np.bytes_(json.dumps(plan).encode())
+
+
+def read_plan(file: h5py.File) -> Table | None:
+    """The plan of an unfinished file; None where there is none, CaptureError where it is damaged."""
+    if (text := _text(file, "plan")) is None:
+        return None
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
+
+
+def forget_plan(path: str | Path) -> None:
+    """Remove the plan from a file that is finished."""
+    with h5py.File(path, "r+", locking=False) as file:
+        # HDF5 leaves the bytes of what is removed in the file.
+        file.attrs.modify("plan", np.bytes_(b" " * file.attrs.get_id("plan").dtype.itemsize))
+        del file.attrs["plan"]
 
 
 def format_of(path: str | Path) -> str | None:

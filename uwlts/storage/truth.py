@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.storage.files import written_aside
@@ -69,6 +70,7 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     """Read a truth file; CaptureError where it is missing, foreign, newer, damaged, or contradicts itself."""
     if not Path(path).is_file():
         raise CaptureError(f"no truth file at {path}")
+    note_input(path)
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)

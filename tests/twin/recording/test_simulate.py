@@ -9,6 +9,7 @@ import pytest
 import twin
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.options import NONE, Options
+from twin.recording.recording import choose_scene
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
@@ -151,6 +152,9 @@ def test_an_interrupted_recording_goes_on_where_it_stopped(undisturbed, small, s
         record_scene(scene, small, path, options=OPTIONS)
     with pytest.raises(CaptureError, match="belongs to another recording"):
         record_scene(scene, small, path, options=Options(spp=16, seed=12), resume=True)
+    moved = choose_scene(scene, placement=None, medium=None, water=1.0)
+    with pytest.raises(CaptureError, match=r"plan\.scene\.water is .* in it, 1.0 now"):
+        record_scene(moved, small, path, options=OPTIONS, resume=True)
     record_scene(scene, small, path, options=OPTIONS, resume=True)
     assert not part.exists()
     assert_same(path, undisturbed)

@@ -68,7 +68,9 @@ def tilted_choice(thesis):
     ways = splits(problem)
     models = (Candidate(), Candidate(window_tilt=False), Candidate(bow=False))
     return choice_of(
-        {model: {where: predict(problem, model, held) for where, held in ways.items()} for model in models}, ways
+        {model: {where: predict(problem, model, held) for where, held in ways.items()} for model in models},
+        ways,
+        frozenset({1}),
     )
 
 

@@ -104,7 +104,7 @@ def test_what_is_no_certificate_is_refused(path, tmp_path):
 
 
 def test_the_calibration_itself_is_never_replaced(path):
-    with pytest.raises(OutputError, match="would replace the calibration"):
+    with pytest.raises(OutputError, match="is an input"):
         write_certificate(path, out=path.with_suffix(".html"), overwrite=True)
 
 

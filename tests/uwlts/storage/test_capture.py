@@ -2,7 +2,9 @@
 
 import errno
 import json
+import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -65,9 +67,10 @@ def record(path: Path, count: int, dtype=np.uint8, *, header: CaptureHeader | No
     return path
 
 
-def interrupted(path: Path, count: int, *, header: CaptureHeader | None = None) -> Path:
+def interrupted(path: Path, count: int, *, header: CaptureHeader | None = None, plan: dict | None = None) -> Path:
     """A recording that an exception ended."""
-    with pytest.raises(KeyboardInterrupt), CaptureWriter(path, header or a_header(), dtype=np.uint8) as writer:
+    writer = CaptureWriter(path, header or a_header(), dtype=np.uint8, plan=plan)
+    with pytest.raises(KeyboardInterrupt), writer:
         for index in range(count):
             writer.append(a_frame(index))
         raise KeyboardInterrupt
@@ -289,6 +292,56 @@ def test_part_of_another_recording_is_refused(tmp_path: Path):
     with pytest.raises(CaptureError, match=r"cannot resume: .*--overwrite"):
         CaptureWriter(path, a_header(), dtype=np.uint8, resume=True)
     assert sorted(tmp_path.iterdir()) == [part]
+
+
+def test_another_recording_is_told_by_its_entries(tmp_path: Path):
+    path = tmp_path / "a.h5"
+    part = interrupted(path, 1, plan={"stage": {"start_mm": 0.0, "count": 4}, "laser_ms": "auto"})
+    before = part.read_bytes()
+    for header, plan, says in (
+        (a_header(provenance={"seed": 5}), {}, "header.provenance.seed is 4 in it, 5 now"),
+        (a_header(), {"laser_ms": 2.0}, r'plan.laser_ms is "auto" in it, 2.0 now'),
+        (a_header(), {"stage": {"start_mm": 0.0, "count": 9}}, "plan.stage.count is 4 in it, 9 now. Go on"),
+        (a_header(stage_direction=(0.0, 0.6, 0.8)), {}, "header.stage_direction[0] is 0.6 in it, 0.0 now"),
+        (a_header(), {"background": True}, "plan.background is not stated in it, true now"),
+        (a_header(name="x"), {"a": 1, "b": 2, "c": 3}, "plan.c is not stated in it, 3 now; and 1 more"),
+    ):
+        table = {"stage": {"start_mm": 0.0, "count": 4}, "laser_ms": "auto"} | plan
+        with pytest.raises(CaptureError, match=rf"another recording: .*{re.escape(says)}"):
+            CaptureWriter(path, header, dtype=np.uint8, plan=table, resume=True)
+    assert part.read_bytes() == before
+
+
+def test_a_plan_is_kept_while_it_is_not_fulfilled(tmp_path: Path):
+    path, plan = tmp_path / "a.h5", {"scene": {"secret": "ä" * 100_000}}
+    part = interrupted(path, 1, plan=plan)
+    with Capture(part) as unfinished:
+        assert unfinished.plan() == plan
+    with CaptureWriter(path, a_header(), dtype=np.uint8, plan=plan, resume=True) as writer:
+        writer.append(a_frame(1))
+    with Capture(path) as capture:
+        assert capture.plan() is None
+        assert_holds(capture, 2)
+    assert b"secret" not in path.read_bytes()
+
+
+def test_two_recordings_at_a_time_are_refused(tmp_path: Path):
+    """The second would take the part of the first for one that was interrupted."""
+    path = tmp_path / "a.h5"
+    with CaptureWriter(path, a_header(), dtype=np.uint8) as writer:
+        writer.append(a_frame(0))
+        code = (
+            "import sys, numpy as np\n"
+            "from tests.uwlts.storage.test_capture import *\n"
+            "CaptureWriter(sys.argv[1], a_header(), dtype=np.uint8, resume=sys.argv[2] == 'resume', overwrite=True)"
+        )
+        for how in ("resume", "overwrite"):
+            second = subprocess.run([sys.executable, "-c", code, path, how], capture_output=True, text=True, cwd=ROOT)
+            assert f"process {os.getpid()} on" in second.stderr and "is writing it" in second.stderr
+        writer.append(a_frame(1))
+    with Capture(path) as capture:
+        assert_holds(capture, 2)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 # --- recordings that are killed, followed, or run out of space

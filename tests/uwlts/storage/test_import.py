@@ -222,6 +222,15 @@ def test_noise_below_the_background_stays_below(tmp_path: Path):
         assert capture.image(0).min() < 256
 
 
+def test_ignored_images_are_no_backgrounds(tmp_path: Path):
+    lit = stripe_image()
+    images = {"l1.png": lit, "dark1.png": np.full_like(lit, 7), "dark-spoilt.png": np.full_like(lit, 90)}
+    told = without("laser", laser="l*", background="dark*", ignore="*spoilt*")
+    import_images(folder_of(tmp_path, images, told), tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        assert np.array_equal(capture.image(0), lit.astype(int) - 7 + 256)
+
+
 def test_images_are_taken_as_stored_whatever_exif_says(tmp_path: Path):
     folder = folder_of(tmp_path, {"a.jpg": stripe_image()}, without("laser", laser="a*"))
     upright = read_image(folder / "a.jpg")

@@ -15,6 +15,7 @@ from uwlts.calibration.joint.gathering import Gathered, Series, gather_jointly
 from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.procedure import JointProblem, joint_problem
 from uwlts.calibration.model_comparison.held_out import (
+    FEWEST_HELD,
     INSIDE,
     Candidate,
     Image,
@@ -98,14 +99,16 @@ class Tally:
         return np.sum(list(self.counts.values()), axis=0)
 
 
-def tally(predictions: Sequence[Prediction]) -> Tally:
-    """The sums of several predictions of the same images."""
+def tally(predictions: Sequence[Prediction], *, among: frozenset[Image] | None = None) -> Tally:
+    """The sums of several predictions of the same images, of all or only some of these."""
     used, first = _used(predictions), predictions[0].misses
-    images = sorted({miss.image for miss in first})
+    images = sorted({miss.image for miss in first if among is None or miss.image in among})
     shape = len(predictions), len(images)
     sums = {what: {kind: np.zeros(shape) for kind in (POINTS, STRIPES)} for what in ("px", "mm")}
     counts = {kind: np.zeros(len(images)) for kind in (POINTS, STRIPES)}
     for place, miss in enumerate(first):
+        if miss.image not in images:
+            continue
         kind, image = POINTS if miss.kind == TARGET else STRIPES, images.index(miss.image)
         counts[kind][image] += used[place].sum()
         for model, prediction in enumerate(predictions):
@@ -206,13 +209,16 @@ class Choice:
     """The models, the usual one first, and what their scores say.
 
     ``ways`` are the images held out, by the name of the way; ``predictions`` those of the models that have scores, by
-    the way; ``tallies`` belong to each way, of those models in their order.
+    the way; ``tallies`` belong to each way, of those models in their order. ``wet`` are the numbers of images held out
+    that were seen in a medium; ``wet_tallies`` are of these alone, none where they are too few.
     """
 
     judged: list[JudgedModel]
     ways: dict[str, frozenset[Image]]
     predictions: dict[Candidate, dict[str, Prediction]]
     tallies: dict[str, Tally]
+    wet: dict[str, int]
+    wet_tallies: dict[str, Tally]
 
     def best(self) -> Candidate:
         """The model of the smallest mean square miss, both ways of holding out counting alike."""
@@ -234,15 +240,16 @@ class Choice:
         """Number of a model among those that have scores."""
         return list(self.predictions).index(candidate)
 
-    def no_worse(self, candidate: Candidate, other: Candidate, where: str) -> bool:
-        """Whether a model predicts as well as another in one way of holding out.
+    def no_worse(self, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False) -> bool:
+        """Whether a model predicts as well as another in one way of holding out, in all images or those in a medium.
 
         Where images held out differ by more than chance, all may yet share errors of the stage and of poses that favour
         one model. So a model that holds parameters of the other also counts as good if the other's estimate cannot
         separate these from what is held.
         """
         separate = self.predictions[other][INSIDE].separates_from(self.predictions[candidate][INSIDE])
-        return not separate or self.tallies[where].as_good(self.number(candidate), self.number(other))
+        tallies = self.wet_tallies if wet else self.tallies
+        return not separate or tallies[where].as_good(self.number(candidate), self.number(other))
 
     def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[JudgedModel, list[JudgedModel]]:
         """Of all models or some the best, and those that are as good in both ways."""
@@ -278,16 +285,17 @@ def choose(
             found[candidate] = next((each for each in own if isinstance(each, str)), by_way)
         return found
 
+    in_medium = frozenset(number for number, each in enumerate(problem.evidence) if each.view.medium is not None)
     found = predicted(singles)
     if isinstance(found[usual], str):
         raise CalibrationError(f"without the images held out there is no calibration: {found[usual]}")
-    first = choice_of(found, ways)
+    first = choice_of(found, ways, in_medium)
     needed = {name: first.level(name, [getattr(usual, name), *others]) for name, others in dimensions.items()}
     simple = replace(usual, **needed)
     if simple not in found:
         found |= predicted([simple])
     progress(total, total)
-    return choice_of(found, ways)
+    return choice_of(found, ways, in_medium)
 
 
 def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> Prediction | str:
@@ -299,8 +307,11 @@ def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> 
         send(None)
 
 
-def choice_of(found: Found, ways: dict[str, frozenset[Image]]) -> Choice:
-    """The choice among models by what each predicts in both ways, or the reason why it does not."""
+def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozenset[int]) -> Choice:
+    """The choice among models by what each predicts in both ways, or the reason why it does not.
+
+    ``in_medium`` are the numbers of the pieces of evidence that were seen in a medium.
+    """
     predictions = {candidate: result for candidate, result in found.items() if not isinstance(result, str)}
     tallies = {where: tally([each[where] for each in predictions.values()]) for where in ways}
     judged, number = [], count()
@@ -311,7 +322,11 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]]) -> Choice:
             place = next(number)
             scores = {where: each.score(place) for where, each in tallies.items()}
             judged.append(JudgedModel(candidate, len(result[INSIDE].parameters.keys), scores))
-    return Choice(judged, ways, predictions, tallies)
+    wet = {where: frozenset(image for image in held if image[0] in in_medium) for where, held in ways.items()}
+    wet_tallies: dict[str, Tally] = {}
+    if min(map(len, wet.values())) >= FEWEST_HELD:
+        wet_tallies = {w: tally([each[w] for each in predictions.values()], among=wet[w]) for w in ways}
+    return Choice(judged, ways, predictions, tallies, {where: len(held) for where, held in wet.items()}, wet_tallies)
 
 
 @dataclass(frozen=True, eq=False)

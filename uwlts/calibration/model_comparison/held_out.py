@@ -119,7 +119,7 @@ Image = tuple[int, int]
 
 _EVERY = 4  # of the images inside one in so many is held out: enough remain, enough are judged
 _OUTER = 1 / 6  # of the depth, at either end
-_FEWEST_KEPT, _FEWEST_HELD = 4, 4  # images; fewer give neither a calibration nor a standard error
+_FEWEST_KEPT, FEWEST_HELD = 4, 4  # images; fewer give neither a calibration nor a standard error
 
 
 def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
@@ -140,10 +140,10 @@ def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
         if np.count_nonzero(~outer) >= _FEWEST_KEPT:
             outside |= {image for image, out in zip(images, outer, strict=True) if out}
     fewest = min(len(inside), len(outside))
-    if fewest < _FEWEST_HELD:
+    if fewest < FEWEST_HELD:
         raise CalibrationError(
             f"the captures have too few images with a stripe to hold some out: {fewest} could be, at least "
-            f"{_FEWEST_HELD} are needed; take 16 or more of the target at different depths"
+            f"{FEWEST_HELD} are needed; take 16 or more of the target at different depths"
         )
     return {INSIDE: frozenset(inside), OUTSIDE: frozenset(outside)}
 

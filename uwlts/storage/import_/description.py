@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from uwlts.model.artefacts import parse_artefact
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, load_sensor, merged, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
@@ -128,6 +129,7 @@ def capture_header(
 
 def read_header(path: Path) -> CaptureHeader:
     """A capture's header from JSON; DescriptionError where it is missing, no JSON or not valid."""
+    note_input(path)
     try:
         return validated(CaptureHeader, json.loads(path.read_text(encoding="utf-8")), path)
     except OSError as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import uwlts
+from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CaptureWriter, Frame, part_path
@@ -108,6 +109,7 @@ class Imported:
     warnings: tuple[str, ...]
 
 
+@keeps_inputs
 def import_images(
     folder: str | Path,
     out: str | Path,

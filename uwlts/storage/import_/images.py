@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import ImageError
 
 _STANDARD_ERROR = 2
@@ -56,6 +57,7 @@ def read_image(path: Path) -> np.ndarray:
     ImageError where the file is missing, foreign, truncated, has an alpha channel, several pages, or other than whole
     numbers of 8 or 16 bit.
     """
+    note_input(path)
     try:
         content = path.read_bytes()
     except OSError as error:

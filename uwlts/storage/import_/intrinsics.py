@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import yaml
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import merged, validated
 from uwlts.model.sensor import Distortion, Sensor
@@ -38,6 +39,7 @@ def read_intrinsics(path: Path) -> KnownCamera:
     DescriptionError where the file is missing or damaged, has no camera matrix or distortion, or the camera is another
     than a pinhole with Brown-Conrady or rational distortion.
     """
+    note_input(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

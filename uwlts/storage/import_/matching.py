@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.storage.import_.description import ImportDescription, Patterns
 from uwlts.storage.import_.images import SUFFIXES
@@ -57,6 +58,7 @@ def read_rows(path: Path) -> list[ImageRow]:
     DescriptionError where the table is missing, empty, has an unknown column, a file twice, an unknown light, or a cell
     that is no number.
     """
+    note_input(path)
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -120,6 +122,8 @@ def image_files(folder: Path) -> list[str]:
     files = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
     if not files:
         raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(SUFFIXES)}")
+    for name in files:
+        note_input(folder / name)
     return sorted(files, key=natural_key)
 
 
@@ -158,7 +162,12 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
             f"none of the {len(files)} images of {folder} is a laser or a lamp image: give patterns such as laser = "
             "'laser*.png' and lamp = 'lamp*.png', or a table with a column light"
         )
-    laser = _with_backgrounds(folder, [name for name in files if _matches(name, given.background)], given, laser)
+    laser = _with_backgrounds(
+        folder,
+        [name for name in files if _matches(name, given.background) and not _matches(name, given.ignore)],
+        given,
+        laser,
+    )
     described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)}
     unmatched = [name for name in files if name not in described and not _matches(name, given.ignore)]
     return Matched(laser, lamp, unmatched)
