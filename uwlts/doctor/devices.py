@@ -201,7 +201,16 @@ def try_stage(port: str) -> list[Finding]:
         advice = "flash a Grbl with VARIABLE_SPINDLE, see docs/how-to/hardware-stage.md"
         build = Finding("stage", "missing", found, advice)
     state = _judge_state(report.state, report.pins, homing=settings.get(22, 0) != 0)
-    return [build, *judge_settings(settings), state]
+    return [build, *judge_settings(settings), state, _LASER_GUARD]
+
+
+_LASER_GUARD = Finding(
+    "laser",
+    "ok",
+    "goes off within the exposure and 1 s when the program ends, is suspended or hangs, or its guard process ends; NOT "
+    "when program and guard are killed together, or the computer freezes: only a hardware interlock helps then, "
+    "see 'Interlock' in docs/how-to/hardware-stage.md",
+)
 
 
 def judge_settings(settings: Mapping[int, float]) -> list[Finding]:

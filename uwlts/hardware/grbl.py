@@ -15,8 +15,10 @@ When the laser goes off:
 - the ``with`` ends, normally or by an exception, Ctrl-C included: Ctrl-X, whose answer is awaited. Grbl's receiving
   interrupt obeys it, so it works while the controller moves, waits or is locked;
 - a fault is found: Ctrl-X before the error is raised;
-- the program is killed (SIGTERM, SIGKILL), crashes or ends without closing: `laser_guard`, a process of its own, sends
-  the Ctrl-X;
+- the program is killed (SIGTERM, SIGKILL), crashes or ends without closing, is suspended or hangs: `laser_guard`, a
+  process of its own, sends the Ctrl-X. It expects to hear of the program while the laser is on: every exchange with the
+  controller is heard, and longer waits are announced by `GrblStage.keep_lit`;
+- the guard is gone: the driver finds out at the next exchange, or `keep_lit`, and sends the Ctrl-X;
 - the cable is pulled out: the Uno, fed by it, loses its power and the pull-down at the laser's transistor does the
   rest. Grbl has no watchdog and no setting replaces one; an Uno with a supply of its own keeps the laser lit;
 - the computer freezes or loses power while USB stays powered: only hardware helps, see
@@ -75,6 +77,11 @@ class GrblStage:
     def position_known(self) -> bool:
         """Whether the stage may move: it is homed or unlocked, and no fault came since."""
         return self._position_known and self._line.fault is None
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a fault has ended all movements, and switched the laser off, until `home` or `unlock`."""
+        return self._line.fault is not None
 
     @property
     def laser_power(self) -> float:
@@ -229,7 +236,10 @@ class GrblStage:
 
         ``power``, 0 < power <= 1, is the share of the time in which the pin is on: below 1 it is pulsed at some kHz.
         RangeError where it is outside this range; HardwareError where the controller is locked or does not follow, the
-        guard process is gone, and for every other fault.
+        guard process is gone or has switched the laser off, and for every other fault.
+
+        While it is on, call something of the stage at least every half second, or `keep_lit` before: the guard switches
+        the laser off otherwise.
         """
         if not 0 < power <= 1:
             raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
@@ -240,17 +250,24 @@ class GrblStage:
             self._line.command("M5")
             self._power = 0.0
             self._see_spindle(0.0)
+            self._line.darkened()
             return
-        if not self._line.guarded:
-            raise self._line.failed(
-                "the process that switches the laser off after a crash is gone; open the stage again"
-            )
+        self._line.keep_lit()
         speed = max(1, round(power * self.settings.spindle_max))
         # In laser mode ($32=1) the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
         self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
         self._power = power
         self._line.command(f"M3S{speed}")
         self._see_spindle(float(speed))
+
+    def keep_lit(self, wait_s: float = 0.0) -> None:
+        """Announce that ``wait_s`` may pass without a call while the laser is on; then the guard switches it off.
+
+        To be called again and again while something is waited for. HardwareError where the guard is gone, or has
+        switched the laser off already.
+        """
+        if self.laser_power:
+            self._line.keep_lit(wait_s)
 
     def _see_spindle(self, expected: float) -> None:
         report = self._line.status()
