@@ -209,10 +209,11 @@ def test_a_scan_that_hangs_in_the_cameras_driver_is_dark(start, hangs):
     assert scan.program.poll() is None
 
 
-def test_a_frame_that_does_not_come_is_waited_for_in_the_dark(start):
+def test_a_frame_that_does_not_come_leaves_no_laser_on(start):
+    """The scan waits for 3 s beyond the exposure, as the camera may begin late, and its guard with it."""
     scan = start(hangs="lost")
     scan.lit()
-    print(f"dark after {scan.dark_after_s():.3f} s")
+    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.0):.3f} s")
     scan.lit()
     scan.lit()
     scan.program.stdout.read()
@@ -227,6 +228,15 @@ def test_without_its_guard_a_scan_is_dark_and_ends(start, ending):
     print(f"dark after {scan.dark_after_s(at_most_s=1.0):.3f} s")
     scan.program.stdout.read()
     scan.ended(2, "the process that switches the laser off .* is gone")
+
+
+def test_without_any_process_the_controller_switches_the_laser_off(start):
+    """By the line that it was sent with the one that lit the laser; 3 s and 1 s are the patience and its margin."""
+    scan = start()
+    guard = scan.lit()
+    os.kill(guard, signal.SIGKILL)
+    scan.program.kill()
+    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.0 + 1.0):.3f} s")
 
 
 def test_both_processes_may_be_asked_to_end_at_once(start):

@@ -340,6 +340,24 @@ class GrblLine:
                 answers.append(reply)
         return answers
 
+    def begin(self, *lines: str) -> None:
+        """Send lines at once and wait for the first to be done only; `end` cuts the others short.
+
+        The controller does them by itself, whatever becomes of the computer meanwhile. HardwareError as by `command`.
+        """
+        self._refuse_after_fault()
+        self._unacknowledged += len(lines)
+        self._write("".join(f"{line}\n" for line in lines).encode("ascii"))
+        deadline, left = time.monotonic() + ANSWER_S, self._unacknowledged - 1
+        while self._unacknowledged > left:
+            if self._next_reply(deadline) is None:
+                raise self.failed(f"{lines[0]!r} was not done in {ANSWER_S:g} s: the controller hangs or is held")
+
+    def end(self) -> None:
+        """End what was begun, by Ctrl-X, which also switches the laser off; the position is kept if nothing moves."""
+        self._refuse_after_fault()
+        self._reset()
+
     def settings(self) -> dict[int, float]:
         """Answer to ``$$``, by number."""
         return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}

@@ -126,8 +126,8 @@ _TRIES = 3
 """Attempts to get an image whose frame was lost on its way."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure: several repeats of a lost GigE command."""
-_DARK_AFTER_S = 0.7
-"""The laser is switched off so long after its exposure, while a frame that is late is still waited for."""
+_SPARE_S = 1.0
+"""Time of the commands between switching the laser on and waiting for a frame; then the controller switches it off."""
 _RUN_UP_MM = 1.0
 """More than the play of a ball screw or belt."""
 
@@ -166,7 +166,7 @@ class HandSwitchedLaser:
         """Nothing moves."""
         return 0.0
 
-    def laser(self, on: bool, *, power: float = 1.0) -> None:
+    def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
         """Ask for it."""
         self._ask("switch the laser on and the lamp off" if on else "switch the laser off and the lamp on")
         self.laser_power = power if on else 0.0
@@ -235,7 +235,8 @@ class Rig:
 
     def _laser(self, on: bool) -> None:
         if (self._stage.laser_power > 0) != on:
-            self._stage.laser(on, power=self._plan.laser_power)
+            longest_s = 1e-3 * (self._exposure_ms or 0.0) + _PATIENCE_S + _SPARE_S
+            self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
 
     def _rest(self) -> None:
         """Switch the laser off; an operator is asked only when an image without laser is next."""
@@ -266,12 +267,5 @@ class Rig:
         exposure_s = 1e-3 * (self._exposure_ms or 0.0)
         self._stage.keep_lit(exposure_s)
         self._camera.trigger()
-        dark_s = time.monotonic() + exposure_s + _DARK_AFTER_S
-
-        def waiting() -> None:
-            left_s = dark_s - time.monotonic()
-            if left_s < 0:
-                self._rest()
-            self._stage.keep_lit()
-
-        return self._camera.grab(_PATIENCE_S + exposure_s, waiting=waiting)
+        # The laser stays on until the frame is there, as a camera may begin its exposure late.
+        return self._camera.grab(_PATIENCE_S + exposure_s, waiting=self._stage.keep_lit)
