@@ -48,9 +48,9 @@ class GrblController:
     """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
 
     ``settings`` by number replace `BENCH_SETTINGS`. The stage stands at ``position_mm`` when the power comes on, and
-    time runs ``speed_up`` times as fast, but for dwells. ``build`` is what `GrblFirmware` takes of its version, options and time to
-    boot. ``resets_when_opened``: as the Uno does through DTR. ``gated``: the laser's supply is cut while the port is
-    closed.
+    time runs ``speed_up`` times as fast, but for dwells. ``build`` is what `GrblFirmware` takes of its version, options
+    and time to boot. ``resets_when_opened``: as the Uno does through DTR. ``gated``: the laser's supply is cut while
+    the port is closed.
     """
 
     def __init__(

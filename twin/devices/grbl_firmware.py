@@ -99,8 +99,8 @@ class GrblFirmware:
 
     All ``settings`` are given by number. The stage stands at ``position_mm`` when the power comes on. ``options`` are
     the code letters of the build in ``$I``, ``boot_s`` is the time from a restart to the greeting, that of the Uno's
-    boot loader. ``clock`` returns the controller's time in s, ``say`` takes the bytes for the computer. Of a clock that
-    runs ``speed_up`` times as fast dwells take that many times as long: exposures, for which they last, are not sped up.
+    boot loader. ``clock`` returns the controller's time in s, ``say`` takes the bytes for the computer. By a clock that
+    runs ``speed_up`` times as fast dwells take that many times as long, as exposures, which they outlast, do.
     """
 
     def __init__(

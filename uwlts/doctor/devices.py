@@ -208,8 +208,9 @@ _LASER_GUARD = Finding(
     "laser",
     "ok",
     "goes off within the exposure and 1 s when the program ends, is suspended or hangs, or its guard process ends; NOT "
-    "when program and guard are killed together, or the computer freezes: only a hardware interlock helps then, "
-    "see 'Interlock' in docs/how-to/hardware-stage.md",
+    "when program and guard are killed together, or the computer freezes: then a scan's laser stays on for the "
+    "exposure and 4 s, and only a hardware interlock helps sooner, or when the controller hangs: see 'Interlock' in "
+    "docs/how-to/hardware-stage.md",
 )
 
 
