@@ -574,6 +574,29 @@ def test_a_program_that_stands_still_loses_its_laser_and_can_go_on_after_homing(
     assert not controller.state().laser_on
 
 
+def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
+    stage.move_to(60.0, feed_mm_per_min=900.0)
+    stage.laser(True, at_most_s=5.0)
+    assert controller.state().laser_on
+    stage.laser(False)
+    assert not controller.state().laser_on
+    assert stage.position_known and stage.move_to(61.0, feed_mm_per_min=900.0) == 61.0
+    stage.laser(True, at_most_s=0.3)
+    stage.keep_lit(2.0)
+    assert wait_for(lambda: not controller.state().laser_on, 0.5)
+    # What was exposed meanwhile may be dark.
+    with pytest.raises(HardwareError, match="its time is over"):
+        stage.laser(False)
+    assert stage.unlock() == 61.0
+
+
+def test_a_hold_while_the_laser_is_on_is_not_hidden_by_switching_it_off(controller, stage):
+    stage.laser(True, at_most_s=5.0)
+    controller.inject("hold")
+    with pytest.raises(HardwareError, match="feed hold"):
+        stage.laser(False)
+
+
 def test_closing_is_confirmed_or_an_error(controller):
     with GrblStage(controller.port) as stage:
         stage.home()
