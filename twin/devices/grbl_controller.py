@@ -48,9 +48,9 @@ class GrblController:
     """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
 
     ``settings`` by number replace `BENCH_SETTINGS`. The stage stands at ``position_mm`` when the power comes on, and
-    time runs ``speed_up`` times as fast. ``build`` is what `GrblFirmware` takes of its version, options and time to
-    boot. ``resets_when_opened``: as the Uno does through DTR. ``gated``: the laser's supply is cut while the port is
-    closed.
+    time runs ``speed_up`` times as fast, but for dwells. ``build`` is what `GrblFirmware` takes of its version, options
+    and time to boot. ``resets_when_opened``: as the Uno does through DTR. ``gated``: the laser's supply is cut while
+    the port is closed.
     """
 
     def __init__(
@@ -68,7 +68,9 @@ class GrblController:
         self._resets_when_opened, self._gated, self._port_open = resets_when_opened, gated, False
         self._powered, self._muted, self._laser_broken = True, False, False
         all_settings = {**BENCH_SETTINGS, **(settings or {})}
-        self._firmware = GrblFirmware(all_settings, position_mm=position_mm, clock=self._now, say=self._say, **build)
+        self._firmware = GrblFirmware(
+            all_settings, position_mm=position_mm, clock=self._now, say=self._say, speed_up=speed_up, **build
+        )
 
     def __enter__(self) -> "GrblController":
         self._master, slave = os.openpty()

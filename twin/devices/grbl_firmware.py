@@ -99,8 +99,8 @@ class GrblFirmware:
 
     All ``settings`` are given by number. The stage stands at ``position_mm`` when the power comes on. ``options`` are
     the code letters of the build in ``$I``, ``boot_s`` is the time from a restart to the greeting, that of the Uno's
-    boot loader. ``clock`` returns the
-    controller's time in s, ``say`` takes the bytes for the computer.
+    boot loader. ``clock`` returns the controller's time in s, ``say`` takes the bytes for the computer. By a clock that
+    runs ``speed_up`` times as fast dwells take that many times as long, as exposures, which they outlast, do.
     """
 
     def __init__(
@@ -113,9 +113,10 @@ class GrblFirmware:
         version: str = "1.1h",
         options: str = "V",
         boot_s: float = 1.6,
+        speed_up: float = 1.0,
     ):
         self._settings, self._version, self._options, self._boot_s = dict(settings), version, options, boot_s
-        self._now, self._say = clock, say
+        self._now, self._say, self._speed_up = clock, say, speed_up
         self.axis = Axis(self._settings[120])
         self.shift_mm, self.short_steps, self._starts = position_mm, 0, 0
         self.restart()
@@ -376,7 +377,7 @@ class GrblFirmware:
         self._modal = {name: modal[name] for name in self._modal}
         if block.commands.get("once") == "G4":
             yield from self._done()
-            yield from self._pause(values["P"])
+            yield from self._pause(values["P"] * self._speed_up)
         elif block.commands.get("once") in ("G92", "G92.1"):
             yield from self._done()
             machine = self.axis.at(self._now())[0]

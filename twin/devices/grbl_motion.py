@@ -140,12 +140,14 @@ class Axis:
             self.add(end_mm, speed=speed, time_s=time_s)
 
     def stick(self, time_s: float) -> None:
-        """Let time stand still for the movement."""
+        """Let time stand still for the movement, or the next one."""
         self._stuck_s = time_s
 
     def stop(self, time_s: float) -> None:
-        """Stop dead where it is and forget the movements."""
+        """Stop dead where it is and forget the movements, and what they are stuck at."""
+        stuck_s = None if self._moves else self._stuck_s
         self.place(self.at(time_s)[0])
+        self._stuck_s = stuck_s
 
     def place(self, position_mm: float) -> None:
         """Rest at a position."""

@@ -201,7 +201,17 @@ def try_stage(port: str) -> list[Finding]:
         advice = "flash a Grbl with VARIABLE_SPINDLE, see docs/how-to/hardware-stage.md"
         build = Finding("stage", "missing", found, advice)
     state = _judge_state(report.state, report.pins, homing=settings.get(22, 0) != 0)
-    return [build, *judge_settings(settings), state]
+    return [build, *judge_settings(settings), state, _LASER_GUARD]
+
+
+_LASER_GUARD = Finding(
+    "laser",
+    "ok",
+    "goes off within the exposure and 1 s when the program ends, is suspended or hangs, or its guard process ends; NOT "
+    "when program and guard are killed together, or the computer freezes: then a scan's laser stays on for the "
+    "exposure and 4 s, and only a hardware interlock helps sooner, or when the controller hangs: see 'Interlock' in "
+    "docs/how-to/hardware-stage.md",
+)
 
 
 def judge_settings(settings: Mapping[int, float]) -> list[Finding]:

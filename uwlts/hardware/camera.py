@@ -11,7 +11,7 @@ twice, come late, or leave out frames that were lost in transfer.
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -307,8 +307,8 @@ class CameraDevice(ABC):
             self._check.begin_anew("late")
         self._trigger()
 
-    def grab(self, timeout_s: float) -> GrabbedFrame:
-        """Wait for the next frame, at most so many seconds.
+    def grab(self, timeout_s: float, *, waiting: Callable[[], None] = lambda: None) -> GrabbedFrame:
+        """Wait for the next frame, at most so many seconds; ``waiting`` is called about every 0.1 s meanwhile.
 
         HardwareError where no frame came in time, the camera is gone, or the frame has a fault (see ``start``). After a
         trigger that was not answered in time the acquisition is restarted, so that its frame cannot be taken for the
@@ -321,6 +321,7 @@ class CameraDevice(ABC):
             frame = self._next(min(left_s, _WAIT_S))
             if frame is None:
                 if left_s > _WAIT_S:
+                    waiting()
                     continue
                 raise self._no_frame(timeout_s)
             status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.image is not None)

@@ -15,12 +15,17 @@ When the laser goes off:
 - the ``with`` ends, normally or by an exception, Ctrl-C included: Ctrl-X, whose answer is awaited. Grbl's receiving
   interrupt obeys it, so it works while the controller moves, waits or is locked;
 - a fault is found: Ctrl-X before the error is raised;
-- the program is killed (SIGTERM, SIGKILL), crashes or ends without closing: `laser_guard`, a process of its own, sends
-  the Ctrl-X;
+- the program is killed (SIGTERM, SIGKILL), crashes or ends without closing, is suspended or hangs: `laser_guard`, a
+  process of its own, sends the Ctrl-X. It expects to hear of the program while the laser is on: every exchange with the
+  controller is heard, and longer waits are announced by `GrblStage.keep_lit`;
+- program and guard are killed, or the computer freezes, during an image of a scan: the controller comes to the M5 that
+  it has been sent with the M3, behind a dwell (``at_most_s``);
+- the guard is gone: the driver finds out at the next exchange, or `keep_lit`, and sends the Ctrl-X;
 - the cable is pulled out: the Uno, fed by it, loses its power and the pull-down at the laser's transistor does the
   rest. Grbl has no watchdog and no setting replaces one; an Uno with a supply of its own keeps the laser lit;
-- the computer freezes or loses power while USB stays powered: only hardware helps, see
-  docs/how-to/hardware-stage.md. The Uno's reset through DTR does not: it comes when the port is *opened*, not closed;
+- the controller itself hangs: only hardware helps, see docs/how-to/hardware-stage.md;
+- program and guard are killed while the laser is on without ``at_most_s``: only hardware helps. The Uno's reset through
+  DTR does not: it comes when the port is *opened*, not closed;
 - the controller restarts for any reason, the next opening of the port included: Grbl starts with the pin off.
 """
 
@@ -53,7 +58,7 @@ class GrblStage:
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
         self._line = GrblLine(port, baud=baud, boot_s=boot_s)
-        self._power, self._held = 0.0, False
+        self._power, self._timed_speed, self._held = 0.0, 0.0, False
         try:
             self.port, self.version = port, self._line.version
             self.settings = parse_settings(self._line.settings())
@@ -75,6 +80,11 @@ class GrblStage:
     def position_known(self) -> bool:
         """Whether the stage may move: it is homed or unlocked, and no fault came since."""
         return self._position_known and self._line.fault is None
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a fault has ended all movements, and switched the laser off, until `home` or `unlock`."""
+        return self._line.fault is not None
 
     @property
     def laser_power(self) -> float:
@@ -117,7 +127,7 @@ class GrblStage:
         if self._line.fault is None and not self._held:
             return
         self._position_known = self._position_known and self._line.fault is None
-        self._power, self._held = 0.0, False
+        self._power, self._timed_speed, self._held = 0.0, 0.0, False
         self._line.restart()
         # A reset that met a movement leaves an alarm behind.
         self._position_known = self._position_known and self._line.status().state != "Alarm"
@@ -224,12 +234,19 @@ class GrblStage:
                 "the motor lost steps (feed or acceleration too high, or something is in the way); home"
             )
 
-    def laser(self, on: bool, *, power: float = 1.0) -> None:
+    def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
         """Switch the laser at once and see that the controller says so; only the camera can show whether it is lit.
 
         ``power``, 0 < power <= 1, is the share of the time in which the pin is on: below 1 it is pulsed at some kHz.
         RangeError where it is outside this range; HardwareError where the controller is locked or does not follow, the
-        guard process is gone, and for every other fault.
+        guard process is gone or has switched the laser off, and for every other fault.
+
+        With ``at_most_s`` the controller itself switches it off after this time, even if nothing is left that could
+        tell it to: the lines that do so are with it before the laser is lit. It does nothing else until the laser is
+        switched off.
+
+        While it is on, call something of the stage at least every half second, or `keep_lit` before: the guard switches
+        the laser off otherwise.
         """
         if not 0 < power <= 1:
             raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
@@ -237,27 +254,45 @@ class GrblStage:
             # The fault has switched it off already.
             if self._line.fault is not None:
                 return
-            self._line.command("M5")
-            self._power = 0.0
+            if self._timed_speed:
+                # Sees that it was on all the time; the reset would hide a hold, or that the time was over.
+                self._line.keep_lit()
+                self._see_spindle(self._timed_speed)
+                self._line.end()
+            else:
+                self._line.command("M5")
+            self._power = self._timed_speed = 0.0
             self._see_spindle(0.0)
+            self._line.darkened()
             return
-        if not self._line.guarded:
-            raise self._line.failed(
-                "the process that switches the laser off after a crash is gone; open the stage again"
-            )
+        self._line.keep_lit()
         speed = max(1, round(power * self.settings.spindle_max))
         # In laser mode ($32=1) the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
         self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
         self._power = power
-        self._line.command(f"M3S{speed}")
+        if at_most_s is None:
+            self._line.command(f"M3S{speed}")
+        else:
+            self._timed_speed = float(speed)
+            self._line.begin(f"M3S{speed}", f"G4P{at_most_s:.2f}", "M5")
         self._see_spindle(float(speed))
+
+    def keep_lit(self, wait_s: float = 0.0) -> None:
+        """Announce that ``wait_s`` may pass without a call while the laser is on; then the guard switches it off.
+
+        To be called again and again while something is waited for. HardwareError where the guard is gone, or has
+        switched the laser off already.
+        """
+        if self.laser_power:
+            self._line.keep_lit(wait_s)
 
     def _see_spindle(self, expected: float) -> None:
         report = self._line.status()
+        self._refuse_stop(report)
         if report.spindle is not None and abs(report.spindle - expected) > 1:
             raise self._line.failed(
                 f"the laser's pin does not follow: S{report.spindle:g} is reported where S{expected:g} was sent "
-                f"(state {report.state}): a hold, an override of the spindle, or $31 above it"
+                f"(state {report.state}): a hold, an override of the spindle, $31 above it, or its time is over"
             )
 
     def stop(self, *, reset: bool = False) -> float:

@@ -4,10 +4,8 @@ Source: ``doc/markdown/interface.md``, ``doc/csv`` and the C code of https://git
 """
 
 import errno
-import os
+import math
 import re
-import subprocess
-import sys
 import termios
 import time
 from collections.abc import Callable, Mapping
@@ -18,7 +16,7 @@ from typing import Literal, Self, assert_never
 import serial
 from serial.tools.list_ports import comports
 
-from uwlts.hardware import laser_guard
+from uwlts.hardware.heartbeat import BEAT_S, GRACE_S, Heartbeat
 from uwlts.model.errors import HardwareError
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
@@ -229,6 +227,10 @@ _WAKE_S = 1.0
 # Status queries are answered within some ms; one that was lost is repeated.
 _QUERY_S = 0.7
 _QUERIES = 3
+_STOOD_STILL = (
+    f"the laser was switched off by its guard, as this program stood still for over {GRACE_S:g} s while it was on: "
+    "suspended (Ctrl-Z), hung in a driver, or the computer too busy; what is recorded is kept"
+)
 
 
 class GrblLine:
@@ -245,10 +247,11 @@ class GrblLine:
         self.offset_mm: float | None = None
         self._received, self._unacknowledged = bytearray(), 0
         self._serial = _open(port, baud)
-        self._guard: subprocess.Popen[bytes] | None = None
+        self._guard: Heartbeat | None = None
+        self._lit, self._beaten_s = False, -math.inf
         try:
             self._hang_up_on_close()
-            self._start_guard()
+            self._guard = Heartbeat(self._serial.fileno())
             self.version = self._greeting(boot_s)
         except BaseException as error:
             self.close(error)
@@ -263,25 +266,32 @@ class GrblLine:
         except termios.error as error:
             raise HardwareError(f"the serial port cannot be set up: {error}") from error
 
-    def _start_guard(self) -> None:
-        descriptor = self._serial.fileno()
-        try:
-            # Its standard input ends with this program. In its own session the terminal's Ctrl-C does not reach it.
-            self._guard = subprocess.Popen(
-                [sys.executable, "-I", "-S", laser_guard.__file__, str(os.getpid()), str(descriptor)],
-                pass_fds=(descriptor,),
-                start_new_session=True,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-        except OSError as error:
-            raise HardwareError(f"cannot start the guard that switches the laser off: {error.strerror}") from error
+    def keep_lit(self, wait_s: float = 0.0) -> None:
+        """Say that the laser is lit, or about to be, and that nothing may be heard of the program for ``wait_s``.
 
-    @property
-    def guarded(self) -> bool:
-        """Whether the process that switches the laser off after a crash is alive."""
-        return self._guard is not None and self._guard.poll() is None
+        Every exchange with the controller says it again. HardwareError where the guard process is gone, or has switched
+        the laser off because the program stood still.
+        """
+        self._refuse_after_fault()
+        self._lit = True
+        self._beat(wait_s + GRACE_S)
+
+    def darkened(self) -> None:
+        """Say that the laser is off; HardwareError as by `keep_lit` where it was lit before."""
+        if self._lit:
+            self._beat(math.inf)
+            self._lit = False
+
+    def _beat(self, allowed_s: float) -> None:
+        match "gone" if self._guard is None else self._guard.beat(allowed_s):
+            case "watching":
+                self._beaten_s = time.monotonic()
+            case "switched off":
+                raise self.failed(_STOOD_STILL)
+            case "gone":
+                raise self.failed(
+                    "the process that switches the laser off after a crash is gone or stopped; open the stage again"
+                )
 
     def _greeting(self, boot_s: float) -> str:
         heard = ""
@@ -330,6 +340,24 @@ class GrblLine:
                 answers.append(reply)
         return answers
 
+    def begin(self, *lines: str) -> None:
+        """Send lines at once and wait for the first to be done only; `end` cuts the others short.
+
+        The controller does them by itself, whatever becomes of the computer meanwhile. HardwareError as by `command`.
+        """
+        self._refuse_after_fault()
+        self._unacknowledged += len(lines)
+        self._write("".join(f"{line}\n" for line in lines).encode("ascii"))
+        deadline, left = time.monotonic() + ANSWER_S, self._unacknowledged - 1
+        while self._unacknowledged > left:
+            if self._next_reply(deadline) is None:
+                raise self.failed(f"{lines[0]!r} was not done in {ANSWER_S:g} s: the controller hangs or is held")
+
+    def end(self) -> None:
+        """End what was begun, by Ctrl-X, which also switches the laser off; the position is kept if nothing moves."""
+        self._refuse_after_fault()
+        self._reset()
+
     def settings(self) -> dict[int, float]:
         """Answer to ``$$``, by number."""
         return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}
@@ -367,6 +395,7 @@ class GrblLine:
         self.fault, self._unacknowledged = None, 0
         self._received.clear()
         self._write(SOFT_RESET)
+        self._told_dark()
         deadline = time.monotonic() + ANSWER_S
         while (line := self._read_line(deadline)) is not None:
             reply = parse_reply(line)
@@ -376,12 +405,20 @@ class GrblLine:
 
     def failed(self, what: str) -> HardwareError:
         """Make everything safe after a fault and return the error to raise."""
-        self.fault = what
         laser = "the laser CANNOT be switched off: switch its power off before going near"
         with suppress(OSError):
             self._serial.write(SOFT_RESET)
             laser = "the command to switch the laser off was sent"
+        # What the guard's reset makes the controller say would be taken for a fault of the controller.
+        if self._told_dark():
+            what = _STOOD_STILL
+        self.fault = what
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
+
+    def _told_dark(self) -> bool:
+        """Say that the laser is off; whether the guard had switched it off."""
+        lit, self._lit = self._lit, False
+        return lit and self._guard is not None and self._guard.beat(math.inf) == "switched off"
 
     def close(self, error: BaseException | None = None) -> None:
         """Switch the laser off and close; after an ``error`` without asking whether it worked.
@@ -392,12 +429,14 @@ class GrblLine:
             return
         try:
             if error is None and self.fault is None and self._guard is not None:
+                self.darkened()
                 self._reset()
             else:
                 with suppress(OSError):
                     self._serial.write(SOFT_RESET)
         finally:
-            self._dismiss_guard()
+            if self._guard is not None:
+                self._guard.end()
             self._serial.close()
 
     def __enter__(self) -> Self:
@@ -405,16 +444,6 @@ class GrblLine:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self.close(error)
-
-    def _dismiss_guard(self) -> None:
-        if self._guard is None or self._guard.stdin is None:
-            return
-        self._guard.stdin.close()
-        try:
-            self._guard.wait(ANSWER_S + 1)
-        except subprocess.TimeoutExpired:
-            self._guard.kill()
-            self._guard.wait()
 
     def _refuse_after_fault(self) -> None:
         if not self._serial.is_open:
@@ -473,8 +502,11 @@ class GrblLine:
                 raise self.failed(
                     f"garbage on the line, {_LONGEST_LINE} characters without an end: wrong baud rate or interference"
                 )
-            if time.monotonic() >= deadline:
+            now = time.monotonic()
+            if now >= deadline:
                 return None
+            if self._lit and now - self._beaten_s > BEAT_S:
+                self._beat(GRACE_S)
             try:
                 self._received += self._serial.read(max(1, self._serial.in_waiting))
             except OSError as error:

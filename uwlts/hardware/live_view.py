@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import viser
 
+from uwlts.hardware.page_access import PageAccess, guarded_server, is_local
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.errors import CaptureError
@@ -25,14 +26,34 @@ _LONGEST_SIDE_PX = 900
 class LivePage:
     """A page with a title. It can be seen from this machine only, unless another ``host`` is given.
 
-    A browser finds it at its ``address``; the next free port is taken where the wanted one is in use.
+    A browser finds it at its ``address``; the next free port is taken where the wanted one is in use. Everybody who
+    opens it there may look; buttons are shown, and obeyed, at the ``operator_address``, which has a token. ``warning``
+    is what to say where the page can be seen from other machines.
     """
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 8080):
-        self.server = viser.ViserServer(host=host, port=port, verbose=False)
-        self.server.gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False)
+        access = PageAccess(host)
+        self.server = guarded_server(access, port=port)
+        self.server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.server.gui.main_panel.dock_right()
         self.server.gui.add_markdown(f"# {title}")
-        self.address = f"http://{host}:{self.server.get_port()}"
+        named = f"[{host}]" if ":" in host else host
+        self.address = f"http://{named}:{self.server.get_port()}"
+        self.operator_address = f"{self.address}/?token={access.token}"
+        self.warning = None
+        if not is_local(host):
+            self.warning = (
+                f"everybody who reaches {host} in the network can see the page, and what is sent is not encrypted: "
+                "safer is the default host with `ssh -L`"
+            )
+
+    def operator_button(self, label: str, pressed: Callable[[], None], *, order: float) -> None:
+        """A button of the operator, among the page's elements by their ``order``; nobody else has it."""
+
+        # Others never get so far: what their browsers send on connecting is thrown away.
+        @self.server.on_client_connect
+        def _(client: viser.ClientHandle) -> None:
+            client.gui.add_button(label, order=order).on_click(lambda _: pressed())
 
     def close(self) -> None:
         """End the page."""
@@ -213,6 +234,8 @@ def watch(
     view = LiveView(path.name, host=host, port=port)
     try:
         report(f"open {view.address}; Ctrl-C ends it")
+        if view.warning:
+            report(f"warning: {view.warning}")
         for seen in images_of(path, known):
             if seen is None:
                 time.sleep(_LOOK_S)

@@ -126,6 +126,8 @@ _TRIES = 3
 """Attempts to get an image whose frame was lost on its way."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure: several repeats of a lost GigE command."""
+_SPARE_S = 1.0
+"""Time of the commands between switching the laser on and waiting for a frame; then the controller switches it off."""
 _RUN_UP_MM = 1.0
 """More than the play of a ball screw or belt."""
 
@@ -150,6 +152,7 @@ class HandSwitchedLaser:
     """In place of a stage where there is none: the operator is asked to switch the laser, and nothing moves."""
 
     limits_mm = (-math.inf, math.inf)
+    faulty = False
 
     def __init__(self, ask: Callable[[str], object]):
         self._ask = ask
@@ -163,17 +166,20 @@ class HandSwitchedLaser:
         """Nothing moves."""
         return 0.0
 
-    def laser(self, on: bool, *, power: float = 1.0) -> None:
+    def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
         """Ask for it."""
         self._ask("switch the laser on and the lamp off" if on else "switch the laser off and the lamp on")
         self.laser_power = power if on else 0.0
+
+    def keep_lit(self, wait_s: float = 0.0) -> None:
+        """No guard watches over it."""
 
 
 LaserStage = GrblStage | HandSwitchedLaser
 
 
 class Rig:
-    """Takes the images of a plan one by one. The laser is on for its own images only.
+    """Takes the images of a plan one by one. A switched laser is on while the camera exposes its images, and no longer.
 
     ``ahead`` is the direction in which the stage reaches every position, 1 or -1, so that play of the drive does not
     show. ``repeated`` counts images that were asked for again, as their frames were lost or damaged on their way.
@@ -211,14 +217,14 @@ class Rig:
 
     def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
         """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says."""
-        self._laser(light == "laser")
         if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
+            self._rest()
             camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
             camera.stop()
             camera.configure(exposure_ms=exposure_ms, gain_db=gain_db, bits=bits, trigger="software")
             camera.start(faults="raise")
             self._exposure_ms = exposure_ms
-        frame = self._grab()
+        frame = self._grab(light)
         return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
 
     def settled_exposure(self, light: Light, *, start_ms: float) -> float | None:
@@ -229,20 +235,37 @@ class Rig:
 
     def _laser(self, on: bool) -> None:
         if (self._stage.laser_power > 0) != on:
-            self._stage.laser(on, power=self._plan.laser_power)
+            longest_s = 1e-3 * (self._exposure_ms or 0.0) + _PATIENCE_S + _SPARE_S
+            self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
 
-    def _grab(self) -> GrabbedFrame:
+    def _rest(self) -> None:
+        """Switch the laser off; an operator is asked only when an image without laser is next."""
+        if not isinstance(self._stage, HandSwitchedLaser):
+            self._laser(False)
+
+    def _grab(self, light: Light) -> GrabbedFrame:
         """One image; asked for again if its frame was lost, as the stage is at rest. Between tries the laser is off."""
-        lit, last = self._stage.laser_power > 0, None
+        last = None
         for _ in range(_TRIES):
-            self._laser(lit)
+            self._laser(light == "laser")
             try:
-                self._camera.trigger()
-                return self._camera.grab(_PATIENCE_S + 1e-3 * (self._exposure_ms or 0.0))
+                frame = self._one()
             except HardwareError as error:
-                if not self._camera.running:
+                if self._stage.faulty or not self._camera.running:
                     raise
                 last = error
                 self._laser(False)
                 self.repeated += 1
+            else:
+                # Also shows whether the laser was on all the time.
+                self._rest()
+                return frame
         raise HardwareError(f"{last} (asked for {_TRIES} times)")
+
+    def _one(self) -> GrabbedFrame:
+        """Trigger and wait. The laser's guard hears of every step, so that a driver that hangs leaves no laser on."""
+        exposure_s = 1e-3 * (self._exposure_ms or 0.0)
+        self._stage.keep_lit(exposure_s)
+        self._camera.trigger()
+        # The laser stays on until the frame is there, as a camera may begin its exposure late.
+        return self._camera.grab(_PATIENCE_S + exposure_s, waiting=self._stage.keep_lit)

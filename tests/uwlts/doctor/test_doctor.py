@@ -346,15 +346,16 @@ def test_the_settings_are_those_of_the_documentation():
 
 def test_a_stage_as_documented_is_in_order():
     with unmoved() as controller:
-        build, settings, state = devices.try_stage(controller.port)
+        build, settings, state, laser = devices.try_stage(controller.port)
     assert build.found == f"{controller.port}: Grbl 1.1h, options V"
-    assert [each.status for each in (build, settings, state)] == ["ok"] * 3
+    assert [each.status for each in (build, settings, state, laser)] == ["ok"] * 4
+    assert "NOT when program and guard are killed" in laser.found
     assert state.found == "locked until it is homed, as after every start"
 
 
 def test_settings_that_contradict_the_documentation_are_named():
     with unmoved(settings={1: 25, 32: 0, 100: 250}) as controller:
-        _, behaviour, mechanics, _ = devices.try_stage(controller.port)
+        _, behaviour, mechanics, *_ = devices.try_stage(controller.port)
     assert behaviour.status == mechanics.status == "warning"
     assert behaviour.found.startswith("$1 is 25, not 255") and "$32 is 0, not 1" in behaviour.found
     assert behaviour.advice.endswith(": $1=255 $32=1")
@@ -363,7 +364,7 @@ def test_settings_that_contradict_the_documentation_are_named():
 
 def test_a_stage_without_a_switch_is_explained():
     with unmoved(settings={20: 0, 22: 0}) as controller:
-        _, settings, state = devices.try_stage(controller.port)
+        _, settings, state, _ = devices.try_stage(controller.port)
     assert "without a limit switch" in settings.advice
     assert (state.status, state.found) == ("ok", "idle")
 
@@ -380,5 +381,5 @@ def test_an_alarm_silence_and_a_firmware_that_cannot_switch_the_laser_are_missin
 
 def test_a_pressed_switch_is_a_warning():
     with GrblController(position_mm=-0.1, boot_s=0.1) as controller:
-        state = devices.try_stage(controller.port)[-1]
+        state = devices.try_stage(controller.port)[2]
     assert state.status == "warning" and "X are active" in state.found and "limit switch is pressed" in state.advice

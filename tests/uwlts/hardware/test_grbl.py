@@ -550,11 +550,51 @@ def test_without_the_guard_only_the_interlock_saves_a_killed_program(gated):
 
 
 def test_the_laser_is_not_lit_without_its_guard(controller, stage):
-    stage._line._guard.kill()
-    stage._line._guard.wait()
+    os.kill(stage._line._guard.pid, signal.SIGKILL)
     with pytest.raises(HardwareError, match="switches the laser off after a crash is gone"):
         stage.laser(True)
     assert not controller.state().laser_on
+
+
+def test_a_program_that_stands_still_loses_its_laser_and_can_go_on_after_homing(controller, stage):
+    stage.laser(True)
+    stage.keep_lit(0.6)
+    time.sleep(1.2)
+    assert controller.state().laser_on
+    assert wait_for(lambda: not controller.state().laser_on, 1.0)
+    with pytest.raises(HardwareError, match="switched off by its guard.*stood still"):
+        stage.laser(False)
+    assert stage.faulty and stage.laser_power == 0.0
+    stage.home()
+    stage.laser(True)
+    # A movement is heard of.
+    stage.move_to(60.0, feed_mm_per_min=1.0 * 60)
+    assert controller.state().laser_on
+    stage.laser(False)
+    assert not controller.state().laser_on
+
+
+def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
+    stage.move_to(60.0, feed_mm_per_min=900.0)
+    stage.laser(True, at_most_s=5.0)
+    assert controller.state().laser_on
+    stage.laser(False)
+    assert not controller.state().laser_on
+    assert stage.position_known and stage.move_to(61.0, feed_mm_per_min=900.0) == 61.0
+    stage.laser(True, at_most_s=0.3)
+    stage.keep_lit(2.0)
+    assert wait_for(lambda: not controller.state().laser_on, 0.5)
+    # What was exposed meanwhile may be dark.
+    with pytest.raises(HardwareError, match="its time is over"):
+        stage.laser(False)
+    assert stage.unlock() == 61.0
+
+
+def test_a_hold_while_the_laser_is_on_is_not_hidden_by_switching_it_off(controller, stage):
+    stage.laser(True, at_most_s=5.0)
+    controller.inject("hold")
+    with pytest.raises(HardwareError, match="feed hold"):
+        stage.laser(False)
 
 
 def test_closing_is_confirmed_or_an_error(controller):

@@ -67,14 +67,14 @@ _SHOWN_LINES = 60
 
 
 class GuidedPage(LivePage):
-    """The page; its button answers like Enter in the terminal."""
+    """The page; its button, which only the operator has, answers like Enter in the terminal."""
 
     def __init__(self, title: str, *, host: str = "127.0.0.1", port: int = 8080):
         super().__init__(title, host=host, port=port)
         gui = self.server.gui
         self._request = gui.add_markdown("starting")
         self._pressed = threading.Event()
-        gui.add_button("take it / go on").on_click(lambda _: self._pressed.set())
+        self.operator_button("take it / go on", self._pressed.set, order=self._request.order + 0.5)
         self._remark = gui.add_markdown("")
         self._map = gui.add_image(np.zeros((2, 2, 3), np.uint8), label="seen so far", format="png")
         self._list = gui.add_markdown("no image yet")

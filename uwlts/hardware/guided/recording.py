@@ -95,7 +95,7 @@ def record_guided(
         raise DescriptionError("neither the plan nor the command line gives the stage's port: give --stage")
     page = GuidedPage(described.title, port=port)
     try:
-        report(f"open {page.address}; Ctrl-C ends it, what was accepted is kept")
+        report(f"open {page.operator_address}; Ctrl-C ends it, what was accepted is kept")
         options = CalibrationOptions(
             refractions=refractions, poses=described.poses, camera=CameraOptions(distortion=distortion)
         )

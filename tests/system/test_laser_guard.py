@@ -1,0 +1,248 @@
+"""The laser goes off within its exposure and 1 s whatever stops a scan: suspended, killed, hung, or its guard killed.
+
+A real ``uwlts scan`` runs in a process of its own at the twin's controller, whose laser pin is watched from here. The
+camera draws a stripe where the driver says that the laser is on, and hangs where a test asks for it.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.system.small_board import small_sensor
+from twin.devices.grbl_controller import GrblController
+from uwlts.storage.capture import Capture, part_path
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parents[2]
+EXPOSURE_S = 0.5
+ALLOWED_S = EXPOSURE_S + 1.0
+LOAD_S = 0.5
+"""For machines so busy that a process which is ready does not run at once. The guard itself needs some ms."""
+COUNT = 4
+
+PROGRAM = """
+import sys, time
+import numpy as np
+from uwlts import cli
+from uwlts.hardware import scanning
+from uwlts.hardware.camera import CameraDevice, CameraInfo, Delivered
+from uwlts.hardware.grbl import GrblStage
+from uwlts.runtime import console
+
+hangs = sys.argv.pop(1)
+
+class Stage(GrblStage):
+    def __init__(self, port):
+        super().__init__(port)
+        Stage.opened = self
+
+class Camera(CameraDevice):
+    number = 0
+    due_s = None
+    def _open(self): return CameraInfo("drawn", "1", 96, 512, 8)
+    def _configure(self, wanted): return wanted
+    def _close(self): pass
+    def _start(self): pass
+    def _stop(self): pass
+    def _answers(self): pass
+    def _trigger(self):
+        self.lit = Stage.opened.laser_power > 0
+        if self.lit:
+            print("lit", Stage.opened._line._guard.pid, flush=True)
+        if self.lit and hangs == "trigger":
+            time.sleep(60)
+        self.due_s = time.monotonic() + 1e-3 * self.settings.exposure_ms
+    def _next(self, timeout_s):
+        if self.due_s is None: return None
+        if self.lit and hangs == "frame":
+            time.sleep(60)
+        time.sleep(min(timeout_s, max(self.due_s - time.monotonic(), 0)))
+        if time.monotonic() < self.due_s or hangs == "lost":
+            return None
+        self.due_s, self.number = None, self.number + 1
+        image = np.random.default_rng(self.number).integers(3, 7, (512, 96), np.uint8)
+        if self.lit:
+            image[250:253] = [[90], [180], [90]]
+        return Delivered(image, self.number)
+
+scanning.GrblStage, scanning.open_camera = Stage, Camera
+sys.exit(console.run(cli.app))
+"""
+
+
+@pytest.fixture
+def controller() -> Iterator[GrblController]:
+    with GrblController(speed_up=50.0, boot_s=0.5, position_mm=30.0) as running:
+        yield running
+
+
+@dataclass
+class Scanning:
+    """A running scan whose laser has just been switched on for an image, and its guard's process."""
+
+    program: subprocess.Popen[str]
+    controller: GrblController
+    out: Path
+
+    def lit(self) -> int:
+        """Wait for the next laser image; the guard's process."""
+        assert self.program.stdout is not None
+        for line in self.program.stdout:
+            if found := re.fullmatch(r"lit (\d+)\n", line):
+                assert self.controller.state().laser_on
+                return int(found[1])
+        raise AssertionError(self.program.communicate()[1])
+
+    def dark_after_s(self, *, at_most_s: float = ALLOWED_S) -> float:
+        """Time in s until the controller's laser pin is off."""
+        began = time.monotonic()
+        while self.controller.state().laser_on:
+            assert time.monotonic() - began < at_most_s + LOAD_S, "the laser is still on"
+            time.sleep(0.002)
+        return time.monotonic() - began
+
+    def ended(self, code: int, says: str) -> None:
+        _, errors = self.program.communicate(timeout=20)
+        assert self.program.returncode == code, errors
+        assert re.search(says, errors), errors
+
+
+StartScan = Callable[..., Scanning]
+
+
+@pytest.fixture
+def start(controller: GrblController, tmp_path: Path) -> Iterator[StartScan]:
+    (tmp_path / "sensor.toml").write_text(small_sensor("settling_s = 0.0"), encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(
+        'title = "Guard"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "drawn"\ncheck_steps = false\n'
+        f'laser_ms = {1e3 * EXPOSURE_S}\n[stage]\nport = "{controller.port}"\nstart_mm = 5.0\nstep_mm = 1.0\n'
+        f"count = {COUNT}\nfeed_mm_per_min = 900.0\n",
+        encoding="utf-8",
+    )
+    running: list[subprocess.Popen[str]] = []
+
+    def scan(*more: str, hangs: str = "") -> Scanning:
+        out = tmp_path / "scan.h5"
+        program = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, hangs, "scan", tmp_path / "plan.toml", "--out", out, "--home", *more],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            # A job of its own, as a shell starts it, in the session of this process.
+            process_group=0,
+        )
+        running.append(program)
+        return Scanning(program, controller, out)
+
+    yield scan
+    for program in running:
+        program.kill()
+        program.communicate()
+
+
+def state_of(process: int) -> str:
+    """Letter of the process's state: T where it is stopped."""
+    return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
+
+
+@pytest.mark.parametrize("stop", [signal.SIGSTOP, signal.SIGTSTP])
+def test_a_suspended_scan_is_dark_and_ends_when_it_is_continued(start, stop):
+    scan = start()
+    scan.lit()
+    guard = scan.lit()
+    time.sleep(EXPOSURE_S / 2)
+    # As the terminal's Ctrl-Z does: all processes of the job.
+    os.killpg(scan.program.pid, stop)
+    print(f"dark after {scan.dark_after_s():.3f} s")
+    assert state_of(scan.program.pid) == "T" and state_of(guard) != "T"
+    os.killpg(scan.program.pid, signal.SIGCONT)
+    scan.ended(2, "switched off by its guard.*suspended")
+    assert not scan.controller.state().laser_on
+    with Capture(part_path(scan.out)) as capture:
+        kept = len(capture)
+    assert kept == 1
+    again = start("--resume")
+    again.program.stdout.read()
+    again.ended(0, "")
+    with Capture(scan.out) as capture:
+        assert capture.stage_mm.tolist() == [5.0, 6.0, 7.0, 8.0]
+
+
+def test_a_scan_that_is_suspended_in_the_dark_goes_on(start):
+    scan = start()
+    scan.lit()
+    # The frame, and the switching off after it.
+    while scan.controller.state().laser_on:
+        time.sleep(0.002)
+    scan.program.send_signal(signal.SIGSTOP)
+    if scan.controller.state().laser_on:
+        pytest.skip("the next image has begun before the signal came")
+    time.sleep(1.5)
+    scan.program.send_signal(signal.SIGCONT)
+    scan.program.stdout.read()
+    scan.ended(0, "")
+
+
+def test_a_killed_scan_is_dark(start):
+    scan = start()
+    scan.lit()
+    scan.program.kill()
+    print(f"dark after {scan.dark_after_s():.3f} s")
+
+
+@pytest.mark.parametrize("hangs", ["trigger", "frame"])
+def test_a_scan_that_hangs_in_the_cameras_driver_is_dark(start, hangs):
+    scan = start(hangs=hangs)
+    scan.lit()
+    print(f"dark after {scan.dark_after_s():.3f} s")
+    assert scan.program.poll() is None
+
+
+def test_a_frame_that_does_not_come_leaves_no_laser_on(start):
+    """The scan waits for 3 s beyond the exposure, as the camera may begin late, and its guard with it."""
+    scan = start(hangs="lost")
+    scan.lit()
+    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.0):.3f} s")
+    scan.lit()
+    scan.lit()
+    scan.program.stdout.read()
+    scan.ended(2, "did not answer a trigger.*asked for 3 times")
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
+def test_without_its_guard_a_scan_is_dark_and_ends(start, ending):
+    scan = start()
+    guard = scan.lit()
+    os.kill(guard, ending)
+    print(f"dark after {scan.dark_after_s(at_most_s=1.0):.3f} s")
+    scan.program.stdout.read()
+    scan.ended(2, "the process that switches the laser off .* is gone")
+
+
+def test_without_any_process_the_controller_switches_the_laser_off(start):
+    """By the line that it was sent with the one that lit the laser; 3 s and 1 s are the patience and its margin."""
+    scan = start()
+    guard = scan.lit()
+    os.kill(guard, signal.SIGKILL)
+    scan.program.kill()
+    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.0 + 1.0):.3f} s")
+
+
+def test_both_processes_may_be_asked_to_end_at_once(start):
+    """As at a shutdown of the computer."""
+    scan = start()
+    guard = scan.lit()
+    os.kill(guard, signal.SIGTERM)
+    scan.program.terminate()
+    print(f"dark after {scan.dark_after_s(at_most_s=0.0):.3f} s")
