@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, assert_never, cast
 
 import drjit as dr
@@ -30,7 +29,10 @@ from twin.scene.description import (
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
 from twin.scene.shapes import bowed_plate, head_surface, weld_surface
 from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import require_regular_file
 
+_MOST_MESH_BYTES = 2**28
+"""Five million triangles of a binary STL file."""
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
 """Right-handed axes (3, 3) of a block's faces, the third one pointing outwards."""
@@ -220,11 +222,11 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     The parts are joined here, as trimesh copies their materials to join them, which needs an imaging library.
     """
     path = thing.path
-    if not Path(path).is_file():
-        raise DescriptionError(f"no mesh at {path}")
+    require_regular_file(path, most_bytes=_MOST_MESH_BYTES, error=DescriptionError, called="mesh")
     try:
         loaded = trimesh.load(path, force="scene")
-    except (ValueError, NotImplementedError, OSError) as error:
+    # trimesh passes on whatever its readers of two dozen formats stumble over.
+    except Exception as error:
         raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
     assert isinstance(loaded, trimesh.Scene)  # as it was forced to be
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0

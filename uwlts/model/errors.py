@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
+    from pydantic_core import ErrorDetails
 
 _MOST_PROBLEMS = 5
 """Problems named in a message; a damaged table would be reported number by number."""
+
+_MOST_LISTED = 1000
+"""Problems that are looked at: a list of a million would take a gigabyte."""
+
+_LONGEST_PROBLEM = 300
 
 
 class Error(Exception):
@@ -61,6 +67,14 @@ class HardwareError(Error):
     """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""
 
 
+def first_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
+    """The first problems that a validation found; none where there are too many to list them."""
+    return error.errors(include_url=False)[:most] if error.error_count() <= _MOST_LISTED else []
+
+
 def problems_of(error: "ValidationError") -> str:
     """The first problems that a validation found, each with the place where it is."""
-    return "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()[:_MOST_PROBLEMS])
+    problems = (
+        f"{'.'.join(map(str, p['loc']))}: {p['msg']}"[:_LONGEST_PROBLEM] for p in first_problems(error, _MOST_PROBLEMS)
+    )
+    return "; ".join(problems) or f"{error.error_count():,} values are wrong"
