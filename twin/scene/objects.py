@@ -235,6 +235,7 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
         if isinstance(part, trimesh.Trimesh):
+            _require_surface(part, path)
             vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
             faces.append(part.faces + count)
             uv.append(getattr(part.visual, "uv", None))
@@ -247,6 +248,17 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     if thing.texture is not None and not everywhere:
         raise DescriptionError(f"{path} has no texture coordinates for {thing.texture}: add them, or leave it out")
     return thing.scale * corners, triangles, np.concatenate(known) if everywhere else None
+
+
+def _require_surface(part: trimesh.Trimesh, path: str) -> None:
+    """DescriptionError where a part has no vertices (V, 3) and faces (F, 3) of them."""
+    vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
+    shaped = [each.ndim == 2 and each.shape[1] == 3 for each in (vertices, faces)]
+    if not all(shaped) or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices)):
+        raise DescriptionError(
+            f"{path} holds no usable surface: its vertices are of the shape {vertices.shape}, its faces {faces.shape}, "
+            "expected three coordinates of each vertex and three existing vertices of each face"
+        )
 
 
 def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:

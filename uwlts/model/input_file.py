@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import JsonValue
 
@@ -27,8 +27,8 @@ MiB = 2**20
 MOST_TOML_BYTES = MiB
 """The parser takes about a second for it; the longest descriptions, lists of positions, have a tenth."""
 MOST_JSON_BYTES = 32 * MiB
-MOST_VALUES = 1_000_000
-"""Values in a JSON file: a covariance of 1000 parameters. As Python objects they take less than 100 MB."""
+MOST_VALUES = 500_000
+"""Values in a JSON file: a covariance of 700 parameters. As Python objects they take less than 100 MB."""
 MOST_DEPTH = 64
 """Nested tables and lists; the program's own files have fewer than ten."""
 _LARGEST_INT = 2**63
@@ -181,20 +181,23 @@ _TOO_DEEP = f"its tables and lists are nested more than {MOST_DEPTH} deep"
 
 def require_plain(content: Content, *, finite: bool = True) -> Content:
     """The content; ValueError where it is nested too deep, or a number is not finite or too large for 64 bits."""
-    level, depth = [content], 0
+    level: list[Any] = [content]
+    depth = 0
     while level:
         if depth > MOST_DEPTH:
             raise ValueError(_TOO_DEEP)
-        below: list[object] = []
+        below: list[Any] = []
         for each in level:
-            if isinstance(each, dict):
+            # By their very type, as there may be a million; parsers make no others.
+            kind = type(each)
+            if kind is dict:
                 below.extend(each.values())
-            elif isinstance(each, list | tuple):
+            elif kind is list or kind is tuple:
                 below.extend(each)
-            elif isinstance(each, float):
+            elif kind is float:
                 if finite and not math.isfinite(each):
                     raise ValueError(f"{_place_of(each, content)} is {each}; expected a finite number")
-            elif isinstance(each, int) and not -_LARGEST_INT <= each < _LARGEST_INT:
+            elif kind is int and not -_LARGEST_INT <= each < _LARGEST_INT:
                 raise ValueError("it holds a whole number of more than 64 bits")
         level, depth = below, depth + 1
     return content

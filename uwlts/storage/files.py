@@ -125,6 +125,21 @@ def read_model(
 ) -> AnyModel:
     """Content of a JSON file of the program; CaptureError where it is missing, foreign, newer or damaged."""
     content = read_json(path, called=called)
+    return model_in(content, path, model, format=format, version=version, called=called, advice=advice)
+
+
+def model_in(
+    content: dict[str, JsonValue],
+    path: str | Path,
+    model: type[AnyModel],
+    *,
+    format: str,
+    version: int,
+    called: str,
+    advice: str = "",
+) -> AnyModel:
+    """What `read_json` gave of a file as a model; CaptureError as from `read_model`."""
+    content = dict(content)
     if content.pop("format", None) != format:
         raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected "format": "{format}"')
     if (found := content.pop("version", None)) != version:
