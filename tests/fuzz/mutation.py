@@ -182,7 +182,7 @@ def _image(content: bytes, rng: Random) -> bytes:
 def _hdf5(content: bytes, rng: Random, path: Path) -> bytes:
     """Values, shapes, types, links or the label changed by the library itself."""
     path.write_bytes(content)
-    odd = OSError, RuntimeError, ValueError, TypeError, KeyError, ArithmeticError
+    odd = AttributeError, OSError, RuntimeError, ValueError, TypeError, KeyError, ArithmeticError
     with contextlib.suppress(*odd), h5py.File(path, "r+") as file:
         for _ in range(rng.choice((1, 1, 2))):
             name = rng.choice(list(file))

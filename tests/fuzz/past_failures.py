@@ -127,7 +127,10 @@ _TOMLS = ("sensor", "import", "plan", "scene", "campaign", "study", "artefact")
 
 PAST: dict[str, tuple[str, Build]] = {
     "capture of a billion frames": ("capture", _with_dataset(_huge("frames"), "capture")),
-    "capture of a billion positions": ("capture", _with_dataset(_huge("stage_mm"), "capture")),
+    "capture of a billion positions, none of them stored": (
+        "capture",
+        _with_dataset(lambda file: [_huge(name)(file) for name in ("frames", "stage_mm")], "capture"),
+    ),
     "cloud of a billion points": ("cloud-hdf5", _with_dataset(_huge("points_mm"), "cloud-hdf5")),
     "truth of a billion lines": ("truth", _with_dataset(_huge("centre_px"), "truth")),
     "capture with a link to another file": ("capture", _with_dataset(_external("frames"), "capture")),

@@ -17,10 +17,16 @@ _MOST_LISTED = 1000
 """Problems that are looked at: a list of a million would take a gigabyte."""
 
 _LONGEST_PROBLEM = 300
+_LONGEST = 5000
 
 
 class Error(Exception):
-    """Base of all errors caused by input, files or the machine rather than by a bug."""
+    """Base of all errors caused by input, files or the machine rather than by a bug; long messages are cut."""
+
+    def __str__(self) -> str:
+        """The message, of at most about 5000 characters: some quote what was found in a file."""
+        text = super().__str__()
+        return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1000]} ... {text[-1000:]}"
 
 
 class DescriptionError(Error):
