@@ -11,13 +11,14 @@ export PIP_NO_INPUT := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-full check bench docs setup clean
+.PHONY: help demo test test-full check fuzz bench docs setup clean
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
 	@echo "make test    check the code and run the tests, without the slow ones"
 	@echo "make test-full   check the code and run all tests, slow studies of statistics and campaigns included"
 	@echo "make check   only check the code: format, lint, layers of imports, types"
+	@echo "make fuzz    read many damaged files; CASES=5000 of each kind, READERS=\"capture sensor\" only these"
 	@echo "make bench   measure speed"
 	@echo "make docs    build the documentation site in docs/_build/html"
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
@@ -36,6 +37,9 @@ check: setup
 	@$(PYTHON) -m ruff check --quiet .
 	@$(VENV)/bin/lint-imports --no-logo
 	@$(VENV)/bin/basedpyright
+
+fuzz: setup
+	@$(PYTHON) -m tests.fuzz $(if $(CASES),--cases $(CASES)) $(READERS)
 
 bench: setup
 	@$(PYTHON) -m tests.bench

@@ -343,7 +343,7 @@ def test_message_names_the_file(fails, folder: Path, monkeypatch):
         fails("uwlts", "reconstruct", capture, "--calibration", "calibration.json", "--out", "x.ply", says=says)
     wrong = ["uwlts", "reconstruct", "scan.h5", "--out", "x.ply", "--calibration"]
     fails(*wrong, "scan.evaluation.json", says="scan.evaluation.json is JSON but not a calibration")
-    fails(*wrong, "missing.json", says="missing.json: No such file")
+    fails(*wrong, "missing.json", says="at missing.json")
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".truth.h5", ".h5.part", ".ply", ".json", ".toml"])

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from twin.design.figures import FIGURES
 from twin.design.parameters import Follow
 from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import find, load_sensor, read_table, validated
 from uwlts.model.sensor import Description, Medium, NotNegative, Sensor
 
@@ -212,7 +213,7 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
         path = find(study, FOLDER)
         table = read_table(path, FOLDER)
         beside = path.parent / str(table.get("sensor", ""))
-        if beside.suffix == ".toml" and beside.is_file():
+        if beside.suffix == ".toml" and is_regular_file(beside):
             table["sensor"] = str(beside)
     sampling = table.get("sampling", {})
     if designs is not None and isinstance(sampling, dict):

@@ -28,7 +28,7 @@ from twin.design.description import Study
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.runtime.workers import Lost, Workers
-from uwlts.storage.files import differences, written_aside
+from uwlts.storage.files import differences, read_json, written_aside
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
@@ -245,8 +245,8 @@ def keep_to_plan(study: Study, folder: Path) -> None:
     path = folder / PLAN
     if path.is_file():
         try:
-            known = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            known = read_json(path, called="plan")
+        except CaptureError as error:
             raise DescriptionError(f"{path} cannot be read: {error}; give another folder, or --overwrite") from error
         if known != plan:
             other = ", ".join(key for key in plan if not isinstance(known, dict) or known.get(key) != plan[key])

@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from plyfile import PlyData, PlyParseError
 
 from twin.design.description import Study
 from twin.design.designs import Marked
@@ -35,6 +34,7 @@ from uwlts.model.errors import Error
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import Lost, Workers, work_through
 from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.cloud import read_cloud
 from uwlts.storage.files import written_aside
 from uwlts.storage.truth import truth_path
 
@@ -166,11 +166,8 @@ def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
 
 def _points(cloud: Path) -> np.ndarray:
     """Frame, Y and Z in mm, scene coordinates, of a cloud's points: (N, 3)."""
-    try:
-        vertices = PlyData.read(str(cloud))["vertex"].data
-        return np.column_stack([vertices[name] for name in ("frame", "y", "z")]).astype(np.float64)
-    except (OSError, PlyParseError, ValueError) as error:
-        raise errors.CaptureError(f"{cloud} is not the cloud of the plane standard: {error}") from error
+    found = read_cloud(cloud)
+    return np.column_stack([found.frame, found.points_mm[:, 1:]])
 
 
 def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
-from uwlts.model.errors import DescriptionError, Error, OutputError
+from uwlts.model.errors import CaptureError, DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
-from uwlts.storage.files import differences, written_aside
+from uwlts.storage.files import differences, read_json, written_aside
 from uwlts.storage.one_writer import one_writer
 from uwlts.storage.truth import truth_path
 
@@ -193,12 +193,11 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, re
     plan = json.loads(text)
     try:
         found = set(folder.glob(recorded))
-        content = path.read_bytes() if path.is_file() else b"null"
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     try:
-        known = json.loads(content)
-    except ValueError:
+        known = read_json(path, called="plan") if path.is_file() else None
+    except CaptureError:
         known = None
     if known == plan:
         return

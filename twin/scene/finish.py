@@ -16,10 +16,12 @@ from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
 from twin.scene.description import AnyObject, Flat, Placed, Printed
-from uwlts.model.command_files import note_input
-from uwlts.model.errors import DescriptionError
+from uwlts.model.errors import DescriptionError, ImageError
+from uwlts.model.input_file import require_regular_file
 from uwlts.model.media import check_range
+from uwlts.storage.image_header import SUFFIXES, image_size
 
+_MOST_TEXTURE_BYTES = 2**27
 _SHIFT = "point_shift_mm"
 _CELLS_PER_PATCH = 4
 """Cells of the grid that lists the patches near a place: so many that most cells list at most three patches."""
@@ -105,9 +107,12 @@ def read_grey(path: str | Path) -> np.ndarray:
 
     DescriptionError where the file is missing, no picture that Mitsuba reads, or its values lie outside 0 to 1.
     """
-    if not Path(path).is_file():
-        raise DescriptionError(f"no texture at {path}")
-    note_input(path)
+    require_regular_file(path, most_bytes=_MOST_TEXTURE_BYTES, error=DescriptionError, called="texture")
+    if Path(path).suffix.lower() in SUFFIXES:
+        try:
+            image_size(path)
+        except ImageError as error:
+            raise DescriptionError(f"{path} is no texture: {error}") from error
     try:
         picture = mi.Bitmap(str(path))
         # A picture marked as gamma-coded would be made linear by the conversion.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, assert_never, cast
 
 import drjit as dr
@@ -29,9 +28,11 @@ from twin.scene.description import (
 )
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
 from twin.scene.shapes import bowed_plate, head_surface, weld_surface
-from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import require_regular_file
 
+_MOST_MESH_BYTES = 2**28
+"""Five million triangles of a binary STL file."""
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
 """Right-handed axes (3, 3) of a block's faces, the third one pointing outwards."""
@@ -221,12 +222,11 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     The parts are joined here, as trimesh copies their materials to join them, which needs an imaging library.
     """
     path = thing.path
-    if not Path(path).is_file():
-        raise DescriptionError(f"no mesh at {path}")
-    note_input(path)
+    require_regular_file(path, most_bytes=_MOST_MESH_BYTES, error=DescriptionError, called="mesh")
     try:
         loaded = trimesh.load(path, force="scene")
-    except (ValueError, NotImplementedError, OSError) as error:
+    # trimesh passes on whatever its readers of two dozen formats stumble over.
+    except Exception as error:
         raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
     assert isinstance(loaded, trimesh.Scene)  # as it was forced to be
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
@@ -235,6 +235,7 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
         transform, name = loaded.graph[node]
         part = loaded.geometry[name]
         if isinstance(part, trimesh.Trimesh):
+            _require_surface(part, path)
             vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
             faces.append(part.faces + count)
             uv.append(getattr(part.visual, "uv", None))
@@ -247,6 +248,17 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
     if thing.texture is not None and not everywhere:
         raise DescriptionError(f"{path} has no texture coordinates for {thing.texture}: add them, or leave it out")
     return thing.scale * corners, triangles, np.concatenate(known) if everywhere else None
+
+
+def _require_surface(part: trimesh.Trimesh, path: str) -> None:
+    """DescriptionError where a part has no vertices (V, 3) and faces (F, 3) of them."""
+    vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
+    shaped = [each.ndim == 2 and each.shape[1] == 3 for each in (vertices, faces)]
+    if not all(shaped) or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices)):
+        raise DescriptionError(
+            f"{path} holds no usable surface: its vertices are of the shape {vertices.shape}, its faces {faces.shape}, "
+            "expected three coordinates of each vertex and three existing vertices of each face"
+        )
 
 
 def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:

@@ -11,6 +11,7 @@ import yaml
 from uwlts.calibration.lens import Distortion, LensCalibration, LensChoice, Pixels, calibrate_lens
 from uwlts.calibration.target_images import TargetImage
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError
+from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import read_table
 from uwlts.storage.files import written_aside
 from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel, read_image
@@ -157,7 +158,7 @@ def _described_target(folder: Path, path: str | Path | None) -> Target:
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
     known = [folder / "target.toml", folder / DESCRIPTION_NAME] if path is None else [Path(path)]
-    there = next((each for each in known if each.is_file()), None)
+    there = next((each for each in known if is_regular_file(each)), None)
     if there is None:
         raise DescriptionError(
             f"no description of the target at {' or '.join(map(str, known))}: write one, such as "

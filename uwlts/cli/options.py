@@ -1,6 +1,5 @@
 """The ``uwlts`` command line itself, and what its commands share."""
 
-import json
 import pkgutil
 import sys
 from collections.abc import Callable, Iterable
@@ -55,6 +54,7 @@ Stripe = Annotated[
 def stripe_settings(stripe: Stripe, method: Method, peak: str | None = None) -> dict[str, object]:
     """Settings of finding stripes that were given on the command line."""
     from uwlts.model.errors import DescriptionError
+    from uwlts.model.input_file import parsed_json
 
     settings: dict[str, object] = {}
     for setting in stripe:
@@ -62,7 +62,7 @@ def stripe_settings(stripe: Stripe, method: Method, peak: str | None = None) -> 
         if not (name and equals and value):
             raise DescriptionError(f"--stripe {setting}: expected NAME=VALUE, such as half_window_px=32")
         try:
-            settings[name] = json.loads(value)
+            settings[name] = parsed_json(value)
         except ValueError:
             settings[name] = value
     given: dict[str, object] = {"method": method, "peak": peak}

@@ -9,8 +9,10 @@ import numpy as np
 
 from uwlts.hardware.camera import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
 from uwlts.model.errors import HardwareError, ImageError
+from uwlts.model.input_file import is_regular_file
 from uwlts.storage.capture import Capture
-from uwlts.storage.import_.images import SUFFIXES, read_image
+from uwlts.storage.image_header import SUFFIXES
+from uwlts.storage.import_.images import read_image
 
 
 class ReplayCamera(CameraDevice):
@@ -41,7 +43,7 @@ class ReplayCamera(CameraDevice):
                 raise HardwareError(f"the folder {self._path} holds no image ({', '.join(SUFFIXES)})")
             first = _read(self._files[0])
             (height, width), bits = first.shape, 8 * first.itemsize
-        elif self._path.is_file():
+        elif is_regular_file(self._path):
             self._capture = Capture(self._path)
             if len(self._capture) == 0:
                 self._close()

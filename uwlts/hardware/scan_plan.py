@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.errors import DescriptionError, DesignError, RangeError
+from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import load_sensor, read_table, validated
 from uwlts.model.placement import check_design
 from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Table, Vector
@@ -181,10 +182,10 @@ def load_plan(path: Path) -> ScanPlan:
 
 def plan_table(path: Path, *, wanted: str) -> Table:
     """A plan's TOML with the path of a sensor that lies beside it; DescriptionError where it is missing or no TOML."""
-    if not path.is_file():
+    if not is_regular_file(path):
         raise DescriptionError(f"no plan at {path}: write one that gives {wanted}")
     table = read_table(path)
     beside = path.parent / str(table.get("sensor", ""))
-    if beside.suffix == ".toml" and beside.is_file():
+    if beside.suffix == ".toml" and is_regular_file(beside):
         table["sensor"] = str(beside)
     return table

@@ -1,14 +1,13 @@
 """Descriptions of artefacts with their calibrated sizes, distinguished by `kind`."""
 
-import tomllib
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.model.command_files import note_input
-from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, problems_of
+from uwlts.model.errors import DescriptionError, EvaluationError, problems_of
+from uwlts.model.input_file import MOST_TOML_BYTES, parsed_toml, read_text
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6
@@ -81,11 +80,9 @@ def read_artefact(path: str | Path) -> Artefact:
 
     CaptureError, DescriptionError or EvaluationError where it cannot be read, is no TOML, or describes no artefact.
     """
-    note_input(path)
+    text = read_text(path, most_bytes=MOST_TOML_BYTES, called="artefact", foreign="is not valid TOML")
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        table = parsed_toml(text)
+    except ValueError as error:
         raise DescriptionError(f"{path} is not valid TOML: {error}") from error
     return parse_artefact(table)

@@ -20,13 +20,20 @@ from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive
 _Rows = tuple[tuple[float, float, float, float], ...]
 
 
+def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
+    """Whether matrices (..., 4, 4) are rotations, not reflections, with a shift, their elements ``within`` that."""
+    rotation = matrices[..., :3, :3]
+    if not (np.abs(rotation) < 2).all():
+        return False
+    square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
+    last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)
+    return square and last and bool((np.linalg.det(rotation) > 0).all())
+
+
 def _rigid(matrix: _Rows) -> _Rows:
     """A matrix (4, 4) that is a rotation, not a reflection, and a shift, to 1e-6, as text may be rounded."""
-    if len(matrix) == 4:
-        rotation = np.array(matrix)[:3, :3]
-        square = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0
-        if square and np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-            return matrix
+    if len(matrix) == 4 and is_rigid(np.array(matrix), within=1e-6):
+        return matrix
     raise ValueError("must be a 4x4 rigid transform: a rotation, a shift, and 0 0 0 1")
 
 

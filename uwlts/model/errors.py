@@ -8,13 +8,25 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
+    from pydantic_core import ErrorDetails
 
 _MOST_PROBLEMS = 5
 """Problems named in a message; a damaged table would be reported number by number."""
 
+_MOST_LISTED = 1000
+"""Problems that are looked at: a list of a million would take a gigabyte."""
+
+_LONGEST_PROBLEM = 300
+_LONGEST = 5000
+
 
 class Error(Exception):
-    """Base of all errors caused by input, files or the machine rather than by a bug."""
+    """Base of all errors caused by input, files or the machine rather than by a bug; long messages are cut."""
+
+    def __str__(self) -> str:
+        """The message, of at most about 5000 characters: some quote what was found in a file."""
+        text = super().__str__()
+        return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1000]} ... {text[-1000:]}"
 
 
 class DescriptionError(Error):
@@ -61,6 +73,14 @@ class HardwareError(Error):
     """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""
 
 
+def first_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
+    """The first problems that a validation found; none where there are too many to list them."""
+    return error.errors(include_url=False)[:most] if error.error_count() <= _MOST_LISTED else []
+
+
 def problems_of(error: "ValidationError") -> str:
     """The first problems that a validation found, each with the place where it is."""
-    return "; ".join(f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()[:_MOST_PROBLEMS])
+    problems = (
+        f"{'.'.join(map(str, p['loc']))}: {p['msg']}"[:_LONGEST_PROBLEM] for p in first_problems(error, _MOST_PROBLEMS)
+    )
+    return "; ".join(problems) or f"{error.error_count():,} values are wrong"

@@ -5,18 +5,23 @@ A description may name a ``base`` of its own kind and give only what differs fro
 """
 
 import re
-import tomllib
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from uwlts.model.command_files import note_input
-from uwlts.model.errors import DescriptionError, Error
+from uwlts.model.errors import DescriptionError, Error, first_problems
+from uwlts.model.input_file import MOST_TOML_BYTES, is_regular_file, parsed_toml, read_text, shortened
 from uwlts.model.sensor import Description, Sensor, Table
 
 AnyDescription = TypeVar("AnyDescription", bound=Description)
+
+
+_MOST_PROBLEMS = 30
+_NO_TOML = "is not valid TOML"
+_MOST_BASES = 16
+"""Descriptions of which each is the base of the next; the shipped ones have two."""
 
 
 def library_folder() -> Path:
@@ -35,27 +40,27 @@ def find(name_or_path: str | Path, folder: str = "") -> Path:
     """Path of a description given by file or by name; raises DescriptionError with the known names."""
     path = Path(name_or_path)
     if path.suffix == ".toml":
-        if not path.is_file():
-            raise DescriptionError(f"no description at {path}")
+        if not is_regular_file(path):
+            raise DescriptionError(f"no description at {shortened(str(path))}")
         return path
     shipped = library_folder() / folder / f"{name_or_path}.toml"
-    if not shipped.is_file():
+    if not is_regular_file(shipped):
         known = f"known are {', '.join(names(folder))}, or give the path of a .toml file"
-        raise DescriptionError(f"nothing is called '{name_or_path}'; {known}")
+        raise DescriptionError(f"nothing is called '{shortened(str(name_or_path))}'; {known}")
     return shipped
 
 
 def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> Table:
     """Table of a TOML file with its ``base`` filled in; nested tables are merged, everything else is replaced."""
+    text = read_text(path, most_bytes=MOST_TOML_BYTES, error=DescriptionError, called="description", foreign=_NO_TOML)
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
-    note_input(path)
+    if len(seen) == _MOST_BASES:
+        raise DescriptionError(f"{path} is the base of {_MOST_BASES} descriptions one after another: give fewer")
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
-    except OSError as error:
-        raise DescriptionError(f"cannot read {path}: {error.strerror}") from error
+        table = parsed_toml(text)
+    except ValueError as error:
+        raise DescriptionError(f"{path} {_NO_TOML}: {error}") from error
     base = table.pop("base", None)
     if base is None:
         return table
@@ -63,7 +68,7 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
         raise DescriptionError(f"{path}: base is {base!r}; expected the name or path of another description")
     beside = path.parent / f"{base.removesuffix('.toml')}.toml"
     # A description may be called like the shipped one on which it is based.
-    base_path = beside if beside.is_file() and beside.resolve() != path.resolve() else find(base, folder)
+    base_path = beside if is_regular_file(beside) and beside.resolve() != path.resolve() else find(base, folder)
     return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
 
 
@@ -96,10 +101,14 @@ def validated(model: type[AnyDescription], table: object, source: str | Path) ->
         return model.model_validate(table)
     except ValidationError as error:
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
-        lines = [f"{source} is not a valid {words}:", *map(_explained, error.errors())]
-        raise DescriptionError("\n".join(lines)) from error
+        known = [*map(_explained, first_problems(error, _MOST_PROBLEMS))]
+        left = error.error_count() - len(known)
+        more = [f"  {left:,} {'more ' if known else ''}values are wrong"] if left else []
+        raise DescriptionError("\n".join([f"{source} is not a valid {words}:", *known, *more])) from error
     except Error as error:
         raise type(error)(f"{source}: {error}") from error
+    except ArithmeticError as error:
+        raise DescriptionError(f"{source} holds numbers that nothing can be calculated with: {error}") from error
 
 
 def _explained(problem: ErrorDetails) -> str:
@@ -108,7 +117,7 @@ def _explained(problem: ErrorDetails) -> str:
         return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"
     if problem["type"] == "missing":
         return f"  {key}: missing"
-    found = "" if isinstance(problem["input"], dict) else f" (found {problem['input']!r})"
+    found = "" if isinstance(problem["input"], dict) else f" (found {shortened(repr(problem['input']))})"
     return f"  {key}: {problem['msg'].removeprefix('Value error, ')}{found}"
 
 

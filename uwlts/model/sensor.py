@@ -23,10 +23,17 @@ from pydantic_core import to_jsonable_python
 
 from uwlts.model import media, phase_functions, waters
 from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import require_plain
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Vector = tuple[float, float, float]
+
+_Length = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""A length of a sensor in mm: from 1 nm to 1 km, so that no product of lengths leaves the range of numbers."""
+
+_Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+"""A coordinate in an image in px; those far outside the image are of lenses that are shifted."""
 
 
 def _unit(vector: Vector) -> Vector:
@@ -41,7 +48,7 @@ _INDEX_FORMULA = 1.5e-5
 """Error that Quan and Fry (1995) give for their formula of the index of water."""
 
 
-Table = Annotated[dict[str, JsonValue], BeforeValidator(to_jsonable_python)]
+Table = Annotated[dict[str, JsonValue], BeforeValidator(to_jsonable_python), AfterValidator(require_plain)]
 """A table of a TOML or JSON file that is checked where it is used."""
 
 
@@ -59,10 +66,10 @@ class Window(Description):
     left out of the light's way: the module looks straight into the medium, which is then air.
     """
 
-    distance_mm: Positive
-    thickness_mm: Positive
+    distance_mm: _Length
+    thickness_mm: _Length
     glass: str | Annotated[float, Field(gt=1, lt=4)]
-    aperture_diameter_mm: Positive
+    aperture_diameter_mm: _Length
     tilt_x_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.0
     tilt_y_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.0
     absorption_per_m: NotNegative | None = None
@@ -92,6 +99,10 @@ class Window(Description):
         return np.array([math.cos(x) * math.sin(y), -math.sin(x), math.cos(x) * math.cos(y)])
 
 
+_Coefficient = Annotated[float, Field(ge=-1e9, le=1e9)]
+"""Those of telephoto lenses reach thousands, as r is small; with r6 products stay in the range of numbers."""
+
+
 class Distortion(Description):
     """Coefficients in OpenCV's order and sense: Brown-Conrady's, and with k4, k5 and k6 the rational model's.
 
@@ -99,14 +110,14 @@ class Distortion(Description):
     g = (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6).
     """
 
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-    k5: float = 0.0
-    k6: float = 0.0
+    k1: _Coefficient = 0.0
+    k2: _Coefficient = 0.0
+    p1: _Coefficient = 0.0
+    p2: _Coefficient = 0.0
+    k3: _Coefficient = 0.0
+    k4: _Coefficient = 0.0
+    k5: _Coefficient = 0.0
+    k6: _Coefficient = 0.0
 
     def is_rational(self) -> bool:
         """Whether the radial factor has a denominator."""
@@ -127,13 +138,13 @@ class Camera(Description):
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
     height_px: Annotated[int, Field(ge=16, le=20000)]
-    pixel_size_um: Positive
+    pixel_size_um: Annotated[float, Field(ge=0.1, le=1000)]
     pixel_aspect: Annotated[float, Field(ge=0.9, le=1.1)] = 1.0
-    focal_length_mm: Positive
-    principal_point_px: tuple[float, float] | None = None
+    focal_length_mm: _Length
+    principal_point_px: tuple[_Coordinate, _Coordinate] | None = None
     distortion: Distortion = Distortion()
-    f_number: Positive
-    focus_distance_mm: Positive
+    f_number: Annotated[float, Field(ge=0.1, le=1000)]
+    focus_distance_mm: _Length
     stripe_along: Literal["width", "height"]
     window: Window
 
@@ -180,10 +191,10 @@ class Laser(Description):
     fan_profile: Literal["flat", "gaussian"] | tuple[tuple[float, float], ...] = "flat"
     bow_deg: Annotated[float, Field(gt=-10, lt=10)] = 0.0
     roll_deg: Annotated[float, Field(gt=-180, le=180)] = 0.0
-    waist_radius_mm: Positive
-    waist_distance_mm: Positive
-    beam_quality_m2: Annotated[float, Field(ge=1)] = 1.0
-    baseline_mm: Positive | None = None
+    waist_radius_mm: _Length
+    waist_distance_mm: _Length
+    beam_quality_m2: Annotated[float, Field(ge=1, le=1e6)] = 1.0
+    baseline_mm: _Length | None = None
     triangulation_angle_deg: Annotated[float, Field(gt=0, lt=90)] | None = None
     origin_mm: Vector | None = None
     axis: Vector | None = None
@@ -447,8 +458,8 @@ class Stage(Description):
 class Volume(Description):
     """Measuring volume along the camera's axis, counted from the outer face of its window."""
 
-    near_mm: Positive
-    far_mm: Positive
+    near_mm: _Length
+    far_mm: _Length
 
     @model_validator(mode="after")
     def _ordered(self) -> "Volume":

@@ -13,11 +13,13 @@ from uwlts.measurement.evaluation import EvaluationRecord, read_evaluation
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CaptureError, problems_of
+from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import find, read_table, validated
 from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
+from uwlts.storage.files import read_json
 from uwlts.storage.truth import read_truth
 
 _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"
@@ -161,7 +163,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
 def _files(folder: Path, pattern: str, *, but: str | None = None) -> Iterator[Path]:
     for path in sorted(folder.glob(pattern)):
         # A hidden file is one that is still being written.
-        if path.is_file() and not path.name.startswith(".") and not (but and path.name.endswith(but)):
+        if is_regular_file(path) and not path.name.startswith(".") and not (but and path.name.endswith(but)):
             yield path
 
 
@@ -194,9 +196,7 @@ def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) 
 
 def _seconds(path: Path) -> dict[str, float]:
     try:
-        return _SECONDS.validate_json(path.read_bytes()) if path.is_file() else {}
-    except OSError as error:
-        raise CaptureError(f"{path} cannot be read: {error.strerror}") from error
+        return _SECONDS.validate_python(read_json(path, called="table of times")) if is_regular_file(path) else {}
     except ValidationError as error:
         expected = 'the seconds of each stage by name: {"render": 12.3, ...}'
         raise CaptureError(f"{path} must hold {expected}; {problems_of(error)}") from error

@@ -1,6 +1,5 @@
 """Files and sensors described for the terminal: what a file holds, and what a sensor's design formulas give."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,6 +24,7 @@ from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORM
 from uwlts.storage.calibration_file import read_calibration, read_polynomials
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
+from uwlts.storage.files import read_json
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
@@ -135,12 +135,7 @@ def describe(path: str | Path) -> str:
 
 
 def _json_lines(path: Path) -> list[str]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8")).get("format")
-    except OSError as error:
-        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise CaptureError(f"{path} is not a file of this program, or is truncated") from error
+    found = read_json(path, called="file of this program").get("format")
     try:
         if found == CALIBRATION_FORMAT:
             return calibration_lines(read_calibration(path))

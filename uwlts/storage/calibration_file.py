@@ -2,14 +2,26 @@
 
 import json
 from pathlib import Path
-from typing import assert_never
+from typing import TypedDict, assert_never
 
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.storage.files import read_json, read_model, write_model, written_aside
+from uwlts.storage.files import model_in, read_json, read_model, write_model, written_aside
 
 FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
+
+
+class _Known(TypedDict):
+    """By what a file of calibrations is recognised."""
+
+    format: str
+    version: int
+    called: str
+
+
+_CALIBRATION: _Known = {"format": FORMAT, "version": VERSION, "called": "calibration"}
+_POLYNOMIALS: _Known = {"format": POLYNOMIALS_FORMAT, "version": VERSION, "called": "polynomial calibration"}
 
 
 def write_calibration(path: str | Path, calibration: AnyCalibration, *, overwrite: bool = False) -> None:
@@ -29,19 +41,20 @@ def write_calibration(path: str | Path, calibration: AnyCalibration, *, overwrit
 
 def read_calibration(path: str | Path) -> Calibration:
     """Read a calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    return read_model(path, Calibration, format=FORMAT, version=VERSION, called="calibration")
+    return read_model(path, Calibration, **_CALIBRATION)
 
 
 def read_polynomials(path: str | Path) -> PolynomialCalibration:
     """Read a polynomial calibration; CaptureError where the file is missing, foreign, newer or damaged."""
-    known_by = {"format": POLYNOMIALS_FORMAT, "called": "polynomial calibration"}
-    return read_model(path, PolynomialCalibration, version=VERSION, **known_by)
+    return read_model(path, PolynomialCalibration, **_POLYNOMIALS)
 
 
 def load_calibration(path: str | Path) -> AnyCalibration:
     """Read a calibration of any kind; CaptureError if the file is missing, foreign, newer or damaged."""
-    kind = read_json(path, called="calibration").get("format")
-    return read_polynomials(path) if kind == POLYNOMIALS_FORMAT else read_calibration(path)
+    content = read_json(path, called="calibration")
+    if content.get("format") == POLYNOMIALS_FORMAT:
+        return model_in(content, path, PolynomialCalibration, **_POLYNOMIALS)
+    return model_in(content, path, Calibration, **_CALIBRATION)
 
 
 def loaded_calibration(calibration: AnyCalibration | str | Path) -> AnyCalibration:

@@ -9,6 +9,7 @@ While it is being recorded the file is called ``NAME.part`` and every frame is f
 an interrupted recording keeps all its complete frames; closing it gives it its name.
 """
 
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,17 +21,21 @@ import h5py
 import hdf5plugin
 import numpy as np
 
-from uwlts.model.command_files import note_input, note_made, refuse_input
+from uwlts.model.calibration import is_rigid
+from uwlts.model.command_files import note_made, refuse_input
 from uwlts.model.errors import CaptureError, ImageError, OutputError
+from uwlts.model.input_file import require_regular_file
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.storage.files import differences, refuse_unsuitable, sha256_of
 from uwlts.storage.hdf5_file import (
     UnfinishedFile,
+    find_dataset,
     forget_plan,
     has_writer,
     read_label,
     read_plan,
+    require_small_chunks,
     write_label,
     write_plan,
 )
@@ -41,6 +46,8 @@ VERSION = 1
 _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
 # What h5py raises on a damaged file depends on where the damage is.
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+POSE_ROUNDED = 1e-4
+"""By how much a pose's elements may be off a rotation, as tables give them with four decimals or more."""
 # Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
 _MARGIN_BYTES = 2**18
 
@@ -73,8 +80,8 @@ def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None)
 
 
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
-    dataset = file.get(name)
-    if not isinstance(dataset, h5py.Dataset) or dataset.ndim == 0:
+    dataset = find_dataset(file, name, path=path)
+    if dataset is None or dataset.ndim == 0:
         raise CaptureError(f"{path} is damaged: it has no '{name}' for every frame")
     return dataset
 
@@ -99,6 +106,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         resume: bool = False,
     ):
         self.path, self.header, self._plan = Path(path), header, plan
+        self._last_s = -math.inf
         self._part = part_path(self.path)
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
@@ -177,20 +185,26 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         """Store one frame; once this returns, the frame survives the end of the program.
 
         ImageError where the image has another size or type than the capture; CaptureError where stage position,
-        exposure, time or pose is not finite, or the pose is not (4, 4); OutputError where storage fails, the frames
-        before being kept.
+        exposure, time or pose is not finite, the exposure is negative, the time is before the last frame's, or the pose
+        is no rotation with a shift (4, 4); OutputError where storage fails, the frames before being kept.
         """
         if frame.image.shape != self._shape or frame.image.dtype != self._dtype:
             raise ImageError(
                 f"frame is {frame.image.shape} {frame.image.dtype}, the capture holds {self._shape} {self._dtype}"
             )
-        if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all():
+        if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
             raise CaptureError(
                 f"a frame at stage position {frame.stage_mm} mm, exposure {frame.exposure_ms} ms and time "
-                f"{frame.time_s} s cannot be stored: all three must be finite"
+                f"{frame.time_s} s cannot be stored: all three must be finite, the exposure not negative"
+            )
+        if frame.time_s < self._last_s:
+            raise CaptureError(
+                f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give times that grow"
             )
         if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
             raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
+        if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
+            raise CaptureError(f"a pose is a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
         with self._storage():
             self._store(frame)
 
@@ -205,6 +219,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             dataset.resize(count + 1, axis=0)
             dataset[count] = value
             dataset.flush()
+        self._last_s = frame.time_s
 
     def _claim_space(self) -> None:
         """Make the file long enough for one more frame, by zeros behind what HDF5 uses; OSError where the disk is full.
@@ -261,11 +276,12 @@ class Capture(AbstractContextManager["Capture"]):
     dtype : dtype
         Type of the images, uint8 or uint16.
     stage_mm, exposure_ms, time_s : (N,) float64
-        Stage position in mm, exposure in ms, time in s of every frame; finite.
+        Stage position in mm, exposure in ms, time in s of every frame; finite, exposures not negative, and times not
+        running backwards.
     laser_on : (N,) bool
         Whether the laser was on, rather than the lamp.
     pose : (N, 4, 4) float64
-        ``T_scene_object`` of the sensor's OCS; all NaN for a frame without one.
+        ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one.
 
     Raises
     ------
@@ -275,9 +291,7 @@ class Capture(AbstractContextManager["Capture"]):
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        if not self.path.is_file():
-            raise CaptureError(f"no capture at {self.path}")
-        note_input(self.path)
+        require_regular_file(self.path, called="capture")
         try:
             unfinished = not self.finished or has_writer(self.path)
             self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
@@ -285,7 +299,7 @@ class Capture(AbstractContextManager["Capture"]):
             raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:
             self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
-            self._read_frames()
+            self._read_frames(unfinished=unfinished)
         except _DAMAGE as error:
             self.file.close()
             raise CaptureError(f"{self.path} is damaged: {error}") from error
@@ -293,7 +307,7 @@ class Capture(AbstractContextManager["Capture"]):
             self.file.close()
             raise
 
-    def _read_frames(self) -> None:
+    def _read_frames(self, *, unfinished: bool) -> None:
         camera = self.header.sensor.camera
         images = self._dataset("frames", (camera.height_px, camera.width_px), "u")
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
@@ -301,6 +315,8 @@ class Capture(AbstractContextManager["Capture"]):
         columns = {
             name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()
         }
+        for name, dataset in columns.items():
+            require_small_chunks(dataset, name, path=self.path)
         self._images, self.dtype = images, images.dtype
         self._count = min(len(images), *map(len, columns.values()))
         # HDF5 shows chunks that were never stored as zeros.
@@ -314,6 +330,17 @@ class Capture(AbstractContextManager["Capture"]):
         finite = np.isfinite(self.pose).reshape(self._count, 16)
         if (finite.any(axis=1) != finite.all(axis=1)).any():
             raise CaptureError(f"{self.path} holds poses of which only some elements are known")
+        if not is_rigid(self.pose[finite.all(axis=1)], within=POSE_ROUNDED):
+            raise CaptureError(f"{self.path} holds poses that are no rotation with a shift")
+        if (self.exposure_ms < 0).any():
+            raise CaptureError(f"{self.path} holds negative exposures")
+        if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
+            # The writer was killed between making room for its last frame and storing it.
+            self._count -= 1
+            for name in _PER_FRAME:
+                setattr(self, name, getattr(self, name)[: self._count])
+        if (np.diff(self.time_s) < 0).any():
+            raise CaptureError(f"{self.path} holds times that run backwards")
 
     def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """A dataset with one row of a shape per frame; CaptureError where it is something else."""

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from uwlts.model.command_files import note_input
 from uwlts.model.errors import CaptureError
+from uwlts.model.input_file import opened, parsed_json, require_plain, require_regular_file, shortened
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.files import written_aside
-from uwlts.storage.hdf5_file import format_of, read_label, write_label
+from uwlts.storage.hdf5_file import format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
@@ -32,6 +32,12 @@ _KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), stri
 _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
+_FARTHEST_MM = 1e12
+"""Coordinates of maps in mm reach 1e10; squares and products of larger ones would leave the range of numbers."""
+_LONGEST_PLY_HEADER = 2**24
+_MOST_PROPERTIES = 1000
+_TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+_TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
 
 
@@ -119,16 +125,17 @@ class PointCloud:
             raise CaptureError(f"the points of a cloud have the shape (N, 3), not {points.shape}")
         if unusable := np.count_nonzero(~np.isfinite(points).all(axis=1)):
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
+        if len(points) and (farthest := np.abs(points).max()) > _FARTHEST_MM:
+            raise CaptureError(f"a point lies {farthest:g} mm from the origin; expected at most {_FARTHEST_MM:g} mm")
         for name in (*_PER_POINT[1:], "deviation_mm"):
             column = getattr(self, name)
             if column is not None and column.shape != (len(points),):
                 raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {len(points)} points")
         if self.uncertainty is not None:
-            random, patterns = self.uncertainty.random_mm2, self.uncertainty.patterns_mm
-            if random.shape != (len(points), 6) or patterns.shape[1:] != points.shape:
-                raise CaptureError(
-                    f"the uncertainty of {len(points)} points has the shapes {random.shape} and {patterns.shape}"
-                )
+            known = self.uncertainty
+            shapes = known.random_mm2.shape, known.position_mm.shape, known.patterns_mm.shape[1:]
+            if shapes != ((len(points), 6), points.shape, points.shape):
+                raise CaptureError(f"the uncertainty of {len(points)} points has the shapes {shapes}")
         _as_json(self.metadata)
 
     def __len__(self) -> int:
@@ -180,7 +187,6 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
         The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
     """
     path = Path(path)
-    note_input(path)
     try:
         return _read_hdf5(path) if _in_hdf5(path) else _read_ply(path)
     except CaptureError as error:
@@ -213,6 +219,7 @@ def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.n
 
 def _as_json(metadata: Table) -> str:
     try:
+        require_plain(metadata)
         text = json.dumps(metadata, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     except (TypeError, ValueError) as error:
         raise CaptureError(f"the metadata of a cloud must be plain JSON without NaN: {error}") from error
@@ -237,8 +244,8 @@ def _metadata(comments: list[str]) -> Table:
     if [piece and piece.groups()[:2] for piece in pieces] != wanted:
         raise CaptureError("its metadata is incomplete; write the file again or remove those comments")
     try:
-        metadata = json.loads("".join(piece.group(3) for piece in pieces if piece))
-    except json.JSONDecodeError as error:
+        metadata = parsed_json("".join(piece.group(3) for piece in pieces if piece))
+    except ValueError as error:
         raise CaptureError(f"its metadata is damaged: {error}") from error
     if not isinstance(metadata, dict):
         raise CaptureError(f"its metadata is a {type(metadata).__name__}; expected a JSON object")
@@ -246,13 +253,13 @@ def _metadata(comments: list[str]) -> Table:
 
 
 def _read_ply(path: Path) -> PointCloud:
+    with opened(path, called="cloud") as file:
+        _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
     try:
         ply = PlyData.read(str(path))
-    except FileNotFoundError as error:
-        raise CaptureError(f"{path} does not exist") from error
     except OSError as error:
         raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (PlyParseError, ValueError, MemoryError) as error:
+    except (PlyParseError, ValueError, MemoryError, ArithmeticError, LookupError) as error:
         raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
     if "vertex" not in ply:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
@@ -295,6 +302,31 @@ def _read_ply(path: Path) -> PointCloud:
     )
 
 
+def _refuse_impossible_header(start: bytes, *, size: int, path: Path) -> None:
+    """CaptureError where a PLY file is shorter than what its header declares; other faults are left to the reader."""
+    header, end, _ = start.partition(b"end_header")
+    if not end:
+        raise CaptureError(f"{path} is not a complete PLY file: its header has no end in the first 16 MiB")
+    in_text, least, count, properties = b"format ascii" in header[:200], 0, 0, 0
+    for line in header.splitlines():
+        match line.decode("ascii", "replace").split():
+            case ["element", _, number] if number.isdecimal() and len(number) <= 18:
+                count = int(number)
+            case ["element", *_]:
+                raise CaptureError(f"{path} is not a complete PLY file: {shortened(repr(line))} is no element")
+            case ["property", kind, *_]:
+                # In text a number takes a digit and what parts it from the next; a list at least its length.
+                least += count * (2 if in_text else _TYPE_BYTES.get(kind, 1))
+                properties += 1
+    if properties > _MOST_PROPERTIES:
+        raise CaptureError(f"{path} has {properties:,} properties; this program reads up to {_MOST_PROPERTIES:,}")
+    if least > size:
+        raise CaptureError(
+            f"{path} is not a complete PLY file: early end-of-file, its header declares at least {least:,} bytes of "
+            f"values, and the file has {size:,}"
+        )
+
+
 class _CloudHeader(Description):
     """Header of a cloud's HDF5 file."""
 
@@ -319,17 +351,23 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 
 def _read_hdf5(path: Path) -> PointCloud:
-    if not path.is_file():
-        raise CaptureError(f"{path} {'is no file' if path.exists() else 'does not exist'}")
+    require_regular_file(path, called="cloud")
+    names = [part.name for part in fields(PointUncertainty)]
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
-            arrays = {name: np.asarray(dataset[...]) for name, dataset in file.items()}
+            found = {name: read_array(file, name, path=path) for name in (*_KINDS, *names)}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
-    if unusable := [name for name, values in arrays.items() if values.dtype.kind not in "iuf"]:
-        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers")
-    names = [part.name for part in fields(PointUncertainty)]
+    arrays = {name: values for name, values in found.items() if values is not None}
+    # Whole numbers may not be cut, nor fractions become whole.
+    wanted_kinds = {name: np.dtype(_KINDS.get(name, np.float32)).kind for name in arrays}
+    if unusable := [name for name, values in arrays.items() if values.dtype.kind != wanted_kinds[name]]:
+        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers of the expected kind")
+    if unusable := [
+        n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
+    ]:
+        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
     wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
     if missing := [name for name in wanted if name not in arrays]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")

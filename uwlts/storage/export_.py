@@ -19,7 +19,7 @@ from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import OutputError, SetupError
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud, write_cloud
-from uwlts.storage.files import refuse_unsuitable, written_aside
+from uwlts.storage.files import refuse_unsuitable, require_possible_name, written_aside
 from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 
@@ -88,6 +88,7 @@ def export_capture(
     one), header.json and import.toml. OutputError where the folder exists, its parent is missing, or storage fails;
     CaptureError where a frame's data are damaged.
     """
+    require_possible_name(folder)
     if folder.exists():
         raise OutputError(f"{folder} exists already; give the name of a new folder")
     if not folder.parent.is_dir():
@@ -170,9 +171,9 @@ def _laz(cloud: PointCloud) -> bytes:
     points = 1e-3 * cloud.points_mm
     middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2, 3)
     reach = np.abs(points - middle).max()
-    if reach > _REACH_M:
+    if not reach <= _REACH_M:
         raise OutputError(
-            f"the cloud reaches {reach:.0f} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
+            f"the cloud reaches {reach:.9g} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
             f"only {_REACH_M:.0f} m: write PLY or E57"
         )
     header = laspy.LasHeader(version="1.4", point_format=6)

@@ -15,8 +15,9 @@ from typing import TypeVar
 
 from pydantic import BaseModel, JsonValue, ValidationError
 
-from uwlts.model.command_files import hold_until_end, note_input, note_made, refuse_input
-from uwlts.model.errors import CaptureError, OutputError, problems_of
+from uwlts.model.command_files import hold_until_end, note_made, refuse_input
+from uwlts.model.errors import CaptureError, Error, OutputError, problems_of
+from uwlts.model.input_file import MOST_JSON_BYTES, opened, parsed_json, read_text, shortened, with_article
 from uwlts.storage.one_writer import one_writer
 
 _PATIENCE_S = 10.0
@@ -37,6 +38,7 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     missing or not writable, the file exists, is an input of the running command or is being written by another process,
     `path` is a folder or a device, or the disk is full: for any OSError.
     """
+    require_possible_name(Path(path))
     target = Path(os.path.realpath(path))
     _require_suitable(target, overwrite=overwrite)
     with one_writer(target, patience_s=_PATIENCE_S):
@@ -75,6 +77,7 @@ def refuse_unsuitable(target: Path, *, overwrite: bool) -> None:
 
 
 def _require_suitable(target: Path, *, overwrite: bool) -> None:
+    require_possible_name(target)
     if not target.parent.is_dir():
         raise OutputError(f"cannot write {target}: the folder {target.parent} does not exist; create it first")
     if target.exists() and not target.is_file():
@@ -82,6 +85,18 @@ def _require_suitable(target: Path, *, overwrite: bool) -> None:
     refuse_input(target)
     if target.exists() and not overwrite:
         raise OutputError(f"{target} exists already; give another name, or --overwrite to replace it")
+
+
+def require_possible_name(target: Path) -> None:
+    """OutputError where no file can have this name: it is too long, or holds a null character."""
+    try:
+        os.stat(target)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        raise OutputError(_cannot_write(target, error)) from error
+    except ValueError as error:
+        raise OutputError(f"cannot write {str(target)!r}: no file can have this name") from error
 
 
 def _cannot_write(target: Path, error: OSError) -> str:
@@ -92,7 +107,7 @@ def _cannot_write(target: Path, error: OSError) -> str:
         errno.EPERM: f"no permission to write in {target.parent}",
         errno.EROFS: f"{target.parent} is on a read-only file system",
     }
-    return f"cannot write {target}: {advice.get(error.errno or 0, error.strerror or str(error))}"
+    return f"cannot write {shortened(str(target))}: {advice.get(error.errno or 0, error.strerror or str(error))}"
 
 
 def _flush(path: Path, flags: int) -> None:
@@ -105,33 +120,28 @@ def _flush(path: Path, flags: int) -> None:
 
 def sha256_of(path: str | Path) -> str:
     """Hash of a file in hexadecimal; CaptureError where it cannot be read."""
-    note_input(path)
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise CaptureError(f"cannot read {path}: {error.strerror}") from error
+    with opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
 
 
 def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
-    """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be."""
-    note_input(path)
+    """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be.
+
+    Numbers are finite and no key occurs twice (`uwlts.model.input_file`).
+    """
+    text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CaptureError(f"cannot read the {called} {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise CaptureError(f"{path} is not {_a(called)}, or is truncated: {error}") from error
+        content = parsed_json(text)
+    except json.JSONDecodeError as error:
+        raise CaptureError(f"{path} is not {with_article(called)}, or is truncated: {error}") from error
+    except ValueError as error:
+        raise CaptureError(f"{path} is not a valid {called}: {error}") from error
     if not isinstance(content, dict):
-        raise CaptureError(f'{path} is JSON but not {_a(called)}: expected an object with a "format"')
+        raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected an object with a "format"')
     return content
-
-
-def _a(called: str) -> str:
-    return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
 
 
 def read_model(
@@ -139,14 +149,36 @@ def read_model(
 ) -> AnyModel:
     """Content of a JSON file of the program; CaptureError where it is missing, foreign, newer or damaged."""
     content = read_json(path, called=called)
+    return model_in(content, path, model, format=format, version=version, called=called, advice=advice)
+
+
+def model_in(
+    content: dict[str, JsonValue],
+    path: str | Path,
+    model: type[AnyModel],
+    *,
+    format: str,
+    version: int,
+    called: str,
+    advice: str = "",
+) -> AnyModel:
+    """What `read_json` gave of a file as a model; CaptureError as from `read_model`."""
+    content = dict(content)
     if content.pop("format", None) != format:
-        raise CaptureError(f'{path} is JSON but not {_a(called)}: expected "format": "{format}"')
+        raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected "format": "{format}"')
     if (found := content.pop("version", None)) != version:
         raise CaptureError(f"{path} has version {found}; this program reads {version}")
+    return validated_content(model, content, f"{path} is not a valid {called}", advice=advice)
+
+
+def validated_content(model: type[AnyModel], content: object, complaint: str, *, advice: str = "") -> AnyModel:
+    """The content of a file as a model; CaptureError that begins with ``complaint`` where it is not valid."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise CaptureError(f"{path} is not a valid {called}: {problems_of(error)}{advice}") from error
+        raise CaptureError(f"{complaint}: {problems_of(error)}{advice}") from error
+    except (Error, ArithmeticError) as error:
+        raise CaptureError(f"{complaint}: {error}{advice}") from error
 
 
 def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:

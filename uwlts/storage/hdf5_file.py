@@ -7,6 +7,7 @@ for ever.
 
 import io
 import json
+import math
 import os
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,6 +17,7 @@ import h5py
 import numpy as np
 
 from uwlts.model.errors import CaptureError, Error
+from uwlts.model.input_file import MOST_JSON_BYTES, is_regular_file, parsed_json
 from uwlts.model.library import validated
 from uwlts.model.sensor import Description, Table
 
@@ -23,6 +25,15 @@ if TYPE_CHECKING:
     from typing_extensions import Buffer
 
 AnyHeader = TypeVar("AnyHeader", bound=Description)
+
+_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, 32000, 32001, 32015}
+"""Of a dataset's stored pieces: those of the program, LZF and Zstandard, with which files may be packed again."""
+
+_MOST_SHRINKING = 1100
+"""Least size of an array's stored pieces is its size over this: deflate reaches 1032 (zlib.net/zlib_tech.html)."""
+
+_LARGEST_CHUNK = 2**23
+"""Bytes of a piece of an array that is read as a whole. HDF5 makes them of up to 1 MiB, the program less."""
 
 
 def write_label(file: h5py.File, *, format: str, version: int, header: Description) -> None:
@@ -38,17 +49,20 @@ def read_label(file: h5py.File, model: type[AnyHeader], *, path: str | Path, for
     if found != format:
         called = "it has no format" if found is None else f"its format is {found!r}"
         raise CaptureError(f"{path} is HDF5, but not what is expected here: {called}, expected '{format}'")
-    number = file.attrs.get("version")
-    if not isinstance(number, int | np.integer) or number < 1:
-        raise CaptureError(f"{path} is damaged: its version is {number!r}, expected a whole number from 1")
+    number = _number(file, "version")
+    if number is None or number < 1:
+        found = "no number" if number is None else number
+        raise CaptureError(f"{path} is damaged: its version is {found}, expected a whole number from 1")
     if number > version:
         raise CaptureError(f"{path} has version {number}; this program reads up to {version}: update it")
     if (header := _text(file, "header")) is None:
         raise CaptureError(f"{path} is damaged: its header is missing")
     try:
-        return validated(model, json.loads(header), f"the header of {path}")
-    except json.JSONDecodeError as error:
+        content = parsed_json(header)
+    except ValueError as error:
         raise CaptureError(f"{path} is damaged: its header is not JSON: {error}") from error
+    try:
+        return validated(model, content, f"the header of {path}")
     except Error as error:
         raise CaptureError(str(error)) from error
 
@@ -63,9 +77,12 @@ def read_plan(file: h5py.File) -> Table | None:
     if (text := _text(file, "plan")) is None:
         return None
     try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
+        plan = parsed_json(text)
+    except ValueError as error:
         raise CaptureError(f"{file.filename} is damaged: its plan is not JSON: {error}") from error
+    if not isinstance(plan, dict):
+        raise CaptureError(f"{file.filename} is damaged: its plan is no table")
+    return plan
 
 
 def forget_plan(path: str | Path) -> None:
@@ -78,6 +95,8 @@ def forget_plan(path: str | Path) -> None:
 
 def format_of(path: str | Path) -> str | None:
     """Format of an HDF5 file by its label; None where it cannot be opened or has none."""
+    if not is_regular_file(path):
+        return None
     try:
         # Unlocked, as it may be a recording that goes on.
         with h5py.File(path, "r", locking=False) as file:
@@ -88,10 +107,66 @@ def format_of(path: str | Path) -> str | None:
 
 def _text(file: h5py.File, name: str) -> str | None:
     """An attribute's text, None where it is missing or something else."""
-    if name not in file.attrs or file.attrs.get_id(name).dtype.kind != "S":
+    if name not in file.attrs:
+        return None
+    known = file.attrs.get_id(name)
+    if known.dtype.kind != "S" or known.shape != () or known.dtype.itemsize > MOST_JSON_BYTES:
         return None
     value = file.attrs[name]
     return value.decode() if isinstance(value, bytes) else None
+
+
+def _number(file: h5py.File, name: str) -> int | None:
+    """An attribute's whole number, None where it is missing or something else."""
+    if name not in file.attrs:
+        return None
+    known = file.attrs.get_id(name)
+    return int(np.asarray(file.attrs[name])) if known.dtype.kind in "iu" and known.shape == () else None
+
+
+def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Dataset | None:
+    """A dataset of plain numbers that lies in the file itself; None where there is none of this name.
+
+    CaptureError where the name is a link to another place or file, or the values are no numbers or booleans, lie in
+    other files, or are packed in another way than the program does.
+    """
+    if name not in file:
+        return None
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise CaptureError(f"{path} is damaged: '{name}' is a link to another place; expected an array")
+    dataset = file[name]
+    if not isinstance(dataset, h5py.Dataset):
+        return None
+    if dataset.shape is None or dataset.dtype.kind not in "biuf" or dataset.dtype.itemsize > 8:
+        raise CaptureError(f"{path} is damaged: the values of '{name}' are no numbers, but {dataset.dtype}")
+    packing = dataset.id.get_create_plist()
+    if dataset.is_virtual or packing.get_external_count():
+        raise CaptureError(f"{path} refers to other files for '{name}'; expected an array in the file itself")
+    filters = {packing.get_filter(number)[0] for number in range(packing.get_nfilters())}
+    if filters - _FILTERS:
+        raise CaptureError(f"{path} has '{name}' packed by filters of HDF5 that this program does not use")
+    return dataset
+
+
+def read_array(file: h5py.File, name: str, *, path: str | Path) -> np.ndarray | None:
+    """All values of a dataset as from `find_dataset`; CaptureError also where the file cannot hold so many."""
+    dataset = find_dataset(file, name, path=path)
+    if dataset is None:
+        return None
+    stored = dataset.id.get_storage_size()
+    if dataset.nbytes > (stored if dataset.chunks is None else _MOST_SHRINKING * stored):
+        raise CaptureError(
+            f"{path} is damaged: '{name}' has the shape {dataset.shape}, of which {stored:,} bytes are there"
+        )
+    require_small_chunks(dataset, name, path=path)
+    return dataset[...]
+
+
+def require_small_chunks(dataset: h5py.Dataset, name: str, *, path: str | Path) -> None:
+    """CaptureError where a piece of an array, which is unpacked as a whole, is larger than any that is written."""
+    piece = 0 if dataset.chunks is None else math.prod(dataset.chunks) * dataset.dtype.itemsize
+    if piece > max(_LARGEST_CHUNK, 2 * dataset.nbytes):
+        raise CaptureError(f"{path} is damaged: '{name}' is stored in pieces of {piece:,} bytes")
 
 
 _SIGNATURE_AND_VERSION = b"\x89HDF\r\n\x1a\n\x03"

@@ -7,11 +7,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from uwlts.model.command_files import note_input
 from uwlts.model.errors import CaptureError
+from uwlts.model.input_file import require_regular_file
 from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.storage.files import written_aside
-from uwlts.storage.hdf5_file import read_label, write_label
+from uwlts.storage.hdf5_file import read_array, read_label, write_label
 
 FORMAT = "uwlts-truth"
 VERSION = 1
@@ -68,9 +68,7 @@ def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrit
 
 def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     """Read a truth file; CaptureError where it is missing, foreign, newer, damaged, or contradicts itself."""
-    if not Path(path).is_file():
-        raise CaptureError(f"no truth file at {path}")
-    note_input(path)
+    require_regular_file(path, called="truth file")
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
@@ -90,8 +88,8 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
 
 
 def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
-    dataset = file.get(name)
+    values = read_array(file, name, path=path)
     kinds = "iu" if name in ("status", "crossings") else "f"
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kinds or dataset.ndim != _DIMENSIONS[name]:
+    if values is None or values.dtype.kind not in kinds or values.ndim != _DIMENSIONS[name]:
         raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {_DIMENSIONS[name]} dimensions")
-    return dataset[...]
+    return values

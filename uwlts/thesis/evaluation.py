@@ -1,6 +1,5 @@
 """Evaluates one campaign: calibrates by every method, measures every scan, and studies what the results rest on."""
 
-import json
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -8,17 +7,19 @@ from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from uwlts.calibration.sequential import CalibrationOptions, gather
 from uwlts.measurement.reconstruction import reconstruct
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError
+from uwlts.model.errors import CaptureError, problems_of
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.reconstruction import reconstruct_by_polynomials
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture
+from uwlts.storage.files import read_json
 from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, THESIS, TWO, calibrations, measure_scan
 from uwlts.thesis.monte_carlo import propagate
@@ -34,6 +35,15 @@ from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan,
 
 RESULTS = "results.json"
 TRIALS = 100
+
+
+class _Known(BaseModel):
+    """The part of a campaign's plan that says how well its inputs were known."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    imperfections: dict[str, float]
+
+
 _SHOWN_LINES = {"one end": 0.05, "middle": 0.5, "other end": 0.95}
 Progress = Callable[[str, int, int], None]
 
@@ -170,11 +180,10 @@ def _monte_carlo(
     # Imperfections of the inputs, from the plan that lies beside the campaigns; none without one.
     plan = folder.path.parent / "plan.json"
     try:
-        knowledge = dict(json.loads(plan.read_text(encoding="utf-8"))["campaign"]["imperfections"])
-    except FileNotFoundError:
-        knowledge = {}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise CaptureError(f"{plan} does not hold the campaign's imperfections: {error}") from error
+        campaign = read_json(plan, called="plan").get("campaign") if plan.exists() else {"imperfections": {}}
+        knowledge = _Known.model_validate(campaign).imperfections
+    except ValidationError as error:
+        raise CaptureError(f"{plan} does not hold the campaign's imperfections: {problems_of(error)}") from error
     shown = partial(progress, "Monte Carlo")
     return [
         SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
-from uwlts.model.errors import CaptureError, problems_of
-from uwlts.storage.files import json_text, written_aside
+from uwlts.storage.files import json_text, read_json, validated_content, written_aside
 
 Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""
@@ -27,13 +26,9 @@ class _Kept(BaseModel):
     @classmethod
     def read(cls, path: Path) -> Self:
         """The file's content; CaptureError where it cannot be read, is damaged or of another version."""
-        try:
-            return cls.model_validate_json(path.read_bytes())
-        except OSError as error:
-            raise CaptureError(f"cannot read {path}: {error.strerror}") from error
-        except ValidationError as error:
-            reason = f"holds no results that this program reads ({problems_of(error).removeprefix(': ')})"
-            raise CaptureError(f"{path} {reason}; remove it to evaluate the campaign again") from error
+        content = read_json(path, called="file of results")
+        advice = "; remove it to evaluate the campaign again"
+        return validated_content(cls, content, f"{path} holds no results that this program reads", advice=advice)
 
     def keep(self, path: Path) -> Self:
         """Write the file, whole or not at all; ValueError where a number is not finite."""

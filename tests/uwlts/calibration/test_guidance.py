@@ -148,7 +148,7 @@ def test_motion_and_sameness_are_reported_in_pixels(small):
     # f of about 1220 px at 378 mm: 1 mm is 3.2 px.
     shifted = PLATE.detect(drawn_lamp(small, PLATE, target_pose(middle_mm=(1.0, 0.0, 378.0))))
     assert way_px(first, again) < 0.1 and judge_motion(first, again) == ()
-    assert way_px(first, shifted) == pytest.approx(lens_of(small).f / 378, rel=0.03)
+    assert way_px(first, shifted) == pytest.approx(lens_of(small).fx / 378, rel=0.03)
     assert judge_motion(first, shifted)[0].startswith("moved: the target went 3.")
     assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: 0.")
     moved = PLATE.detect(drawn_lamp(small, PLATE, target_pose(tilt_deg=(20, 0))))
@@ -166,7 +166,7 @@ def test_the_stripe_counts_where_it_lies_on_the_target(small):
 
     whole = stripe(drawn_laser(small, pose))
     # The points are 120 mm wide, and a spacing of 12 mm is allowed for beyond them.
-    expected = (120 + 24) * lens_of(small).f / 378
+    expected = (120 + 24) * lens_of(small).fx / 378
     assert whole.reasons == () and whole.lines == pytest.approx(expected, rel=0.05)
     away = stripe(np.roll(drawn_laser(small, pose), 230, axis=0))
     assert away.lines == 0 and away.reasons == ()
@@ -233,7 +233,7 @@ def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_bui
     true, std = lens_of(thesis_as_built), state.solution.std()
     assert std["f"] <= 0.5 and std["cx"] <= 0.4 and state.coverage.share >= 0.85
     # Four standard deviations: wrong by chance in one of 10,000 cases.
-    assert abs(state.camera.fx_px - true.f) < 4 * std["f"]
+    assert abs(state.camera.fx_px - true.fx) < 4 * std["f"]
     assert abs(state.camera.cx_px - true.cx) < 4 * std["cx"] and abs(state.camera.cy_px - true.cy) < 4 * std["cy"]
     assert state.solution.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
     tilts = np.degrees([tilts_rad(pose) for pose in state.poses])

@@ -442,7 +442,7 @@ def test_files_that_are_none(file, tmp_path):
     file.write_text("[1, 2]")
     with pytest.raises(CaptureError, match="not a polynomial calibration"):
         read_polynomials(file)
-    with pytest.raises(CaptureError, match="cannot read"):
+    with pytest.raises(CaptureError, match="no calibration at"):
         load_calibration(tmp_path / "missing.json")
 
 

@@ -100,7 +100,7 @@ def test_foreign_files(tmp_path: Path, content: bytes, words: str):
 
 
 def test_missing_file(tmp_path: Path):
-    refused(tmp_path / "none.json", "No such file")
+    refused(tmp_path / "none.json", "no calibration at")
     refused(tmp_path, "directory")
 
 

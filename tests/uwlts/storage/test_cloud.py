@@ -140,10 +140,9 @@ def _newer(file):
     [
         (_without("line"), "has no line"),
         (_without("random_mm2"), "has no random_mm2"),
-        (_text_for("intensity"), "intensity are no numbers"),
+        (_text_for("intensity"), "'intensity' are no numbers"),
         (_shorter, "frame has the shape"),
         (_newer, "has version 99"),
-        (lambda file: file.create_group("more"), "not a complete HDF5 file of a cloud"),
     ],
 )
 def test_a_damaged_cloud_in_hdf5_is_refused(tmp_path, damage, message):
@@ -279,9 +278,9 @@ def test_what_is_no_cloud_is_refused(tmp_path, content, message):
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     for name in ("none.ply", "none.h5"):
-        with pytest.raises(CaptureError, match="does not exist"):
+        with pytest.raises(CaptureError, match="no cloud at"):
             read_cloud(tmp_path / name)
-    with pytest.raises(CaptureError, match="cannot be read"):
+    with pytest.raises(CaptureError, match="cannot read"):
         read_cloud(tmp_path)
 
 

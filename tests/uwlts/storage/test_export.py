@@ -9,6 +9,7 @@ import laspy
 import numpy as np
 import pye57
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.uwlts.storage.test_capture import a_header, record, small_sensor
 from uwlts import cli
@@ -64,11 +65,11 @@ def test_poses_and_numbers_come_back_to_the_last_bit(tmp_path: Path):
     shape = (sensor.camera.height_px, sensor.camera.width_px)
     with CaptureWriter(tmp_path / "a.h5", a_header(sensor=sensor, target=None), dtype=np.uint8) as writer:
         for index in range(4):
-            stage, exposure, time = rng.normal(size=3).tolist()
+            stage, exposure, time = rng.normal(), rng.uniform(0, 5), index + rng.uniform()
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=index).as_matrix(), rng.normal(size=3)
             image = rng.integers(0, 255, shape, dtype=np.uint8)
-            writer.append(
-                Frame(image, stage, index < 2, exposure, time, rng.normal(size=(4, 4)) if index % 2 else None)
-            )
+            writer.append(Frame(image, stage, index < 2, exposure, time, pose if index % 2 else None))
     with Capture(tmp_path / "a.h5") as capture:
         export_capture(capture, tmp_path / "images")
     import_images(tmp_path / "images", tmp_path / "b.h5")

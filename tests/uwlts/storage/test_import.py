@@ -12,9 +12,10 @@ from uwlts import cli
 from uwlts.model.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
 from uwlts.storage.import_.channels import one_channel
-from uwlts.storage.import_.images import SUFFIXES, grey_values, read_image
+from uwlts.storage.import_.images import grey_values, read_image
 from uwlts.storage.import_.matching import natural_key, read_rows
 from uwlts.stripe import extract_stripe
 
@@ -518,7 +519,7 @@ def test_wrong_tables(tmp_path: Path, table: str, words: str):
 
 
 def test_a_missing_table_and_description(tmp_path: Path):
-    with pytest.raises(DescriptionError, match="cannot read the table"):
+    with pytest.raises(DescriptionError, match="no table at"):
         read_rows(tmp_path / "each.csv")
     folder = three(tmp_path)
     (folder / "import.toml").unlink()

@@ -94,7 +94,7 @@ def test_existing_file_is_only_replaced_on_demand(path: Path):
 
 def test_files_that_are_no_truth(tmp_path: Path, path: Path):
     refused(tmp_path / "none.h5", "no truth file at")
-    refused(tmp_path, "no truth file at")
+    refused(tmp_path, "cannot read the truth file")
     other = tmp_path / "other.h5"
     for content in (b"", b"some text", path.read_bytes()[:4]):
         other.write_bytes(content)
@@ -128,11 +128,11 @@ def changed_at(name: str, place: tuple, value: float):
 
 CONTRADICTIONS = {
     "newer": (lambda file: file.attrs.__setitem__("version", 2), "version 2; .*reads up to 1"),
-    "no version": (lambda file: file.attrs.__delitem__("version"), "version is None"),
+    "no version": (lambda file: file.attrs.__delitem__("version"), "version is no number"),
     "no header": (lambda file: file.attrs.__delitem__("header"), "header is missing"),
     "broken header": (lambda file: file.attrs.__setitem__("header", np.bytes_(b"{}")), "not a valid truth header"),
     "group": (lambda file: (file.__delitem__("status"), file.create_group("status")), "no numbers 'status'"),
-    "text": (replaced("status", np.array([[b"ok"]])), "no numbers 'status'"),
+    "text": (replaced("status", np.array([[b"ok"]])), "'status' are no numbers"),
     "one line": (replaced("centre_px", np.zeros(LINES)), "no numbers 'centre_px'"),
     "real status": (replaced("status", np.zeros((FRAMES, LINES))), "no numbers 'status'"),
     "fewer lines": (replaced("centre_px", np.zeros((FRAMES, LINES - 1))), "contradicts itself"),

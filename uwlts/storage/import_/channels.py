@@ -15,6 +15,8 @@ _COLOURS = {"blue": 0, "green": 1, "red": 2}
 _NAMES = (*_COLOURS, "grey")
 _OPERATORS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
 _FUNCTIONS = {"max": np.maximum, "min": np.minimum}
+_LONGEST = 500
+"""Characters of a formula: four colours and a few numbers take a hundred."""
 _EXPECTED = (
     "expected red, green, blue, grey, max (the brightest), or a formula of them with + - * /, numbers, max(...) and "
     "min(...), such as 'red - max(green, blue)'"
@@ -63,8 +65,7 @@ def one_channel(image: np.ndarray, channel: str | None, *, name: str) -> np.ndar
         return image.max(axis=2)
     values = {colour: image[:, :, place].astype(np.float32) for colour, place in _COLOURS.items()}
     most = np.iinfo(image.dtype).max
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mixed = _evaluated(channel, values | {"grey": grey.astype(np.float32)})
+    mixed = _evaluated(channel, values | {"grey": grey.astype(np.float32)})
     return np.rint(np.clip(np.nan_to_num(mixed), -most, most)).astype(np.int32)
 
 
@@ -85,9 +86,12 @@ def _evaluated(text: str, values: dict[str, np.ndarray]) -> np.ndarray:
                 return reduce(_FUNCTIONS[name], map(value, parts))
         raise ValueError(_EXPECTED)
 
+    if len(text) > _LONGEST:
+        raise ValueError(f"the formula has {len(text):,} characters; expected at most {_LONGEST}")
     try:
-        found = value(ast.parse(text.strip(), mode="eval").body)
-    except (SyntaxError, RecursionError, MemoryError) as error:
+        with np.errstate(all="ignore"):
+            found = value(ast.parse(text.strip(), mode="eval").body)
+    except (SyntaxError, RecursionError, MemoryError, OverflowError, ValueError) as error:
         raise ValueError(_EXPECTED) from error
     if not isinstance(found, np.ndarray):
         raise ValueError(_EXPECTED)

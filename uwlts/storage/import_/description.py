@@ -1,14 +1,13 @@
 """Description of a folder of images: a TOML file with the sensor, the medium, what each image is, and the stage."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from uwlts.model.artefacts import parse_artefact
-from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import MOST_JSON_BYTES, is_regular_file, parsed_json, read_text
 from uwlts.model.library import find, load_sensor, merged, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
@@ -93,7 +92,7 @@ class ImportDescription(Description):
 
 def read_description(path: Path) -> ImportDescription:
     """Description in a TOML file; DescriptionError where it is missing, no TOML, or holds an unknown or wrong key."""
-    if not path.is_file():
+    if not is_regular_file(path):
         raise DescriptionError(
             f"no description at {path}: write one with sensor, medium, and which image is what "
             "(docs/how-to/import-images.md)"
@@ -129,13 +128,12 @@ def capture_header(
 
 def read_header(path: Path) -> CaptureHeader:
     """A capture's header from JSON; DescriptionError where it is missing, no JSON or not valid."""
-    note_input(path)
+    text = read_text(path, most_bytes=MOST_JSON_BYTES, error=DescriptionError, called="header in JSON")
     try:
-        return validated(CaptureHeader, json.loads(path.read_text(encoding="utf-8")), path)
-    except OSError as error:
-        raise DescriptionError(f"cannot read the header {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+        content = parsed_json(text)
+    except ValueError as error:
         raise DescriptionError(f"{path} is no header in JSON, or is truncated: {error}") from error
+    return validated(CaptureHeader, content, path)
 
 
 def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:

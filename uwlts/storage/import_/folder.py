@@ -13,6 +13,7 @@ from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
+from uwlts.storage.image_header import image_size
 from uwlts.storage.import_.channels import is_formula, one_channel
 from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.storage.import_.description import (
@@ -170,6 +171,7 @@ def import_images(
     saturation = header.saturation_dn - zero
     if saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
+    in_time = _in_time(frames)
     content = _Content(header.sensor.camera.stripe_along, saturation, header.target is not None)
     dtype = np.dtype(np.uint16) if zero else reader.dtype
     writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
@@ -188,7 +190,7 @@ def import_images(
                 if laser_on:
                     content.look_for_stripe(image)
                 # An unknown exposure or time is stored as 0; the provenance says so.
-                exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s]).tolist()
+                exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
                 image = image.astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))
@@ -203,10 +205,17 @@ def import_images(
         channel, wavelength = given.lamp_channel or given.channel, header.sensor.laser.wavelength_nm
         target = parse_target(given.target)
         warnings += chromatic_warnings(lamps, target, lamp_channel=channel, wavelength_nm=wavelength)
+    if not in_time:
+        warnings.append("the images are not in the order of their times, which are left out: the table's lines give it")
     if unmatched := matched.unmatched:
         few = ", ".join(unmatched[:3])
         warnings.append(f"{len(unmatched)} images of the folder are left out, as nothing says what they are: {few}")
     return Imported(len(matched.laser), len(matched.lamp), tuple(warnings))
+
+
+def _in_time(frames: list[ImageRow]) -> bool:
+    """Whether the images are in the order in which they were taken; those whose time is not known count as at 0 s."""
+    return bool((np.diff(np.nan_to_num([row.time_s for row in frames])) >= 0).all())
 
 
 def _zero_dn(given: ImportDescription, frames: list[ImageRow], bits: int) -> int:
@@ -232,14 +241,15 @@ class _Reader:
     def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
         """Grey image (H, W), signed where the channel is a formula, and its bits; ImageError if not like the others."""
         given, camera = self._given, self._sensor.camera
-        raw = read_image(self._folder / name)
-        size, wanted = raw.shape[1::-1], (camera.width_px, camera.height_px)
+        wanted = camera.width_px, camera.height_px
+        size = image_size(self._folder / name)
         if size != wanted:
             before = "" if self.dtype == np.void else " and the images before it"
             raise ImageError(
                 f"{name} has {size[0]} x {size[1]} pixels; expected {wanted[0]} x {wanted[1]} as the sensor "
                 f"'{self._sensor.name}' has{before}: {_SIZE_ADVICE[self.dtype == np.void, size == wanted[::-1]]}"
             )
+        raw = read_image(self._folder / name)
         if self.dtype not in (np.void, raw.dtype):
             raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
@@ -265,7 +275,9 @@ def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, 
         background = any(row.background is not None for row in frames)
         name, done = ("background", "subtracted from the laser images, ") if background else ("laser_images", "")
         remarks[name] = f"{done}{zero_dn} added"
+    if not _in_time(frames):
+        remarks["time"] = "not known of all images in their order, stored as 0"
     for name, values in (("exposure", [row.exposure_ms for row in frames]), ("time", [row.time_s for row in frames])):
-        if any(map(math.isnan, values)):
+        if any(map(math.isnan, values)) and name not in remarks:
             remarks[name] = "not known of all images, stored as 0 where it is missing"
     return remarks

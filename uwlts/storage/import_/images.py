@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uwlts.model.command_files import note_input
 from uwlts.model.errors import ImageError
+from uwlts.storage.image_header import png_damage, read_header, read_image_file
 
 _STANDARD_ERROR = 2
 _DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
@@ -45,27 +45,22 @@ def _heard() -> Iterator[list[str]]:
                     os.write(_STANDARD_ERROR, line)
 
 
-SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
-
-_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"BM": "BMP", b"\xff\xd8\xff": "JPEG"}
-_SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")
-
-
 def read_image(path: Path) -> np.ndarray:
     """Image (H, W) or (H, W, 3) in blue, green, red, of uint8 or uint16, as stored: not turned by what EXIF says.
 
     ImageError where the file is missing, foreign, truncated, has an alpha channel, several pages, or other than whole
     numbers of 8 or 16 bit.
     """
-    note_input(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ImageError(f"cannot read {path}: {error.strerror}") from error
-    kind = next((kind for mark, kind in _SIGNATURES.items() if content.startswith(mark)), None)
-    if kind is None:
-        found = "it is empty" if not content else f"it begins with {content[:8]!r}"
-        raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
+    content = read_image_file(path)
+    declared = read_header(content, path)
+    kind = declared.kind
+    if kind == "PNG" and (damage := png_damage(content)):
+        raise ImageError(f"{path} is a PNG file that is truncated or damaged ({damage}); copy it again")
+    if declared.least_bytes() > len(content):
+        raise ImageError(
+            f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes cannot hold "
+            f"{declared.width_px} x {declared.height_px} pixels); copy it again"
+        )
     try:
         with _heard() as said:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -1,5 +1,6 @@
 """Cameras that other programs calibrated: OpenCV's files and ROS CameraInfo."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,8 +8,8 @@ import cv2
 import numpy as np
 import yaml
 
-from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import MOST_DEPTH, read_text, require_plain, shortened
 from uwlts.model.library import merged, validated
 from uwlts.model.sensor import Distortion, Sensor
 
@@ -17,6 +18,14 @@ _MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
 _COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
 _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
 
+
+_MOST_BYTES = 2**20
+_NESTING = re.compile(r"[\[\]{}]")
+_DASHES = re.compile(rf"(?:-[ \t]++){{{MOST_DEPTH}}}")
+_DEEPEST_INDENT = 1000
+_LARGEST = 1e9
+"""Focal lengths in px and coefficients are far below it; their products stay in the range of numbers."""
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _SQUARE = 0.005  # calibrations of square pixels find focal lengths that differ by less
 
@@ -39,19 +48,19 @@ def read_intrinsics(path: Path) -> KnownCamera:
     DescriptionError where the file is missing or damaged, has no camera matrix or distortion, or the camera is another
     than a pinhole with Brown-Conrady or rational distortion.
     """
-    note_input(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DescriptionError(f"cannot read the intrinsics {path}: {getattr(error, 'strerror', error)}") from error
+    text = read_text(
+        path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
+    )
+    if _too_deep(text):
+        raise DescriptionError(f"{path} nests its tables and lists more than {MOST_DEPTH} deep")
     of_opencv = text.lstrip().startswith(("%YAML", "<?xml", "{")) or "!!opencv-matrix" in text
     entries = _opencv(text, path) if of_opencv else _plain_yaml(text, path)
     known = {key.lower().replace("_", ""): value for key, value in entries.items()}
     model = str(known.get("distortionmodel") or "").lower()
     if model not in _BROWN_CONRADY:
         raise DescriptionError(
-            f"{path}: the distortion model is {model!r}; this program's camera is a pinhole with k1, k2, p1, p2, k3 "
-            "(plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one of these"
+            f"{path}: the distortion model is {shortened(repr(model))}; this program's camera is a pinhole with k1, "
+            "k2, p1, p2, k3 (plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one of these"
         )
     matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
     if matrix.size != 9:
@@ -112,13 +121,44 @@ def _value(node: cv2.FileNode) -> object:
 
 def _plain_yaml(text: str, path: Path) -> dict[str, object]:
     try:
+        _refuse_references(text)
         # What `rostopic echo` prints ends with the mark of a next document.
-        entries = next(iter(yaml.safe_load_all(text)), None)
-    except yaml.YAMLError as error:
+        entries = next(iter(yaml.load_all(text, _Loader)), None)
+        require_plain(entries)
+    except RecursionError as error:
+        raise DescriptionError(f"{path} nests its tables and lists too deep") from error
+    except (yaml.YAMLError, ValueError, TypeError) as error:
         raise DescriptionError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(entries, dict):
         raise DescriptionError(f"{path} holds no table of names and values; expected ROS CameraInfo or an OpenCV file")
     return {str(key): value for key, value in entries.items()}
+
+
+def _refuse_references(text: str) -> None:
+    """ValueError where values refer to others, of which a short file makes any number, or are nested too deep."""
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError("it refers to values by name (*name), which this program does not read")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MOST_DEPTH:
+            raise ValueError(f"it is nested more than {MOST_DEPTH} deep")
+
+
+def _too_deep(text: str) -> bool:
+    """Whether brackets, elements of XML, dashes or indentation nest more than `MOST_DEPTH` deep.
+
+    OpenCV's parser calls itself for each and ends the process where the stack does. Brackets within texts count too.
+    """
+    depth = 0
+    for found in _NESTING.finditer(text):
+        depth += 1 if found[0] in "[{" else -1
+        if depth > MOST_DEPTH:
+            return True
+    if text.count("<") - 2 * text.count("</") > 2 * MOST_DEPTH or _DASHES.search(text):
+        return True
+    indents = (len(line) - len(line.lstrip(" ")) for line in text.splitlines())
+    return max(indents, default=0) > _DEEPEST_INDENT
 
 
 def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
@@ -132,14 +172,15 @@ def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np
     if value is None:
         raise DescriptionError(
             f"{path} has none of {', '.join(names)} (in any case, with or without underscores); it has "
-            f"{', '.join(known) or 'nothing'}"
+            f"{shortened(', '.join(known)) or 'nothing'}"
         )
     try:
         numbers = np.asarray(value, dtype=np.float64).ravel()
-    except (TypeError, ValueError) as error:
-        raise DescriptionError(f"{path}: {names[0]} is {value!r}; expected numbers") from error
-    if not np.isfinite(numbers).all():
-        raise DescriptionError(f"{path}: {names[0]} holds {numbers.tolist()}; expected finite numbers")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DescriptionError(f"{path}: {names[0]} is {shortened(repr(value))}; expected numbers") from error
+    if not (np.abs(numbers) < _LARGEST).all():
+        found = shortened(str(numbers.tolist()))
+        raise DescriptionError(f"{path}: {names[0]} holds {found}; expected finite numbers below {_LARGEST:g}")
     return numbers
 
 
@@ -154,7 +195,7 @@ def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
             "program's camera has k1, k2, p1, p2, k3, k4, k5, k6: calibrate with one of the models plumb_bob and "
             "rational_polynomial"
         )
-    return Distortion(**known)
+    return validated(Distortion, known, path)
 
 
 def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
@@ -162,8 +203,8 @@ def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
     if None in size:
         return None
     try:
-        width_px, height_px = np.array(size, dtype=np.float64).astype(int).tolist()
-    except (TypeError, ValueError) as error:
-        found = " x ".join(map(repr, size))
+        width_px, height_px = (int(float(str(each))) for each in size)
+    except (TypeError, ValueError, OverflowError) as error:
+        found = shortened(" x ".join(map(repr, size)))
         raise DescriptionError(f"{path}: the image size is {found}; expected whole numbers") from error
     return width_px, height_px

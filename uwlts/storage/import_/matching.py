@@ -3,6 +3,7 @@
 import csv
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -10,16 +11,22 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from uwlts.model.calibration import is_rigid
 from uwlts.model.command_files import note_input
 from uwlts.model.errors import DescriptionError, ImageError
+from uwlts.model.input_file import is_regular_file, read_text
+from uwlts.storage.capture import POSE_ROUNDED
+from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_.description import ImportDescription, Patterns
-from uwlts.storage.import_.images import SUFFIXES
 
 POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in range(4))
 """Elements of ``T_scene_object``, row by row."""
 
 _NUMBERS = ("stage_mm", "exposure_ms", "time_s")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
+_MOST_TABLE_BYTES = 8 * 2**20
+_LONGEST_LINE = 10_000
+"""Characters of a line; 22 columns have a few hundred."""
 _LIGHTS = ("laser", "lamp", "both", "ignore")
 
 
@@ -48,7 +55,7 @@ class Matched:
 
 def natural_key(name: str) -> list[str | int]:
     """Key by which image9 comes before image10."""
-    return [int(part) if part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
+    return [int(part) if part.isascii() and part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
 
 
 def read_rows(path: Path) -> list[ImageRow]:
@@ -58,11 +65,10 @@ def read_rows(path: Path) -> list[ImageRow]:
     DescriptionError where the table is missing, empty, has an unknown column, a file twice, an unknown light, or a cell
     that is no number.
     """
-    note_input(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DescriptionError(f"cannot read the table {path}: {getattr(error, 'strerror', error)}") from error
+    text = read_text(path, most_bytes=_MOST_TABLE_BYTES, error=DescriptionError, called="table")
+    lines = text.splitlines()
+    if max(map(len, lines), default=0) > _LONGEST_LINE:
+        raise DescriptionError(f"{path} has a line of more than {_LONGEST_LINE:,} characters; expected a CSV table")
     if len(lines) < 2:
         raise DescriptionError(f"{path} is empty: expected a line of column names and one for each image")
     reader = csv.DictReader(lines, delimiter=";" if ";" in lines[0] else ",", skipinitialspace=True)
@@ -72,9 +78,11 @@ def read_rows(path: Path) -> list[ImageRow]:
             f"{path} has the columns {', '.join(columns)}; expected file and any of "
             f"{', '.join(_COLUMNS[1:6])}, pose_00 to pose_33, each once"
         )
-    rows = [_row(number, cells, f"{path}, line {reader.line_num}") for number, cells in enumerate(reader)]
-    names = [row.file for row in rows]
-    twice = sorted({name for name in names if names.count(name) > 1})
+    try:
+        rows = [_row(number, cells, f"{path}, line {reader.line_num}") for number, cells in enumerate(reader)]
+    except csv.Error as error:
+        raise DescriptionError(f"{path} is no CSV table: {error}") from error
+    twice = sorted(name for name, count in Counter(row.file for row in rows).items() if count > 1)
     _refuse_any(twice, f"{path} names ", " more than once: one line for each image")
     return rows
 
@@ -96,6 +104,13 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
     given = np.count_nonzero(np.isfinite(pose))
     if given not in (0, 16):
         raise DescriptionError(f"{place}: only {given} of the 16 elements of the pose are given")
+    if numbers["exposure_ms"] < 0:
+        raise DescriptionError(f"{place}: exposure_ms is {numbers['exposure_ms']:g}; expected a time of 0 or more")
+    if given and not is_rigid(pose, within=POSE_ROUNDED):
+        raise DescriptionError(
+            f"{place}: the pose is no rotation with a shift: its columns must be unit vectors at right angles, given "
+            f"with four decimals or more, its last row 0 0 0 1"
+        )
     return ImageRow(texts["file"], number, light, texts["background"] or None, **numbers, pose=pose if given else None)
 
 
@@ -135,7 +150,7 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
     """
     files = image_files(folder)
     known = [ImageRow(name) for name in files] if rows is None else rows
-    missing = [row.file for row in known if not (folder / row.file).is_file()]
+    missing = [row.file for row in known if not is_regular_file(folder / row.file)]
     _refuse_any(missing, "the table names ", f", which {folder} does not hold")
     if any(row.light is not None for row in known):
         if given.laser or given.lamp:
@@ -187,7 +202,7 @@ def _with_backgrounds(
     if named and (given.background or len(named) < len(laser)):
         advice = ", and there is a pattern as well: give one" if given.background else ": name it for all or none"
         raise DescriptionError(f"the table names a background for {len(named)} of {len(laser)} laser images{advice}")
-    missing = [name for name in named if not (folder / name).is_file()]
+    missing = [name for name in named if not is_regular_file(folder / name)]
     _refuse_any(missing[:1], "the table names the background ", f", which {folder} does not hold")
     if named or not given.background:
         return laser

@@ -1,0 +1,255 @@
+"""Everything that reads files from outside, each with a small valid file made by the program itself."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
+from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
+from tests.uwlts.storage.test_truth import a_header as truth_header
+from tests.uwlts.storage.test_truth import a_truth
+from twin.design.description import load_study
+from twin.scene.campaign import load_campaign
+from twin.scene.description import Mesh, load_scene
+from twin.scene.objects import _surface_from_file
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.hardware.scan_plan import load_plan
+from uwlts.measurement.evaluation import read_evaluation
+from uwlts.model.artefacts import read_artefact
+from uwlts.model.library import library_folder, load_sensor
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.report.certificate import certificate_of, check_certificate
+from uwlts.report.inventory import describe
+from uwlts.storage.calibration_file import load_calibration, read_calibration, write_calibration
+from uwlts.storage.capture import Capture
+from uwlts.storage.cloud import read_cloud, write_cloud
+from uwlts.storage.export_ import export_cloud
+from uwlts.storage.import_ import read_image, read_intrinsics, with_intrinsics
+from uwlts.storage.import_.description import capture_header, described_sensor, read_description, read_header
+from uwlts.storage.import_.matching import read_rows
+from uwlts.storage.truth import read_truth, write_truth
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader, the ending of its files, how a valid one is made, and the form by which it is changed."""
+
+    name: str
+    suffix: str
+    form: str
+    make: Callable[[Path], object]
+    read: Callable[[Path], object]
+
+
+def seed_of(reader: Reader, folder: Path) -> bytes:
+    """Content of the reader's valid file."""
+    path = folder / f"seed{reader.suffix}"
+    if not path.exists():
+        reader.make(path)
+    return path.read_bytes()
+
+
+@cache
+def _joint_text() -> str:
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(built_sensor(), medium=0, positions=np.arange(4) * 50.0 - 100.0, noise=noise, columns=15)
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    solved = solve_jointly(gathered(load_sensor("thesis"), [series]), options=options)
+    return json.dumps({"format": "uwlts-calibration", "version": 1} | solved.calibration.model_dump(mode="json"))
+
+
+def _joint(path: Path) -> None:
+    path.write_text(_joint_text())
+
+
+def _nominal(path: Path) -> None:
+    write_calibration(path, nominal_calibration(load_sensor("thesis")))
+
+
+def _certified(path: Path) -> Path:
+    """The joint calibration that belongs to a certificate, beside it."""
+    beside = path.with_name("certified.json")
+    if not beside.exists():
+        _joint(beside)
+    return beside
+
+
+def _certificate(path: Path) -> None:
+    calibration = _certified(path)
+    content = certificate_of(read_calibration(calibration), calibration, issued="2026-01-02T03:04:05+00:00")
+    path.write_text(json.dumps(content.in_file()))
+
+
+def _polynomials(path: Path) -> None:
+    count, degree = 4, 2
+    medium = load_sensor("thesis").media["water"].model_dump(mode="json")
+    content = {"format": "uwlts-polynomials", "version": 1, "sensor_name": "a", "stripe_along": "width"}
+    content |= {"wavelength_nm": 635.0, "medium_name": "water", "medium": medium, "window_mounted": True}
+    content |= {"width_px": 64, "height_px": 48, "degree": degree, "first_line": 3}
+    content |= {"position_range_px": [1.0, 40.0], "depth_range_mm": [200.0, 300.0]}
+    content |= {"domains_px": [[2.0, 30.0]] * count, "residuals": {"depth": {"rms_mm": 0.1}}}
+    content |= {name: [[1.5] * (degree + 1)] * count for name in ("depth_coefficients", "along_coefficients")}
+    path.write_text(json.dumps(content))
+
+
+def _evaluation(path: Path) -> None:
+    artefact = {"kind": "pipe", "diameter_mm": 300.0}
+    content = {"format": "uwlts-evaluation", "version": 1, "cloud": "a.ply", "artefact": artefact, "medium_index": 1.33}
+    path.write_text(
+        json.dumps(content | {"uncertainty": {"D": dict.fromkeys(("random_mm", "systematic_mm", "expanded_mm"), 0.1)}})
+    )
+
+
+def _cloud(path: Path) -> None:
+    write_cloud(path, some_cloud(uncertainty=some_uncertainty()))
+
+
+def _plain_cloud(path: Path) -> None:
+    write_cloud(path, some_cloud(6))
+
+
+def _text_cloud(path: Path) -> None:
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{names}end_header\n1 2 3\n4 5 6\n7 8 9\n")
+
+
+def _sensor_with(path: Path) -> None:
+    """Read a camera and put it into a sensor."""
+    with_intrinsics(small_sensor(640, 480), read_intrinsics(path), source=path.name)
+
+
+def _exported(path: Path) -> None:
+    """Read a cloud and write it in the formats of others."""
+    cloud = read_cloud(path)
+    for suffix in (".xyz", ".laz", ".e57"):
+        export_cloud(cloud, path.with_name(f"exported{suffix}"), overwrite=True)
+
+
+def _all_of_capture(path: Path) -> None:
+    with Capture(path) as capture:
+        for _ in capture:
+            pass
+
+
+def _capture(path: Path) -> None:
+    record(path, 3)
+
+
+def _unfinished(path: Path) -> None:
+    interrupted(path.with_name("left.h5"), 3)
+    path.with_name("left.h5.part").rename(path)
+
+
+def _import_description(path: Path) -> None:
+    text = 'sensor = "thesis"\nmedium = "water"\nlaser = "*laser*"\nlamp = ["*lamp*", "b*"]\nchannel = "red"\n'
+    text += "bits = 10\n[stage]\nstart_mm = 0.5\nstep_mm = 0.1\ndirection = [1, 0, 0]\n"
+    path.write_text(text + '[target]\nkind = "chessboard"\ncolumns = 9\nrows = 6\nsquare_mm = 15\n')
+
+
+def _read_import(path: Path) -> None:
+    given = read_description(path)
+    sensor = described_sensor(given, beside=path.parent)
+    capture_header(given, sensor, beside=path.parent, name="a", saturation_dn=255, remarks={})
+
+
+def _header(path: Path) -> None:
+    path.write_text(a_header().model_dump_json())
+
+
+def _plan(path: Path) -> None:
+    text = 'title = "A scan"\nsensor = "thesis"\nmedium = "water"\nlights = ["lamp", "laser"]\nlaser_ms = 5.0\n'
+    path.write_text(text + "[stage]\nstart_mm = 1.0\nstep_mm = 0.5\ncount = 5\ndirection = [0.6, 0.0, 0.8]\n")
+
+
+def _shipped(name: str) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes((library_folder() / name).read_bytes())
+
+
+def _artefact(path: Path) -> None:
+    path.write_text('kind = "pipe"\ndiameter_mm = 300.0\ndiameter_uncertainty_mm = 0.01\n')
+
+
+def _table(path: Path) -> None:
+    path.write_text("file,light,stage_mm,exposure_ms,time_s\na1.png,laser,1.0,2.5,0\na2.png,lamp,1.5,2.5,1\n")
+
+
+_CAMERA = """image_width: 640
+image_height: 480
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [800.0, 0.0, 320.0, 0.0, 801.0, 240.0, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.1, 0.02, 0.001, -0.002, 0.0]
+"""
+
+
+def _ros(path: Path) -> None:
+    path.write_text(_CAMERA)
+
+
+def _opencv(path: Path) -> None:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array([[800.0, 0, 320], [0, 801, 240], [0, 0, 1]]))
+    storage.write("distortion_coefficients", np.array([[-0.1, 0.02, 0.001, -0.002, 0.0]]))
+    storage.release()
+
+
+def _picture(path: Path) -> None:
+    image = np.random.default_rng(1).integers(0, 255, (12, 16, 3), dtype=np.uint8)
+    path.write_bytes(cv2.imencode(path.suffix, image)[1].tobytes())
+
+
+def _mesh(path: Path) -> None:
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in ((1, 2, 3), (1, 2, 4), (1, 3, 4), (2, 3, 4)))
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n{faces}")
+
+
+def _read_mesh(path: Path) -> None:
+    _surface_from_file(Mesh(kind="mesh", path=str(path)))
+
+
+READERS = {
+    each.name: each
+    for each in (
+        Reader("calibration", ".json", "json", _nominal, load_calibration),
+        Reader("joint", ".json", "json", _joint, read_calibration),
+        Reader("polynomials", ".json", "json", _polynomials, load_calibration),
+        Reader("certificate", ".json", "json", _certificate, lambda path: check_certificate(path, _certified(path))),
+        Reader("evaluation", ".json", "json", _evaluation, read_evaluation),
+        Reader("header", ".json", "json", _header, read_header),
+        Reader("described", ".json", "json", _nominal, describe),
+        Reader("capture", ".h5", "hdf5", _capture, _all_of_capture),
+        Reader("unfinished", ".h5.part", "hdf5", _unfinished, _all_of_capture),
+        Reader("cloud-hdf5", ".h5", "hdf5", _cloud, read_cloud),
+        Reader("truth", ".truth.h5", "hdf5", lambda path: write_truth(path, truth_header(), a_truth()), read_truth),
+        Reader("cloud-ply", ".ply", "lines", _cloud, read_cloud),
+        Reader("cloud-text", ".ply", "lines", _text_cloud, read_cloud),
+        Reader("export", ".ply", "lines", _plain_cloud, _exported),
+        Reader("sensor", ".toml", "toml", _shipped("sensors/thesis.toml"), load_sensor),
+        Reader("sensor-shown", ".toml", "toml", _shipped("sensors/thesis.toml"), describe),
+        Reader("scene", ".toml", "toml", _shipped("spheres.toml"), load_scene),
+        Reader("campaign", ".toml", "toml", _shipped("campaigns/demo.toml"), load_campaign),
+        Reader("study", ".toml", "toml", _shipped("studies/baseline-angle.toml"), load_study),
+        Reader("plan", ".toml", "toml", _plan, lambda path: load_plan(path).header("a")),
+        Reader("artefact", ".toml", "toml", _artefact, read_artefact),
+        Reader("import", ".toml", "toml", _import_description, _read_import),
+        Reader("table", ".csv", "lines", _table, read_rows),
+        Reader("intrinsics-ros", ".yaml", "lines", _ros, _sensor_with),
+        Reader("intrinsics-opencv", ".yml", "lines", _opencv, _sensor_with),
+        Reader("intrinsics-xml", ".xml", "lines", _opencv, _sensor_with),
+        *(Reader(f"image-{kind}", f".{kind}", "image", _picture, read_image) for kind in ("png", "tif", "bmp", "jpg")),
+        Reader("mesh", ".obj", "lines", _mesh, _read_mesh),
+    )
+}

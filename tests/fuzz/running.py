@@ -1,0 +1,167 @@
+"""Readers run on changed files in a process of their own, whose time, memory and exceptions are watched.
+
+A case is a reader's name and a number: the same number makes the same file. Accepted is a file that is read, or refused
+by one of the project's errors, within `MOST_S` and `MOST_MIB`.
+"""
+
+import json
+import os
+import resource
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from random import Random
+
+MOST_S, MOST_MIB = 5.0, 200.0
+_SPACE = 2**30
+"""Bytes of addresses beyond those that the libraries take: far more than may be used, and less than the machine has."""
+_READY = b"ready\n"
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One case: its reader, its number or path, what went wrong or "", the error that refused it, and what it took."""
+
+    reader: str
+    case: str
+    fault: str
+    refusal: str
+    seconds: float
+    mib: float
+
+
+def watched(folder: Path, work: Iterable[tuple[str, str]], *, seed: int = 0) -> list[Outcome]:
+    """Outcomes of cases: pairs of a reader's name and a case's number, or the path of a file.
+
+    A file on which a reader crashes or hangs ends the process; the next one goes on behind it. ``folder`` keeps the
+    last file of each.
+    """
+    waiting, outcomes = list(work), []
+    while waiting:
+        done = 0
+        for outcome in _by_child(folder, waiting, seed):
+            outcomes.append(outcome)
+            if outcome.fault:
+                print(f"{outcome.reader} {outcome.case}: {outcome.fault[-700:]}", file=sys.stderr, flush=True)
+            done += 1
+        waiting = waiting[done:]
+    return outcomes
+
+
+def _by_child(folder: Path, waiting: list[tuple[str, str]], seed: int) -> Iterator[Outcome]:
+    """Outcomes up to the end or to the first case that ends the process."""
+    command = [sys.executable, "-m", "tests.fuzz.running", str(folder), str(seed)]
+    known = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "BLOSC_NTHREADS"), "1")
+    environment = os.environ | known | {"PYTHONPATH": str(ROOT)}
+    with (
+        tempfile.TemporaryFile("w+") as list_, tempfile.TemporaryFile() as said,
+        subprocess.Popen(command, stdin=list_, stdout=subprocess.PIPE, stderr=said, env=environment, cwd=ROOT) as child,
+    ):  # fmt: skip
+        json.dump(waiting, list_)
+        list_.seek(0)
+        # The file's place is shared with the child, which reads it once it has been written.
+        assert child.stdout is not None
+        if child.stdout.readline() != _READY:
+            said.seek(0)
+            raise RuntimeError(f"the readers' valid files cannot be read: {said.read().decode()}")
+        for reader, case in waiting:
+            ready = select.select([child.stdout], [], [], 4 * MOST_S)[0]
+            line = child.stdout.readline() if ready else b""
+            if not line:
+                hung = child.poll() is None and not ready
+                child.kill()
+                child.wait()
+                _keep(folder, reader, case)
+                said.seek(0)
+                words = "no end" if hung else f"the process ended with {child.returncode}: {said.read()[-600:]!r}"
+                yield Outcome(reader, case, words, "", 4 * MOST_S, 0.0)
+                return
+            yield Outcome(**json.loads(line))
+
+
+def kept_file(folder: Path, reader: str, case: str) -> Path:
+    """Where the file of a case stays that went wrong."""
+    return folder / f"{reader}--{case}"
+
+
+def _keep(folder: Path, reader: str, case: str) -> None:
+    """Put the file of a numbered case aside."""
+    found = next((folder / reader).glob("case.*"), None)
+    if case.isdecimal() and found is not None:
+        shutil.copyfile(found, kept_file(folder, reader, case))
+
+
+def _peak_mib() -> tuple[float, float]:
+    """Memory in use now and at its peak since the peak was last forgotten, MiB."""
+    known = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return tuple(int(known[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))  # type: ignore
+
+
+def _too_slow(*_: object) -> None:
+    raise TimeoutError(f"it took more than {MOST_S} s")
+
+
+def _child(folder: Path, seed: int) -> None:
+    from tests.fuzz.mutation import changed
+    from tests.fuzz.readers import READERS, seed_of
+    from uwlts.model.errors import Error
+
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    work = json.load(sys.stdin)
+    seeds = {}
+    for name in dict.fromkeys(name for name, _ in work):
+        place = folder / name
+        place.mkdir(exist_ok=True)
+        if any(case.isdecimal() for each, case in work if each == name):
+            seeds[name] = seed_of(READERS[name], place)
+            READERS[name].read(place / f"seed{READERS[name].suffix}")
+    answers.write(_READY.decode())
+    answers.flush()
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (used + _SPACE, used + _SPACE))
+    signal.signal(signal.SIGALRM, _too_slow)
+    for name, case in work:
+        reader, path = READERS[name], Path(case)
+        if case.isdecimal():
+            path = folder / name / f"case{reader.suffix}"
+            content = changed(seeds[name], reader.form, Random(f"{name} {case} {seed}"), folder / name)
+            path.unlink(missing_ok=True)
+            path.write_bytes(content)
+        Path("/proc/self/clear_refs").write_text("5")
+        before, began = _peak_mib()[0], time.perf_counter()
+        fault = refusal = ""
+        signal.setitimer(signal.ITIMER_REAL, MOST_S)
+        try:
+            reader.read(path)
+        except Error as error:
+            refusal = f"{type(error).__name__}: {error}"
+            if len(refusal) > 6000:
+                fault = f"the message has {len(refusal)} characters"
+        except BaseException:
+            fault = traceback.format_exc()[-1500:]
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        seconds, mib = time.perf_counter() - began, _peak_mib()[1] - before
+        if not fault and mib > MOST_MIB:
+            fault = f"it took {mib:.0f} MiB"
+        if not fault and seconds > MOST_S:
+            fault = f"it took {seconds:.1f} s"
+        if fault:
+            _keep(folder, name, case)
+        outcome = Outcome(name, case, fault, refusal[:300], round(seconds, 4), round(mib, 1))
+        answers.write(json.dumps(asdict(outcome)) + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    _child(Path(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,88 @@
+"""Input that cannot hurt: readers refuse what is wrong by the project's errors, in limited time and memory."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.fuzz.past_failures import PAST
+from tests.fuzz.readers import READERS
+from tests.fuzz.running import MOST_MIB, MOST_S, watched
+from uwlts.model.errors import CaptureError, OutputError
+from uwlts.model.input_file import parsed_json, parsed_toml, read_bytes
+from uwlts.storage.calibration_file import load_calibration
+from uwlts.storage.files import written_aside
+
+CORPUS = Path(__file__).with_name("corpus")
+CASES = 2000
+
+
+def test_past_failures_are_refused(tmp_path: Path):
+    files = {}
+    for number, (words, (reader, build)) in enumerate(PAST.items()):
+        (tmp_path / reader).mkdir(exist_ok=True)
+        path = tmp_path / reader / f"past-{number}{READERS[reader].suffix}"
+        build(path)
+        files[words] = reader, str(path)
+    outcomes = dict(zip(files, watched(tmp_path, files.values()), strict=True))
+    assert {words: each.fault for words, each in outcomes.items() if each.fault} == {}
+    # A certificate that is not as issued is not refused, but told to be so.
+    assert [words for words, each in outcomes.items() if not each.refusal] == []
+    assert max(each.seconds for each in outcomes.values()) < MOST_S
+    assert max(each.mib for each in outcomes.values()) < MOST_MIB
+    assert "is an HDF5 file, such as a capture" in outcomes["capture as a calibration"].refusal
+
+
+def test_corpus(tmp_path: Path):
+    files = sorted(path for path in CORPUS.iterdir() if "--" in path.name)
+    outcomes = watched(tmp_path, [(path.name.split("--")[0], str(path)) for path in files])
+    assert [each for each in outcomes if each.fault] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", READERS)
+def test_changed_files_are_read_or_refused(tmp_path: Path, reader: str):
+    outcomes = watched(tmp_path, [(reader, str(number)) for number in range(CASES)])
+    assert [each for each in outcomes if each.fault] == []
+    # The changes reach something: not all files are still read.
+    assert len(outcomes) == CASES and sum(bool(each.refusal) for each in outcomes) > 0.1 * CASES
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text(max_size=200) | st.text(alphabet='[]{}",:.=\n0a \\-eE+x', max_size=200))
+def test_any_text_is_parsed_or_refused(text: str):
+    for parse in (parsed_json, parsed_toml):
+        try:
+            parse(text)
+        except ValueError:
+            continue
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False, allow_infinity=False),
+    lambda inside: st.lists(inside) | st.dictionaries(st.text(), inside),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(PLAIN)
+def test_plain_json_comes_back(content):
+    assert parsed_json(json.dumps(content)) == content
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "x" * 300 + ".json"])
+def test_names_that_no_file_can_have(tmp_path: Path, name: str):
+    for attempt in (lambda: read_bytes(tmp_path / name, most_bytes=10), lambda: load_calibration(tmp_path / name)):
+        with pytest.raises(CaptureError):
+            attempt()
+    with pytest.raises(OutputError), written_aside(tmp_path / name):
+        pytest.fail("the body must not run")
+
+
+def test_files_that_are_too_large_are_not_read(tmp_path: Path):
+    (tmp_path / "a").write_bytes(bytes(11))
+    with pytest.raises(CaptureError, match="this program reads up to"):
+        read_bytes(tmp_path / "a", most_bytes=10)

@@ -1,0 +1,150 @@
+"""Headers of image files: what is declared there is checked before a decoder makes room for it."""
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from uwlts.model.errors import ImageError
+from uwlts.model.input_file import read_bytes
+
+SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
+
+MOST_PIXELS = 150_000_000
+"""Of an image: the largest single image sensors have that many pixels."""
+_MOST_BYTES = 2**27
+"""Of an image file: 60 million pixels of 16 bit that are not packed."""
+_MOST_SHRINKING = {"PNG": 1100}
+"""How much smaller a packed file is at most: deflate reaches 1032 (zlib.net/zlib_tech.html), others have no limit."""
+_MOST_TAGS = 4096
+
+_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "PNG", b"BM": "BMP", b"\xff\xd8\xff": "JPEG"}
+_SIGNATURES |= dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "TIFF")
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What an image file says of itself before its pixels are decoded."""
+
+    kind: Literal["PNG", "BMP", "JPEG", "TIFF"]
+    width_px: int
+    height_px: int
+    bits_per_pixel: int
+    packed: bool
+
+    def least_bytes(self) -> float:
+        """Bytes that a file of such an image has at least."""
+        row = -(-self.width_px * self.bits_per_pixel // 8)
+        return row * self.height_px / (_MOST_SHRINKING.get(self.kind, math.inf) if self.packed else 1)
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height in px that a file declares, without decoding it; ImageError as from `read_header`."""
+    declared = read_header(read_image_file(path), path)
+    return declared.width_px, declared.height_px
+
+
+def read_image_file(path: str | Path) -> bytes:
+    """Content of an image file; ImageError where it is missing, no regular file, or too large."""
+    return read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="image")
+
+
+def _kind_of(content: bytes, path: str | Path) -> str:
+    kind = next((kind for mark, kind in _SIGNATURES.items() if content.startswith(mark)), None)
+    if kind is None:
+        found = "it is empty" if not content else f"it begins with {content[:8]!r}"
+        raise ImageError(f"{path} is no PNG, TIFF, BMP or JPEG image: {found}; leave it out or convert it")
+    return kind
+
+
+def read_header(content: bytes, path: str | Path) -> ImageHeader:
+    """The header of an image; ImageError where it is foreign or damaged, or has more pixels than any camera."""
+    kind = _kind_of(content, path)
+    readers = {"PNG": _png_header, "BMP": _bmp_header, "JPEG": _jpeg_header, "TIFF": _tiff_header}
+    try:
+        found = readers[kind](content)
+    except (struct.error, IndexError, KeyError, ValueError) as error:
+        raise ImageError(
+            f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes, its header cannot be read); "
+            "copy it again"
+        ) from error
+    if found.width_px * found.height_px > MOST_PIXELS:
+        raise ImageError(
+            f"{path} says that it has {found.width_px} x {found.height_px} pixels; this program reads images of up to "
+            f"{MOST_PIXELS / 1e6:g} million"
+        )
+    return found
+
+
+def _png_header(content: bytes) -> ImageHeader:
+    """Portable Network Graphics (PNG) Specification, 11.2.1."""
+    width, height, bits, colours = struct.unpack_from(">IIBB", content, 16)
+    return ImageHeader("PNG", width, height, bits * {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[colours], packed=True)
+
+
+def png_damage(content: bytes) -> str | None:
+    """What is wrong with a PNG's pieces, each of which has a length and a checksum; None where they are whole."""
+    view, place = memoryview(content), 8
+    while place + 12 <= len(content):
+        (length,) = struct.unpack_from(">I", content, place)
+        end = place + 12 + length
+        if end > len(content):
+            break
+        if zlib.crc32(view[place + 4 : end - 4]) != struct.unpack_from(">I", content, end - 4)[0]:
+            return f"a checksum does not fit near byte {place}"
+        if content[place + 4 : place + 8] == b"IEND":
+            return None
+        place = end
+    return f"{len(content)} bytes, its end is missing"
+
+
+def _bmp_header(content: bytes) -> ImageHeader:
+    """BITMAPINFOHEADER and its successors; of BITMAPCOREHEADER by its length of 12 bytes."""
+    if struct.unpack_from("<I", content, 14)[0] == 12:
+        width, height, _, bits = struct.unpack_from("<HHHH", content, 18)
+        return ImageHeader("BMP", width, height, bits, packed=False)
+    width, height, _, bits, packing = struct.unpack_from("<iiHHI", content, 18)
+    # 1 and 2 are run lengths; heights below zero count from the top.
+    return ImageHeader("BMP", abs(width), abs(height), bits, packed=packing in (1, 2))
+
+
+def _jpeg_header(content: bytes) -> ImageHeader:
+    """The frame header, ITU-T T.81, B.2.2, behind markers with their lengths."""
+    place = 2
+    while True:
+        marker = content[place + 1]
+        if content[place] != 0xFF:
+            raise ValueError("expected a marker")
+        if marker == 0xFF:
+            place += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            bits, height, width, components = struct.unpack_from(">BHHB", content, place + 4)
+            return ImageHeader("JPEG", width, height, bits * components, packed=True)
+        else:
+            place += 2 + struct.unpack_from(">H", content, place + 2)[0]
+
+
+_WIDTH, _HEIGHT, _BITS, _PACKING, _SAMPLES = 256, 257, 258, 259, 277
+
+
+def _tiff_header(content: bytes) -> ImageHeader:
+    """The first directory, TIFF 6.0, section 2, or of BigTIFF: entries of tag, type, count and value."""
+    order = "<" if content.startswith(b"II") else ">"
+    big = struct.unpack_from(order + "H", content, 2)[0] == 43
+    (place,) = struct.unpack_from(order + ("Q" if big else "I"), content, 8 if big else 4)
+    (count,) = struct.unpack_from(order + ("Q" if big else "H"), content, place)
+    place, step, at = place + (8 if big else 2), 20 if big else 12, 12 if big else 8
+    known = {_BITS: 1, _PACKING: 1, _SAMPLES: 1}
+    for entry in range(place, place + step * min(count, _MOST_TAGS), step):
+        tag, kind = struct.unpack_from(order + "HH", content, entry)
+        if tag in (_WIDTH, _HEIGHT, _BITS, _PACKING, _SAMPLES):
+            # Several values, such as the bits of each colour, stand elsewhere; the same holds for all of them.
+            (several,) = struct.unpack_from(order + ("Q" if big else "I"), content, entry + 4)
+            where, letter = entry + at, {1: "B", 3: "H", 4: "I", 16: "Q"}[kind]
+            if several * struct.calcsize(order + letter) > (8 if big else 4):
+                (where,) = struct.unpack_from(order + ("Q" if big else "I"), content, where)
+            (known[tag],) = struct.unpack_from(order + letter, content, where)
+    bits = known[_BITS] * known[_SAMPLES]
+    return ImageHeader("TIFF", known[_WIDTH], known[_HEIGHT], bits, packed=known[_PACKING] != 1)
