@@ -612,9 +612,12 @@ def test_theses_that_cannot_be(fails, tmp_path: Path):
     fails("uwlts", "thesis", tmp_path / "runs", says="campaign-0 has no ")
     (place / "results.json").write_text("{", encoding="utf-8")
     fails("uwlts", "thesis", tmp_path / "runs", says="results.json")
-    for text in ("[]", '{"format": "uwlts-thesis-results", "version": 0}'):
+    for text, words in (
+        ("[]", "expected an object with"),
+        ('{"format": "uwlts-thesis-results", "version": 0}', "no results"),
+    ):
         (place / "results.json").write_text(text, encoding="utf-8")
-        fails("uwlts", "thesis", tmp_path / "runs", says="holds no results that this program reads")
+        fails("uwlts", "thesis", tmp_path / "runs", says=words)
     fails("uwlts", "thesis", tmp_path / "runs", "--again", says="campaign-0 has no ")
     fails("uwlts", "thesis", tmp_path / "runs", "--trials", "5", says="trials is 5: take 20 or more, or 0")
     fails("uwlts", "thesis", tmp_path / "runs", "--trials", "-1", says="trials is -1")

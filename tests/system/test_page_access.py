@@ -108,8 +108,8 @@ def send(connection: ClientConnection, message: _messages.Message) -> None:
     connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
 
 
-def within_a_second(condition: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + 1.0
+def within(seconds: float, condition: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
             return False
@@ -117,9 +117,20 @@ def within_a_second(condition: Callable[[], bool]) -> bool:
     return True
 
 
+def soon(condition: Callable[[], bool]) -> bool:
+    """Whether a condition comes true on a machine however busy."""
+    return within(20.0, condition)
+
+
+def ever(condition: Callable[[], bool]) -> bool:
+    """Whether a condition comes true that must not: what is obeyed is obeyed within some ms."""
+    return within(1.0, condition)
+
+
 def button_of(page: LivePage) -> str:
     """The latest client's button."""
     client = page.server.get_clients()[max(page.server.get_clients())]
+    assert soon(lambda: len(client.gui._gui_input_handle_from_uuid) == 1)
     (uuid,) = client.gui._gui_input_handle_from_uuid
     return uuid
 
@@ -129,35 +140,35 @@ def test_only_the_operator_has_a_button_and_only_the_latest_one_is_obeyed(page):
         # What is shown reaches everybody.
         assert bystander.recv(timeout=5)
         send(bystander, CAMERA)
-        assert not within_a_second(lambda: bool(page.server.get_clients()))
+        assert not ever(lambda: bool(page.server.get_clients()))
         with opened(page, Origin=page.address, Cookie=cookie(page)) as operator:
             send(operator, CAMERA)
-            assert within_a_second(lambda: len(page.server.get_clients()) == 1)
+            assert soon(lambda: len(page.server.get_clients()) == 1)
             click = _messages.GuiUpdateMessage(button_of(page), {"value": True})
             send(bystander, click)
-            assert not within_a_second(page.pressed)
+            assert not ever(page.pressed)
             send(operator, click)
-            assert within_a_second(page.pressed)
+            assert soon(page.pressed)
             with opened(page, Origin=page.address, Cookie=cookie(page)) as again:
                 send(again, CAMERA)
-                assert within_a_second(lambda: len(page.server.get_clients()) == 2)
+                assert soon(lambda: len(page.server.get_clients()) == 2)
                 send(operator, click)
-                assert not within_a_second(page.pressed)
+                assert not ever(page.pressed)
                 send(again, _messages.GuiUpdateMessage(button_of(page), {"value": True}))
-                assert within_a_second(page.pressed)
+                assert soon(page.pressed)
 
 
 def test_a_cookie_with_another_token_is_no_operators(page):
     name = cookie(page).split("=")[0]
     with opened(page, Cookie=f"{name}=wrong") as bystander:
         send(bystander, CAMERA)
-        assert not within_a_second(lambda: bool(page.server.get_clients()))
+        assert not ever(lambda: bool(page.server.get_clients()))
 
 
 def test_nothing_is_shared_by_way_of_the_internet(page):
     with opened(page, Cookie=cookie(page)) as operator:
         send(operator, _messages.ShareUrlRequest())
-        assert not within_a_second(lambda: page.server._share_tunnel is not None)
+        assert not ever(lambda: page.server._share_tunnel is not None)
     assert page.server.request_share_url() is None
 
 

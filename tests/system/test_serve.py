@@ -245,6 +245,7 @@ def test_the_lamp_is_on_while_the_laser_is_off_and_frames_are_dropped_and_late(l
                 with pytest.raises(HardwareError, match="did not answer a trigger"):
                     camera.grab(1.0)
                 stage.laser(True)
+                stage.keep_lit(60.0)
                 assert np.median(grab(camera)) < 20
                 began = time.monotonic()
                 grab(camera)

@@ -112,7 +112,7 @@ def read_grey(path: str | Path) -> np.ndarray:
         try:
             image_size(path)
         except ImageError as error:
-            raise DescriptionError(f"{path} is no texture: {error}") from error
+            raise DescriptionError(f"texture {error}") from error
     try:
         picture = mi.Bitmap(str(path))
         # A picture marked as gamma-coded would be made linear by the conversion.

@@ -344,7 +344,7 @@ def test_the_numbers_0_and_almost_1_give_rays(thesis):
 
 def test_a_waist_at_the_origin_of_a_bare_fan_gives_rays(thesis):
     # There the rays of the fan meet, and the surface has no normal of its own.
-    sensor = altered(thesis, {"laser": {"waist_distance_mm": 1e-9, "window": {"mounted": False}}})
+    sensor = altered(thesis, {"laser": {"waist_distance_mm": 1e-6, "window": {"mounted": False}}})
     u = mi.Point3f(*(to_jit(mi.Float, np.linspace(0.01, 0.99, 50)) for _ in range(3)))
     rays = Sheet(sensor, Medium(kind="air")).sample(u)
     assert np.isfinite(to_numpy(rays.origin)).all()

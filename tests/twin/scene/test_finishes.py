@@ -366,7 +366,7 @@ def test_a_missing_foreign_or_too_bright_texture_is_refused(tmp_path):
         built(scene)
     for content in (b"", b"hello", b"\x89PNG\r\n\x1a\n" + b"\x00" * 40):
         (tmp_path / "grey.png").write_bytes(content)
-        with pytest.raises(DescriptionError, match=r"grey\.png is no picture that Mitsuba reads"):
+        with pytest.raises(DescriptionError, match=r"grey\.png is (no PNG|no picture)"):
             built(scene)
     for value in (1.5, -0.1, np.nan):
         mi.Bitmap(np.full((4, 4, 1), value, np.float32)).write(str(tmp_path / "bright.exr"))
