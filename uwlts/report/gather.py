@@ -197,6 +197,8 @@ def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) 
 def _seconds(path: Path) -> dict[str, float]:
     try:
         return _SECONDS.validate_python(read_json(path, called="table of times")) if is_regular_file(path) else {}
+    except CaptureError as error:
+        raise CaptureError(f"{error}; expected the seconds of each stage by name") from error
     except ValidationError as error:
         expected = 'the seconds of each stage by name: {"render": 12.3, ...}'
         raise CaptureError(f"{path} must hold {expected}; {problems_of(error)}") from error

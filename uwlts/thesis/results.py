@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict
 
+from uwlts.model.errors import CaptureError
 from uwlts.storage.files import json_text, read_json, validated_content, written_aside
 
 Points = list[tuple[float, float]]
@@ -26,8 +27,11 @@ class _Kept(BaseModel):
     @classmethod
     def read(cls, path: Path) -> Self:
         """The file's content; CaptureError where it cannot be read, is damaged or of another version."""
-        content = read_json(path, called="file of results")
         advice = "; remove it to evaluate the campaign again"
+        try:
+            content = read_json(path, called="file of results")
+        except CaptureError as error:
+            raise CaptureError(f"{error}{advice}") from error
         return validated_content(cls, content, f"{path} holds no results that this program reads", advice=advice)
 
     def keep(self, path: Path) -> Self:
