@@ -74,7 +74,7 @@ def test_nothing_is_replaced_unasked_nor_the_calibration_at_all(folder: Path):
     before = (folder / "calibration.json").read_bytes()
     own = run("certificate", "calibration.json", "--out", "calibration.html", "--overwrite", folder=folder)
     assert own.returncode == 2
-    assert "would replace the calibration" in own.stderr
+    assert "it is an input of this command" in own.stderr
     (folder / "cert.json").write_text("{}", encoding="utf-8")
     there = run("certificate", "calibration.json", "--out", "cert.html", folder=folder)
     assert there.returncode == 2
