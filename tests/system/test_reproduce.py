@@ -255,7 +255,8 @@ def test_overwriting_renders_anew(copied: Path, rendered: tuple[Path, Progress],
 def test_another_plan_is_refused_and_nothing_is_lost(copied: Path, described: Path, how: dict, differing: str):
     before = contents(copied)
     with pytest.raises(
-        DescriptionError, match=rf"made with another {differing} \(.* in it, .* now.*\): give another folder.*--overwrite"
+        DescriptionError,
+        match=rf"made with another {differing} \(.* in it, .* now.*\): give another folder.*--overwrite",
     ):
         record(described, copied, **how)
     assert contents(copied) == before
