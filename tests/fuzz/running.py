@@ -103,7 +103,8 @@ def _keep(folder: Path, reader: str, case: str) -> None:
 def _peak_mib() -> tuple[float, float]:
     """Memory in use now and at its peak since the peak was last forgotten, MiB."""
     known = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
-    return tuple(int(known[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))  # type: ignore
+    now, peak = (int(known[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))
+    return now, peak
 
 
 def _too_slow(*_: object) -> None:

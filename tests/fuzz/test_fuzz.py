@@ -28,7 +28,7 @@ def test_past_failures_are_refused(tmp_path: Path):
         files[words] = reader, str(path)
     outcomes = dict(zip(files, watched(tmp_path, files.values()), strict=True))
     assert {words: each.fault for words, each in outcomes.items() if each.fault} == {}
-    # A certificate that is not as issued is not refused, but told to be so.
+    # A certificate that is not as issued is not refused, but reported as such.
     assert [words for words, each in outcomes.items() if not each.refusal] == []
     assert max(each.seconds for each in outcomes.values()) < MOST_S
     assert max(each.mib for each in outcomes.values()) < MOST_MIB

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
+from tests.waiting import within
 from twin.devices.gige_camera import GigeCamera
 from twin.devices.grbl_controller import GrblController
 from twin.devices.serve import ServedTwin, serve
@@ -118,12 +119,7 @@ def started(*words: object) -> subprocess.Popen[str]:
 
 def dark(controller: GrblController) -> bool:
     """Whether the laser goes off within a second."""
-    deadline = time.monotonic() + 1.0
-    while controller.state().laser_on:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
+    return within(1.0, lambda: not controller.state().laser_on)
 
 
 def frames_in(part: Path) -> int:

@@ -2,7 +2,6 @@
 
 import http.client
 import socket
-import time
 from collections.abc import Callable, Iterator
 from urllib.parse import parse_qs, urlsplit
 
@@ -13,6 +12,7 @@ from viser import _messages
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from tests.waiting import within
 from uwlts.hardware.guided.operator import GuidedPage
 from uwlts.hardware.live_view import LivePage
 from uwlts.hardware.page_access import PageAccess
@@ -106,15 +106,6 @@ CAMERA = _messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 10.0, 
 
 def send(connection: ClientConnection, message: _messages.Message) -> None:
     connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
-
-
-def within(seconds: float, condition: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
 
 
 def soon(condition: Callable[[], bool]) -> bool:

@@ -13,6 +13,7 @@ import pytest
 
 import uwlts
 from tests.system.small_board import small_sensor, turned_board
+from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
 from twin.recording.studio import record_scene
@@ -60,12 +61,7 @@ def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 def dark(served: ServedTwin) -> bool:
     """Whether the laser goes off within a second."""
-    deadline = time.monotonic() + 1.0
-    while served.controller.state().laser_on:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
+    return within(1.0, lambda: not served.controller.state().laser_on)
 
 
 def centres(image: np.ndarray) -> np.ndarray:

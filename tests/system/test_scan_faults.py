@@ -2,7 +2,6 @@
 
 import re
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 
 from tests.system.in_process import uwlts
 from tests.system.small_board import small_sensor, turned_board
+from tests.waiting import within
 from twin.devices.serve import NAMES, ServedTwin, serve
 from twin.scene.description import Scene, load_scene
 from uwlts.model.sensor import Sensor
@@ -68,12 +68,7 @@ def scan(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
 
 def dark(served: ServedTwin) -> bool:
     """Whether the laser goes off within a second."""
-    deadline = time.monotonic() + 1.0
-    while served.controller.state().laser_on:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
+    return within(1.0, lambda: not served.controller.state().laser_on)
 
 
 def ended(done: subprocess.CompletedProcess[str], says: str) -> None:

@@ -7,7 +7,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.waiting import within
 from twin.design.description import load_study
 from twin.design.screening import parts, read_parts, screen
 from uwlts.model.library import load_sensor
@@ -80,10 +80,7 @@ def begun(study: Path, out: Path, *more: str) -> subprocess.Popen[str]:
 
 
 def until(condition: Callable[[], bool], *, seconds: float = 120.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it took too long"
-        time.sleep(0.02)
+    assert within(seconds, condition), "it took too long"
 
 
 def contents(out: Path) -> dict[str, int]:

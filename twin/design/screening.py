@@ -28,7 +28,7 @@ from twin.design.description import Study
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.runtime.workers import Lost, Workers
-from uwlts.storage.files import differences, read_json, written_aside
+from uwlts.storage.files import another, read_json, written_aside
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
@@ -249,10 +249,9 @@ def keep_to_plan(study: Study, folder: Path) -> None:
         except CaptureError as error:
             raise DescriptionError(f"{path} cannot be read: {error}; give another folder, or --overwrite") from error
         if known != plan:
-            other = ", ".join(key for key in plan if not isinstance(known, dict) or known.get(key) != plan[key])
             raise DescriptionError(
-                f"{folder} holds a study with another {other} ({differences(known, plan)}): give another folder, or "
-                "--overwrite to start afresh"
+                f"{folder} holds a study with {another(known, plan)}: give another folder, or --overwrite to start "
+                "afresh"
             )
         return
     if any(not path.name.startswith(".") for path in folder.iterdir()):

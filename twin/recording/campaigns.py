@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from pydantic import JsonValue
+
 from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
 from uwlts.model.errors import CaptureError, DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
-from uwlts.storage.files import differences, read_json, written_aside
+from uwlts.storage.files import another, read_json, written_aside
 from uwlts.storage.one_writer import one_writer
 from uwlts.storage.truth import truth_path
 
@@ -135,14 +137,14 @@ def _jobs(
     ]
 
 
-def _plan(campaign: Campaign, *, every: int, spp: int, variant: str) -> dict[str, object]:
+def _plan(campaign: Campaign, *, every: int, spp: int, variant: str) -> dict[str, JsonValue]:
     return {"campaign": campaign.model_dump(mode="json"), "every": every, "spp": spp, "variant": variant}
 
 
 def _record_all(
     jobs: list[_Job],
     folder: Path,
-    plan: dict[str, object],
+    plan: dict[str, JsonValue],
     *,
     recorded: str,
     workers: int | None,
@@ -156,37 +158,26 @@ def _record_all(
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     # Two at once would take each other's unfinished recordings for interrupted ones.
     with one_writer(folder / PLAN):
-        _work(jobs, folder, plan, recorded=recorded, workers=workers, overwrite=overwrite, progress=progress)
+        files = {file for job in jobs for file in job.files}
+        _keep_to_plan(folder, plan, files, recorded=recorded, overwrite=overwrite)
+        for place in {job.path.parent for job in jobs}:
+            place.mkdir(exist_ok=True)
+        if overwrite:
+            # All at once and not one by one: what an interrupted run leaves must not be taken for its own.
+            for path in (path for job in jobs for path in job.files):
+                path.unlink(missing_ok=True)
+        # The longest first, so that no process is left alone with a long one at the end.
+        waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
+        waiting.sort(key=lambda job: job.images, reverse=True)
+        total = sum(job.images for job in jobs)
+        counted = count(total - sum(job.images for job in waiting))
+        progress(next(counted), total)
+        work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
 
 
-def _work(
-    jobs: list[_Job],
-    folder: Path,
-    plan: dict[str, object],
-    *,
-    recorded: str,
-    workers: int | None,
-    overwrite: bool,
-    progress: Callable[[int, int], None],
+def _keep_to_plan(
+    folder: Path, plan: dict[str, JsonValue], files: set[Path], *, recorded: str, overwrite: bool
 ) -> None:
-    files = {file for job in jobs for file in job.files}
-    _keep_to_plan(folder, plan, files, recorded=recorded, overwrite=overwrite)
-    for place in {job.path.parent for job in jobs}:
-        place.mkdir(exist_ok=True)
-    if overwrite:
-        # All at once and not one by one: what an interrupted run leaves must not be taken for its own.
-        for path in (path for job in jobs for path in job.files):
-            path.unlink(missing_ok=True)
-    # The longest first, so that no process is left alone with a long one at the end.
-    waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
-    waiting.sort(key=lambda job: job.images, reverse=True)
-    total = sum(job.images for job in jobs)
-    counted = count(total - sum(job.images for job in waiting))
-    progress(next(counted), total)
-    work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
-
-
-def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, recorded: str, overwrite: bool) -> None:
     """Write the settings of a folder's campaigns, or check that they are the same as before; ``files`` are theirs."""
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"
@@ -202,9 +193,8 @@ def _keep_to_plan(folder: Path, plan: dict[str, object], files: set[Path], *, re
     if known == plan:
         return
     how = f"that {PLAN} does not describe"
-    if isinstance(known, dict):
-        others = ", ".join(key for key in plan if known.get(key) != plan[key])
-        how = f"made with another {others} ({differences(known, plan)})"
+    if known is not None:
+        how = f"made with {another(known, plan)}"
     if found and not overwrite:
         raise DescriptionError(
             f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start afresh"

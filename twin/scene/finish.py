@@ -19,7 +19,7 @@ from twin.scene.description import AnyObject, Flat, Placed, Printed
 from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.media import check_range
-from uwlts.storage.image_header import SUFFIXES, image_size
+from uwlts.storage.image_header import SUFFIXES, read_header, read_image_file
 
 _MOST_TEXTURE_BYTES = 2**27
 _SHIFT = "point_shift_mm"
@@ -110,7 +110,7 @@ def read_grey(path: str | Path) -> np.ndarray:
     require_regular_file(path, most_bytes=_MOST_TEXTURE_BYTES, error=DescriptionError, called="texture")
     if Path(path).suffix.lower() in SUFFIXES:
         try:
-            image_size(path)
+            read_header(read_image_file(path), path)
         except ImageError as error:
             raise DescriptionError(f"texture {error}") from error
     try:

@@ -22,8 +22,13 @@ from uwlts.model.calibration import CameraModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.sensor import Uncertainty
 
-_DISTORTIONS = ((), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2", "k3"))
-_RATIONAL = (("k1", "k2", "k4", "k5"), ("k1", "k2", "p1", "p2", "k4", "k5"))  # tried where k3 helps
+BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
+"""Coefficients that lenses are tried with besides k1 and k2."""
+RATIONAL_BESIDES = (("k4", "k5"), ("p1", "p2", "k4", "k5"))
+"""Those that are tried where k3 helps."""
+_USUAL = ("k1", "k2")
+_DISTORTIONS = ((), ("k1",), _USUAL, *((*_USUAL, *names) for names in BESIDES))
+_RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
 _WORSE = 1.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
@@ -187,7 +192,7 @@ def calibrate_lens(
         )
 
     tried = _candidates(_DISTORTIONS, choice, poses)
-    usual = tried[0] if len(tried) == 1 else _candidates((("k1", "k2"),), replace(choice, distortion="auto"), poses)[0]
+    usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
         """Points (N,) of each image near to where the lens sees them, found without trust in any of them."""
@@ -277,7 +282,7 @@ def _name(options: CameraOptions) -> str:
 
 
 def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Poses) -> list[CameraOptions]:
-    any_of = (("k1", "k2"),) if poses == "stage-normal" else any_of
+    any_of = (_USUAL,) if poses == "stage-normal" else any_of
     sets = any_of if choice.distortion == "auto" else (choice.distortion,)
     known = choice.pixel_aspect
     any_shape = (known, None) if poses == "free" else (known,)

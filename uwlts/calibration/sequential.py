@@ -252,14 +252,8 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
         solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
     )
     if options.lens is None:
-        return _Seen(
-            solved(
-                air.images, poses=options.poses, options=options.camera.described(evidence.sensor.camera), start=start
-            ),
-            None,
-            air,
-            [],
-        )
+        estimated = options.camera.described(evidence.sensor.camera)
+        return _Seen(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
     lens = calibrate_lens(
         air.images,
         width_px=width_px,

@@ -1,4 +1,4 @@
-"""Who may see a live page and who may use it: requests of other sites are refused, and one operator's clicks count.
+"""Access control of live pages: requests of other sites are refused, and one operator's clicks count.
 
 The pages are served by viser, whose server takes no filter of requests. Its connections are made by the websockets
 package, which does; so the filter is put there while viser starts its server. A proxy in front would leave viser's own

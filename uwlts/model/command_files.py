@@ -1,7 +1,7 @@
 """Files of the running command: an output never replaces an input.
 
-A scope holds the files that the command reads and those that it is to write. Arguments are told apart by name: those in
-`OUTPUTS` are written, all others that name a file are read, so that a new command is covered without doing anything.
+A scope holds the files that the command reads and those that it is to write. Arguments are distinguished by name: those
+in `OUTPUTS` are written, all others that name a file are read, so that a new command is covered without doing anything.
 What arguments lead to is added when it is opened (`uwlts.model.input_file`): images in a folder, a description's base.
 All writing goes through `refuse_input`. The first of both that sees a file on both sides refuses it, which is before
 the work in most cases.

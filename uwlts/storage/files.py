@@ -140,7 +140,7 @@ def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
     except ValueError as error:
         raise CaptureError(f"{path} is not a valid {called}: {error}") from error
     if not isinstance(content, dict):
-        raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected an object with a "format"')
+        raise CaptureError(f"{path} is JSON but not {with_article(called)}: expected an object with named entries")
     return content
 
 
@@ -198,6 +198,11 @@ def differences(there: object, now: object) -> str:
     return "; ".join(
         [*(f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in found[:_SHOWN])] + more
     )
+
+
+def another(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:
+    """Words for a plan that a file holds and that is not the one wanted: "another" with its keys, and `differences`."""
+    return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({differences(there, now)})"
 
 
 def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:

@@ -40,12 +40,6 @@ class ImageHeader:
         return row * self.height_px / (_MOST_SHRINKING.get(self.kind, math.inf) if self.packed else 1)
 
 
-def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height in px that a file declares, without decoding it; ImageError as from `read_header`."""
-    declared = read_header(read_image_file(path), path)
-    return declared.width_px, declared.height_px
-
-
 def read_image_file(path: str | Path) -> bytes:
     """Content of an image file; ImageError where it is missing, no regular file, or too large."""
     return read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="image")

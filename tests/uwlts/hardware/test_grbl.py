@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
 from twin.devices.grbl_firmware import GrblError, parse_block
 from twin.devices.grbl_motion import Axis, Ramp
@@ -31,12 +32,7 @@ STEP_MM = 0.0125
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.005)
-    return True
+    return within(seconds, condition)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What a verification says beside its verdicts."""
+"""Warnings and limits that a verification reports beside its verdicts."""
 
 import numpy as np
 

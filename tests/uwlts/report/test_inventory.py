@@ -1,4 +1,4 @@
-"""What is said of a file."""
+"""Descriptions of the files in a folder."""
 
 import pytest
 

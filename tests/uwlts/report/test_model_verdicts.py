@@ -1,4 +1,4 @@
-"""What is said of models by images held out: of the window only by those in water."""
+"""Verdicts on models from held-out images: on the window only from those in water."""
 
 from types import SimpleNamespace
 

@@ -26,7 +26,7 @@ SENSOR = {
     "camera": {"width_px": WIDTH, "height_px": HEIGHT, "stripe_along": "width"},
 }
 SHAPE = (HEIGHT, WIDTH)
-TOLD = {
+GIVEN = {
     "sensor": SENSOR,
     "medium": "water",
     "laser": "*.png",
@@ -47,22 +47,22 @@ def lamp_image(seed: int = 0) -> np.ndarray:
     return np.clip(np.random.default_rng(seed).normal(scene, 2, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
 
 
-def folder_of(tmp_path: Path, images: dict[str, np.ndarray], told: dict | None = None) -> Path:
+def folder_of(tmp_path: Path, images: dict[str, np.ndarray], given: dict | None = None) -> Path:
     folder = tmp_path / "images"
     for name, image in images.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         assert cv2.imwrite(str(folder / name), image)
-    (folder / "import.toml").write_text(tomli_w.dumps(TOLD if told is None else told))
+    (folder / "import.toml").write_text(tomli_w.dumps(GIVEN if given is None else given))
     return folder
 
 
-def three(tmp_path: Path, told: dict | None = None, **others: np.ndarray) -> Path:
+def three(tmp_path: Path, given: dict | None = None, **others: np.ndarray) -> Path:
     images = {f"l{number}.png": stripe_image(20.0 + number, seed=number) for number in (1, 2, 3)}
-    return folder_of(tmp_path, images | {f"{name}.png": image for name, image in others.items()}, told)
+    return folder_of(tmp_path, images | {f"{name}.png": image for name, image in others.items()}, given)
 
 
 def without(*keys: str, **changes) -> dict:
-    return {key: value for key, value in TOLD.items() if key not in keys} | changes
+    return {key: value for key, value in GIVEN.items() if key not in keys} | changes
 
 
 # --- what comes in
@@ -82,11 +82,11 @@ def test_every_format_comes_in(tmp_path: Path, suffix: str):
 def test_everything_described_is_in_the_capture(tmp_path: Path):
     target = {"kind": "chessboard", "columns": 9, "rows": 6, "square_mm": 15.0}
     artefact = {"kind": "step", "height_mm": 23.17}
-    told = without("laser", laser="l*", lamp="w*", exposure_ms=4.0, lamp_exposure_ms=9.0, target=target, name="bench")
+    given = without("laser", laser="l*", lamp="w*", exposure_ms=4.0, lamp_exposure_ms=9.0, target=target, name="bench")
     images = {f"l{n}.png": stripe_image(20.0 + n) for n in (1, 10, 9)} | {
         f"w{n}.png": lamp_image(n) for n in (1, 9, 10)
     }
-    folder = folder_of(tmp_path, images, told | {"artefact": artefact})
+    folder = folder_of(tmp_path, images, given | {"artefact": artefact})
     imported = import_images(folder, tmp_path / "a.h5")
     assert (imported.laser, imported.lamp, imported.warnings) == (3, 3, ())
     with Capture(tmp_path / "a.h5") as capture:
@@ -112,7 +112,7 @@ def test_names_are_sorted_as_people_count():
 def test_the_chosen_channel_comes_in(tmp_path: Path, channel: str):
     blue, green, red = (lamp_image(seed) for seed in (1, 2, 3))
     red = np.maximum(red, stripe_image())
-    folder = folder_of(tmp_path, {"a.png": np.dstack([blue, green, red])}, TOLD | {"channel": channel})
+    folder = folder_of(tmp_path, {"a.png": np.dstack([blue, green, red])}, GIVEN | {"channel": channel})
     import_images(folder, tmp_path / "a.h5")
     # Luminance after ITU-R BT.601, as OpenCV documents it, rounded.
     luminance = 0.114 * blue + 0.587 * green + 0.299 * red
@@ -132,7 +132,7 @@ def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Pat
     red, green, blue = (rng.integers(0, 256, SHAPE, dtype=np.uint8) for _ in range(3))
     images = {f"{n}.png": np.dstack([blue, green, red]) for n in range(2)}
     both = {"laser": "*.png", "lamp": "*.png", "channel": "red - max(green, blue)", "lamp_channel": "green"}
-    folder = folder_of(tmp_path, images, TOLD | both)
+    folder = folder_of(tmp_path, images, GIVEN | both)
     found = import_images(folder, tmp_path / "out.h5")
     assert (found.laser, found.lamp) == (2, 2)
     with Capture(tmp_path / "out.h5") as capture:
@@ -165,12 +165,12 @@ def test_formulas_of_channels(formula, value):
     "formula", ["red -", "red - infrared", "red.real", "abs(red)", "1 + 2", "max(red)", "__import__('os')", "red ** 2"]
 )
 def test_what_is_no_formula_of_channels_is_refused(tmp_path: Path, formula):
-    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, TOLD | {"channel": formula})
+    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, GIVEN | {"channel": formula})
     refused(folder, tmp_path, DescriptionError, "channel: .*expected red, green, blue")
 
 
 def test_a_grey_image_has_no_difference_of_colours(tmp_path: Path):
-    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, TOLD | {"channel": "red - green"})
+    folder = folder_of(tmp_path, {"l1.png": np.full(SHAPE, 9, np.uint8)}, GIVEN | {"channel": "red - green"})
     refused(folder, tmp_path, ImageError, "l1.png has no colours")
 
 
@@ -185,8 +185,8 @@ def test_colour_without_colours_needs_no_channel():
 def test_all_bits_come_in(tmp_path: Path, suffix: str, bits: int, aligned: str):
     image = stripe_image().astype(np.uint16) * 2 ** (bits - 8) + 1
     stored = image * 2 ** (16 - bits) if aligned == "high" else image
-    told = without("laser", laser="a*", bits=bits, aligned=aligned)
-    import_images(folder_of(tmp_path, {f"a{suffix}": stored}, told), tmp_path / "a.h5")
+    given = without("laser", laser="a*", bits=bits, aligned=aligned)
+    import_images(folder_of(tmp_path, {f"a{suffix}": stored}, given), tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 2**bits - 1)
         assert np.array_equal(capture.image(0), image)
@@ -197,8 +197,8 @@ def test_a_background_is_subtracted_with_its_sign(tmp_path: Path):
     lit = [np.clip(scene.astype(int) + stripe_image(25.25, height=90, dark=0, seed=9), 0, 255) for scene in dark]
     images = {f"l{n}.png": image.astype(np.uint8) for n, image in enumerate(lit)}
     images |= {f"w{n}.png": image for n, image in enumerate(dark)}
-    told = without("laser", laser="l*", lamp="w*", background="w*")
-    import_images(folder_of(tmp_path, images, told), tmp_path / "a.h5")
+    given = without("laser", laser="l*", lamp="w*", background="w*")
+    import_images(folder_of(tmp_path, images, given), tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert (capture.dtype, capture.header.saturation_dn) == (np.uint16, 255 + 256)
         assert "256 added" in capture.header.provenance["background"]
@@ -226,8 +226,8 @@ def test_noise_below_the_background_stays_below(tmp_path: Path):
 def test_ignored_images_are_no_backgrounds(tmp_path: Path):
     lit = stripe_image()
     images = {"l1.png": lit, "dark1.png": np.full_like(lit, 7), "dark-spoilt.png": np.full_like(lit, 90)}
-    told = without("laser", laser="l*", background="dark*", ignore="*spoilt*")
-    import_images(folder_of(tmp_path, images, told), tmp_path / "a.h5")
+    given = without("laser", laser="l*", background="dark*", ignore="*spoilt*")
+    import_images(folder_of(tmp_path, images, given), tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert np.array_equal(capture.image(0), lit.astype(int) - 7 + 256)
 
@@ -246,8 +246,8 @@ def test_images_are_taken_as_stored_whatever_exif_says(tmp_path: Path):
 
 
 def test_free_poses_count_the_images(tmp_path: Path):
-    told = without("laser", "stage", laser="l*", lamp="w*", stage={"free": True})
-    folder = three(tmp_path, told, w1=lamp_image(1), w2=lamp_image(2), w3=lamp_image(3))
+    given = without("laser", "stage", laser="l*", lamp="w*", stage={"free": True})
+    folder = three(tmp_path, given, w1=lamp_image(1), w2=lamp_image(2), w3=lamp_image(3))
     import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
         assert capture.stage_mm.tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
@@ -267,8 +267,8 @@ def test_a_table_describes_each_image(tmp_path: Path, separator: str):
         f"l1.png,laser,-1e-3,2,2,{',' * 15}",
         f"l2.png,ignore,,,,{',' * 15}",
     ]
-    told = without("laser", "stage", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
-    folder = three(tmp_path, told, w=lamp_image())
+    given = without("laser", "stage", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
+    folder = three(tmp_path, given, w=lamp_image())
     (folder / "each.csv").write_text("\n".join(lines).replace(",", separator), encoding="utf-8-sig")
     assert import_images(folder, tmp_path / "a.h5").warnings == ()
     with Capture(tmp_path / "a.h5") as capture:
@@ -278,8 +278,8 @@ def test_a_table_describes_each_image(tmp_path: Path, separator: str):
 
 
 def test_patterns_say_which_image_is_what_where_the_table_has_positions_only(tmp_path: Path):
-    told = without("stage", "laser", laser="l*", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
-    folder = three(tmp_path, told)
+    given = without("stage", "laser", laser="l*", table="each.csv", stage={"direction": [0.0, 0.0, 1.0]})
+    folder = three(tmp_path, given)
     (folder / "each.csv").write_text("file,stage_mm\nl2.png,4\nl1.png,3\n")
     imported = import_images(folder, tmp_path / "a.h5")
     assert len(imported.warnings) == 1 and "l3.png" in imported.warnings[0]
@@ -288,8 +288,8 @@ def test_patterns_say_which_image_is_what_where_the_table_has_positions_only(tmp
 
 
 def test_the_table_names_backgrounds(tmp_path: Path):
-    told = without("laser", table="each.csv", stage={"positions_mm": [1.0, 2.0], "direction": [0.0, 0.0, 1.0]})
-    folder = three(tmp_path, told, dark=stripe_image(height=0, dark=4))
+    given = without("laser", table="each.csv", stage={"positions_mm": [1.0, 2.0], "direction": [0.0, 0.0, 1.0]})
+    folder = three(tmp_path, given, dark=stripe_image(height=0, dark=4))
     (folder / "each.csv").write_text("file,light,background\nl1.png,laser,dark.png\nl2.png,laser,dark.png\n")
     import_images(folder, tmp_path / "a.h5")
     with Capture(tmp_path / "a.h5") as capture:
@@ -297,7 +297,7 @@ def test_the_table_names_backgrounds(tmp_path: Path):
 
 
 def test_intrinsics_fill_the_sensor(tmp_path: Path):
-    folder = three(tmp_path, TOLD | {"intrinsics": "camera.yaml"})
+    folder = three(tmp_path, GIVEN | {"intrinsics": "camera.yaml"})
     matrix, coefficients = (
         np.array([[2000.0, 0, 50], [0, 2004, 31], [0, 0, 1]]),
         np.array([0.1, -0.2, 1e-3, 2e-3, 0.05]),
@@ -371,15 +371,15 @@ def test_all_black(tmp_path: Path):
     folder = folder_of(tmp_path, {"l1.png": black, "l2.png": black})
     refused(folder, tmp_path, ImageError, "all 2 laser images are black.*is the laser on")
     target = {"kind": "chessboard", "columns": 9, "rows": 6, "square_mm": 15.0}
-    told = without("laser", laser="l*", lamp="w*", target=target)
+    given = without("laser", laser="l*", lamp="w*", target=target)
     images = {"l1.png": stripe_image(), "l2.png": stripe_image(), "w1.png": black, "w2.png": black}
-    refused(folder_of(tmp_path, images, told), tmp_path, ImageError, "all 2 lamp images are black")
+    refused(folder_of(tmp_path, images, given), tmp_path, ImageError, "all 2 lamp images are black")
 
 
 def test_the_wrong_channel_is_black(tmp_path: Path):
     colour = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     colour[:, :, 2] = stripe_image()
-    folder = folder_of(tmp_path, {"l1.png": colour}, TOLD | {"channel": "green"})
+    folder = folder_of(tmp_path, {"l1.png": colour}, GIVEN | {"channel": "green"})
     refused(folder, tmp_path, ImageError, "black.*the channel that of its colour")
 
 
@@ -395,7 +395,7 @@ def test_all_white(tmp_path: Path):
 
 
 def test_white_with_ten_bits(tmp_path: Path):
-    folder = folder_of(tmp_path, {"l1.png": np.full((HEIGHT, WIDTH), 1023, np.uint16)}, TOLD | {"bits": 10})
+    folder = folder_of(tmp_path, {"l1.png": np.full((HEIGHT, WIDTH), 1023, np.uint16)}, GIVEN | {"bits": 10})
     refused(folder, tmp_path, ImageError, "is white: 100 % .*1023 DN")
 
 
@@ -411,7 +411,7 @@ def test_a_stripe_across_is_reported(tmp_path: Path):
     square = {"width_px": 80, "height_px": 80}
     sensor = SENSOR | {"camera": SENSOR["camera"] | square}
     image = stripe_image()[:, :80].T
-    folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, TOLD | {"sensor": sensor})
+    folder = folder_of(tmp_path, {"l1.png": np.pad(image, ((0, 0), (8, 8)), "reflect")}, GIVEN | {"sensor": sensor})
     warnings = import_images(folder, tmp_path / "a.h5").warnings
     assert "one runs across: the images are turned, or the sensor's stripe_along" in warnings[0]
 
@@ -429,10 +429,10 @@ def test_colour_without_a_channel(tmp_path: Path):
 def test_sixteen_bits_of_unknown_use(tmp_path: Path):
     image = stripe_image().astype(np.uint16)
     refused(folder_of(tmp_path, {"l.png": image}), tmp_path, ImageError, "16 bit: say how many the camera used")
-    told = TOLD | {"bits": 10}
-    refused(folder_of(tmp_path, {"l.png": image * 16}, told), tmp_path, ImageError, "more than 10 bits have: .*'high'")
+    given = GIVEN | {"bits": 10}
+    refused(folder_of(tmp_path, {"l.png": image * 16}, given), tmp_path, ImageError, "more than 10 bits have: .*'high'")
     refused(
-        folder_of(tmp_path, {"l.png": stripe_image()}, told), tmp_path, ImageError, "a file of 8 bit, but bits = 10"
+        folder_of(tmp_path, {"l.png": stripe_image()}, given), tmp_path, ImageError, "a file of 8 bit, but bits = 10"
     )
     with pytest.raises(ImageError, match="more than its upper 10 bits"):
         grey_values(image * 3, bits=10, aligned="high", name="l.png")
@@ -456,38 +456,38 @@ def test_empty_folder(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("given", "words"),
     [
         (without("stage", stage={"direction": [1.0, 0.0, 0.0]}), "positions of the stage are missing"),
-        (TOLD | {"stage": {"start_mm": 0.0, "direction": [1.0, 0.0, 0.0]}}, "start_mm and step_mm belong together"),
-        (TOLD | {"stage": {"positions_mm": [1.0, 2.0], "direction": [1.0, 0.0, 0.0]}}, "has 2 positions for 3 images"),
-        (TOLD | {"stage": {"start_mm": 0.0, "step_mm": 1.0}}, "stage.direction is missing"),
-        (TOLD | {"stage": {"start_mm": 0.0, "step_mm": 0.0}}, "l1.png and l2.png have the same position, 0 mm"),
-        (TOLD | {"stage": {"start_mm": 0.0, "step_mm": 1.0, "free": True}}, "give the positions once"),
-        (TOLD | {"stage": {"positions_mm": [1.0, 2.0, 1.0]}}, "l1.png and l3.png have the same position"),
-        (TOLD | {"exposure": 3.0}, "exposure: unknown key"),
-        (TOLD | {"stage": TOLD["stage"] | {"stop_mm": 3.0}}, "stage.stop_mm: unknown key"),
-        (TOLD | {"channel": "infrared"}, "channel: .*found 'infrared'"),
+        (GIVEN | {"stage": {"start_mm": 0.0, "direction": [1.0, 0.0, 0.0]}}, "start_mm and step_mm belong together"),
+        (GIVEN | {"stage": {"positions_mm": [1.0, 2.0], "direction": [1.0, 0.0, 0.0]}}, "has 2 positions for 3 images"),
+        (GIVEN | {"stage": {"start_mm": 0.0, "step_mm": 1.0}}, "stage.direction is missing"),
+        (GIVEN | {"stage": {"start_mm": 0.0, "step_mm": 0.0}}, "l1.png and l2.png have the same position, 0 mm"),
+        (GIVEN | {"stage": {"start_mm": 0.0, "step_mm": 1.0, "free": True}}, "give the positions once"),
+        (GIVEN | {"stage": {"positions_mm": [1.0, 2.0, 1.0]}}, "l1.png and l3.png have the same position"),
+        (GIVEN | {"exposure": 3.0}, "exposure: unknown key"),
+        (GIVEN | {"stage": GIVEN["stage"] | {"stop_mm": 3.0}}, "stage.stop_mm: unknown key"),
+        (GIVEN | {"channel": "infrared"}, "channel: .*found 'infrared'"),
         (without("sensor"), "sensor missing"),
-        (TOLD | {"medium": "milk"}, "knows the media air, water, not 'milk'"),
-        (TOLD | {"target": {"kind": "chessboard"}}, "columns is missing"),
-        (TOLD | {"laser": "scan*.png"}, "none of the 3 images"),
-        (TOLD | {"lamp": "l2*"}, "l2.png would be both laser and lamp image"),
-        (TOLD | {"background": "l2*"}, "l2.png would be both laser and background image"),
-        (TOLD | {"laser": "l1*", "background": "l[23]*"}, "2 background images for 1 laser images"),
-        (TOLD | {"laser": "l[12]*", "lamp": "l3*"}, "2 laser and 1 lamp images: it is open"),
-        (TOLD | {"header": "header.json"}, "the header gives sensor, medium, stage.direction already"),
-        (TOLD | {"saturation_dn": 1000}, "saturation_dn is 1000; images of uint8"),
+        (GIVEN | {"medium": "milk"}, "knows the media air, water, not 'milk'"),
+        (GIVEN | {"target": {"kind": "chessboard"}}, "columns is missing"),
+        (GIVEN | {"laser": "scan*.png"}, "none of the 3 images"),
+        (GIVEN | {"lamp": "l2*"}, "l2.png would be both laser and lamp image"),
+        (GIVEN | {"background": "l2*"}, "l2.png would be both laser and background image"),
+        (GIVEN | {"laser": "l1*", "background": "l[23]*"}, "2 background images for 1 laser images"),
+        (GIVEN | {"laser": "l[12]*", "lamp": "l3*"}, "2 laser and 1 lamp images: it is open"),
+        (GIVEN | {"header": "header.json"}, "the header gives sensor, medium, stage.direction already"),
+        (GIVEN | {"saturation_dn": 1000}, "saturation_dn is 1000; images of uint8"),
     ],
 )
-def test_wrong_descriptions(tmp_path: Path, told: dict, words: str):
-    refused(three(tmp_path, told), tmp_path, DescriptionError, words)
+def test_wrong_descriptions(tmp_path: Path, given: dict, words: str):
+    refused(three(tmp_path, given), tmp_path, DescriptionError, words)
 
 
 def test_sixteen_bits_leave_no_room_for_a_sign(tmp_path: Path):
     images = {"l.png": stripe_image().astype(np.uint16) * 200, "dark.png": stripe_image().astype(np.uint16)}
-    told = TOLD | {"laser": "l*", "background": "dark*", "bits": 16}
-    refused(folder_of(tmp_path, images, told), tmp_path, DescriptionError, "16 bits leave no room for its sign")
+    given = GIVEN | {"laser": "l*", "background": "dark*", "bits": 16}
+    refused(folder_of(tmp_path, images, given), tmp_path, DescriptionError, "16 bits leave no room for its sign")
 
 
 @pytest.mark.parametrize(
@@ -527,7 +527,7 @@ def test_a_missing_table_and_description(tmp_path: Path):
 
 
 def test_repeated_images_are_meant(tmp_path: Path):
-    folder = three(tmp_path, TOLD | {"stage": TOLD["stage"] | {"step_mm": 0.0}, "repeated": True})
+    folder = three(tmp_path, GIVEN | {"stage": GIVEN["stage"] | {"step_mm": 0.0}, "repeated": True})
     assert import_images(folder, tmp_path / "a.h5").laser == 3
 
 
@@ -557,7 +557,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr("sys.argv", ["uwlts", "import", str(folder), "--out", str(tmp_path / "a.h5")])
     assert run(cli.app) == 2
     assert "error: extra.png is a colour image" in capsys.readouterr().err
-    (folder / "import.toml").write_text(tomli_w.dumps(TOLD | {"laser": "l*"}))
+    (folder / "import.toml").write_text(tomli_w.dumps(GIVEN | {"laser": "l*"}))
     assert run(cli.app) == 0
     printed = capsys.readouterr()
     assert "with 3 laser and 0 lamp images" in printed.out and "warning: 1 images of the folder" in printed.err

@@ -24,6 +24,7 @@ from uwlts.calibration.joint.initial import line_start, series_start, step_profi
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import calibration_of
+from uwlts.calibration.lens import BESIDES, RATIONAL_BESIDES
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
 from uwlts.model.errors import CalibrationError
@@ -32,8 +33,6 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
-_RICHER = (("k3",), ("p1", "p2"), ("p1", "p2", "k3"))  # besides k1 and k2
-_RATIONAL = (("k4", "k5"), ("p1", "p2", "k4", "k5"))  # tried where k3 helps
 _CLEARLY_LESS = 0.9  # scatter with free pixels, over that without
 _NOTICED = 3.0  # standard uncertainties: what is taken for more uncertain loses little where that was chance
 
@@ -251,26 +250,25 @@ class _Attempt:
         Only what the options leave open. Pixels of a sensor on a stage are not freed for contradictions alone: a
         spacing described wrongly along one side looks like them.
         """
-        choice, camera, best, added = self.options.lens, self.options.camera, self, ()
+        choice, camera, best = self.options.lens, self.options.camera, self
         if choice is None or choice.distortion != "auto":
             return best
         odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=_NOTICED))
-        for further in (_RICHER, _RATIONAL) if odd or self.against.all_against() else ():
-            tried = [(best, added)]
-            for names in further:
-                richer = best._with_lens(replace(camera, distortion=(*camera.distortion, *names)))
-                tried += [] if richer is None else [(richer, names)]
-            best, added = _explaining_best(tried)
-            if "k3" not in added:
+        for further in (BESIDES, RATIONAL_BESIDES) if odd or self.against.all_against() else ():
+            tried = [best._with_lens(replace(camera, distortion=(*camera.distortion, *names))) for names in further]
+            best = _explaining_best([best, *filter(None, tried)])
+            if "k3" not in best.options.camera.distortion:
                 break
         free_poses = self.options.poses == "free"
         if choice.pixels == "auto" and (free_poses or best.against.misfits):
             free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
             if free is not None and (free_poses or free._scatter() < _CLEARLY_LESS * best._scatter()):
-                best, added = _explaining_best([(best, added), (free, (*added, "free pixels"))])
-        if not added:
+                best = _explaining_best([best, free])
+        if best is self:
             return best
-        said = f"the lens was given {', '.join(added)}: without, images and description contradict each other"
+        given = [name for name in best.options.camera.distortion if name not in camera.distortion]
+        given += ["free pixels"] if best.options.camera.pixel_aspect != camera.pixel_aspect else []
+        said = f"the lens was given {', '.join(given)}: without, images and description contradict each other"
         return replace(best, said=(*best.said, said))
 
     def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
@@ -322,15 +320,15 @@ class _Attempt:
         return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
 
 
-def _explaining_best(tried: Sequence[tuple[_Attempt, tuple[str, ...]]]) -> tuple[_Attempt, tuple[str, ...]]:
-    """Of attempts from the same evidence, each with what its lens was given, the one that explains it best.
+def _explaining_best(tried: Sequence[_Attempt]) -> _Attempt:
+    """Of attempts from the same evidence the one that explains it best.
 
     That is by the Bayesian information criterion, with as many independent residuals as in the one of least scatter.
     What contradicts the description explains nothing.
     """
-    tried = [each for each in tried if not each[0].against.contradictions] or tried
-    like = min((attempt for attempt, _ in tried), key=_Attempt._scatter).result
-    return min(tried, key=lambda each: each[0]._criterion(like))
+    tried = [each for each in tried if not each.against.contradictions] or tried
+    like = min(tried, key=_Attempt._scatter).result
+    return min(tried, key=lambda each: each._criterion(like))
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
-from uwlts.storage.image_header import image_size
+from uwlts.storage.image_header import ImageHeader
 from uwlts.storage.import_.channels import is_formula, one_channel
 from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.storage.import_.description import (
@@ -240,16 +241,8 @@ class _Reader:
 
     def image(self, name: str, *, laser_on: bool) -> tuple[np.ndarray, int]:
         """Grey image (H, W), signed where the channel is a formula, and its bits; ImageError if not like the others."""
-        given, camera = self._given, self._sensor.camera
-        wanted = camera.width_px, camera.height_px
-        size = image_size(self._folder / name)
-        if size != wanted:
-            before = "" if self.dtype == np.void else " and the images before it"
-            raise ImageError(
-                f"{name} has {size[0]} x {size[1]} pixels; expected {wanted[0]} x {wanted[1]} as the sensor "
-                f"'{self._sensor.name}' has{before}: {_SIZE_ADVICE[self.dtype == np.void, size == wanted[::-1]]}"
-            )
-        raw = read_image(self._folder / name)
+        given = self._given
+        raw = read_image(self._folder / name, accept=partial(self._require_size, name))
         if self.dtype not in (np.void, raw.dtype):
             raise ImageError(f"{name} is of {raw.dtype}, the images before it of {self.dtype}")
         channel = given.channel if laser_on or given.lamp_channel is None else given.lamp_channel
@@ -258,6 +251,16 @@ class _Reader:
         self.dtype = raw.dtype
         values = grey_values(raw, bits=bits, aligned=given.aligned, name=name)
         return one_channel(values, channel, name=name), bits
+
+    def _require_size(self, name: str, declared: ImageHeader) -> None:
+        camera, size = self._sensor.camera, (declared.width_px, declared.height_px)
+        wanted = camera.width_px, camera.height_px
+        if size != wanted:
+            before = "" if self.dtype == np.void else " and the images before it"
+            raise ImageError(
+                f"{name} has {size[0]} x {size[1]} pixels; expected {wanted[0]} x {wanted[1]} as the sensor "
+                f"'{self._sensor.name}' has{before}: {_SIZE_ADVICE[self.dtype == np.void, size == wanted[::-1]]}"
+            )
 
     def background(self, name: str) -> np.ndarray:
         """Grey image (H, W) without laser, in the laser's channel."""

@@ -7,7 +7,7 @@ is read meanwhile: lines about damage are returned, everything else is passed on
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
-from uwlts.storage.image_header import png_damage, read_header, read_image_file
+from uwlts.storage.image_header import ImageHeader, png_damage, read_header, read_image_file
 
 _STANDARD_ERROR = 2
 _DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
@@ -45,14 +45,15 @@ def _heard() -> Iterator[list[str]]:
                     os.write(_STANDARD_ERROR, line)
 
 
-def read_image(path: Path) -> np.ndarray:
+def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda declared: None) -> np.ndarray:
     """Image (H, W) or (H, W, 3) in blue, green, red, of uint8 or uint16, as stored: not turned by what EXIF says.
 
-    ImageError where the file is missing, foreign, truncated, has an alpha channel, several pages, or other than whole
-    numbers of 8 or 16 bit.
+    ``accept`` may refuse what the file says of itself, before it is decoded. ImageError where the file is missing,
+    foreign, truncated, has an alpha channel, several pages, or other than whole numbers of 8 or 16 bit.
     """
     content = read_image_file(path)
     declared = read_header(content, path)
+    accept(declared)
     kind = declared.kind
     if kind == "PNG" and (damage := png_damage(content)):
         raise ImageError(f"{path} is a PNG file that is truncated or damaged ({damage}); copy it again")

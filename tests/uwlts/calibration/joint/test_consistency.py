@@ -66,16 +66,9 @@ def lens_pulls(result, sensor):
 
 def pulls(result):
     """Errors of lens and window distance over their stated uncertainties."""
-    camera = BUILT.camera
-    cx, cy = camera.principal_point()
-    true = {
-        LensParameter.F: camera.focal_length_px(),
-        LensParameter.CX: cx,
-        LensParameter.CY: cy,
-        LensParameter.K1: camera.distortion.k1,
-        LensParameter.K2: camera.distortion.k2,
-        WindowParameter.DISTANCE: camera.window.distance_mm,
-    }
+    lens = CameraModel.described(BUILT.camera).parameters()
+    names = (LensParameter.F, LensParameter.CX, LensParameter.CY, LensParameter.K1, LensParameter.K2)
+    true = {name: lens[name] for name in names} | {WindowParameter.DISTANCE: BUILT.camera.window.distance_mm}
     found = dict(zip(result.estimate.parameters.keys, result.estimate.values.tolist(), strict=True))
     return np.array([(found[key] - value) / result.estimate.std()[key] for key, value in true.items()])
 
