@@ -315,6 +315,13 @@ class GrblStage:
             self._recover()
         return self.position_mm()
 
+    def darken(self) -> None:
+        """Switch the laser off from any thread, whatever the stage does: by Ctrl-X, which also stops a movement.
+
+        What is under way fails at its next exchange with the controller; then `unlock` where nothing moved, or `home`.
+        """
+        self._line.darken()
+
     def close(self, error: BaseException | None = None) -> None:
         """Switch the laser off and close the port; HardwareError where the controller does not confirm."""
         self._line.close(error)

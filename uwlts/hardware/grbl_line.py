@@ -231,6 +231,7 @@ _STOOD_STILL = (
     f"the laser was switched off by its guard, as this program stood still for over {GRACE_S:g} s while it was on: "
     "suspended (Ctrl-Z), hung in a driver, or the computer too busy; what is recorded is kept"
 )
+_ASKED_TO_DARKEN = "the laser was switched off by hand: unlock the stage if it stood still, else home it"
 
 
 class GrblLine:
@@ -249,6 +250,7 @@ class GrblLine:
         self._serial = _open(port, baud)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
+        self._darken = False
         try:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
@@ -384,8 +386,15 @@ class GrblLine:
         self._refuse_after_fault()
         self._write(byte)
 
+    def darken(self) -> None:
+        """Send Ctrl-X and wait for nothing; from any thread. What is under way fails at its next exchange."""
+        self._darken = True
+        with suppress(OSError):
+            self._serial.write(SOFT_RESET)
+
     def restart(self) -> None:
         """Reset by Ctrl-X: the laser goes off and a fault is over; the position is kept only if nothing moved."""
+        self._darken = False
         self._reset()
         # After an alarm there may be a greeting more, which must not look like a restart of its own.
         while self._read_line(time.monotonic() + _QUIET_S) is not None:
@@ -412,6 +421,8 @@ class GrblLine:
         # What the guard's reset makes the controller say would be taken for a fault of the controller.
         if self._told_dark():
             what = _STOOD_STILL
+        elif self._darken:
+            what = _ASKED_TO_DARKEN
         self.fault = what
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
 
@@ -450,6 +461,8 @@ class GrblLine:
             raise HardwareError(f"the stage on {self.port} is closed: open it again")
         if self.fault is not None:
             raise HardwareError(f"the stage on {self.port} has stopped after a fault: {self.fault}; home or unlock it")
+        if self._darken:
+            raise self.failed(_ASKED_TO_DARKEN)
 
     def _write(self, data: bytes) -> None:
         try:
