@@ -29,7 +29,7 @@ NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "google-chrome-
 """Names on PATH. Ubuntu's chromium-browser is only a script that asks for a snap, and is refused where it is."""
 DEBIAN_PACKAGES = ("chromium-headless-shell", "chromium")
 DEBIAN_FONT = "fonts-dejavu-core"
-"""Without any font a page shows boxes for letters."""
+"""Without any font a page shows no text."""
 SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 """WebGL by the processor, the same on machines with and without a graphics card."""
 START_SECONDS = 60
@@ -90,7 +90,7 @@ def _started(path: Path) -> Path:
     if not os.access(path, os.X_OK) or path.is_dir():
         raise SetupError(f"{path}: it is not there, or no program")
     version = run_command([str(path), "--version"], seconds=START_SECONDS, shown=f"{path}: starting it")
-    if not version.startswith(("Chromium ", "Google Chrome ")):
+    if "chrom" not in version.lower():
         raise SetupError(f"{path}: it is no Chromium, it calls itself {version.strip()[:80]!r}")
     return path
 
