@@ -22,7 +22,7 @@ help:
 	@echo "make bench   measure speed"
 	@echo "make docs    build the documentation site in docs/_build/html"
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
-	@echo "make clean   remove .venv, .llvm, caches and build results"
+	@echo "make clean   remove .venv, .llvm, .aravis, .chromium, caches and build results"
 
 demo: setup
 	@$(PYTHON) -m twin.cli demo
@@ -30,6 +30,7 @@ demo: setup
 test: PYTEST_OPTIONS := -m "not slow"
 test test-full: check
 	@$(PYTHON) -m twin.devices.aravis_install
+	@$(PYTHON) -m tests.browser
 	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS)
 
 check: setup
@@ -59,7 +60,7 @@ $(INSTALLED): pyproject.toml
 	@touch $@
 
 clean:
-	@rm -rf $(VENV) .llvm .aravis build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) .llvm .aravis .chromium build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.

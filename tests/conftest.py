@@ -8,13 +8,18 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.browser import find_chromium, open_chromium
 from twin.options import use_variant
+from uwlts.model.errors import SetupError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -111,3 +116,18 @@ def thesis() -> Sensor:
 def thesis_as_built() -> Sensor:
     """The same sensor with distortion, tilted windows and a rolled sheet."""
     return load_sensor("thesis-as-built")
+
+
+@pytest.fixture(scope="module")
+def chromium() -> "Iterator[Browser]":
+    """A headless Chromium with WebGL, as Playwright's Browser; without one the test fails.
+
+    Playwright's event loop runs in this thread as long as the browser is there, so that asyncio.run is refused: it
+    ends with the module and does not disturb the next.
+    """
+    try:
+        path = find_chromium()
+    except SetupError as error:
+        pytest.fail(str(error), pytrace=False)
+    with open_chromium(path) as browser:
+        yield browser

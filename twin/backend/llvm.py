@@ -15,7 +15,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -227,21 +227,12 @@ def install_llvm(report: packages.Report = lambda line: None) -> LlvmLibrary:
     return packages.obtain(
         find_llvm,
         what="libLLVM",
-        choose=_offered,
+        choose=lambda options: [packages.first_offered(DEBIAN_PACKAGES, options), DEBIAN_RUNTIME],
         wheel=WHEEL,
         folders=own_folders("llvm"),
         choice=VARIABLE,
         report=report,
     )
-
-
-def _offered(options: Sequence[str]) -> list[str]:
-    """The packages to take according to the package lists; SetupError where there is none."""
-    policy = run_command(["apt-cache", *options, "policy", *DEBIAN_PACKAGES])
-    offered = set(re.findall(r"^(\S+):\n  Installed: .*\n  Candidate: (?!\(none\))", policy, flags=re.MULTILINE))
-    if package := next((package for package in DEBIAN_PACKAGES if package in offered), None):
-        return [package, DEBIAN_RUNTIME]
-    raise SetupError(f"apt-get: there is none of {', '.join(DEBIAN_PACKAGES)}")
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Obtains shared libraries: as packages of the system where that is allowed, else unpacked into an own folder."""
+"""Obtains libraries and programs: as packages of the system where that is allowed, else unpacked into an own folder."""
 
 import os
 import re
@@ -15,31 +15,63 @@ from typing import TypeVar
 from uwlts.model.errors import SetupError
 
 COMMAND_SECONDS = 900
-"""Downloads of some 40 MB over a slow line."""
+"""Downloads of some 100 MB over a slow line."""
+TREE = "tree"
+"""Folder within an own folder that holds whole packages."""
 
-Library = TypeVar("Library")
+Found = TypeVar("Found")
 Report = Callable[[str], object]
 Choose = Callable[[Sequence[str]], Sequence[str]]
-"""With the options of apt-get to the packages wanted, the library's own first; SetupError where none is offered."""
+"""With the options of apt-get to the packages wanted, the main one first; SetupError where none is offered."""
+Place = Callable[[Path, Path], None]
+"""Takes what is needed of an unpacked folder into an own folder."""
+
+
+def copy_libraries(unpacked: Path, target: Path) -> None:
+    """Copy all shared libraries into one flat folder, in which they find each other."""
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        for library in unpacked.rglob("lib*.so*"):
+            if library.is_file() and not library.is_symlink():
+                # Renamed into place: a library of that name may be in use, and must not change under its user.
+                part = target / f"{library.name}.part{os.getpid()}"
+                shutil.copyfile(library, part)
+                part.replace(target / library.name)
+    except OSError as error:
+        raise SetupError(f"cannot write to {target}: {error}") from error
+
+
+def move_tree(unpacked: Path, target: Path) -> None:
+    """Move everything to `tree` in a folder, in place of an earlier one."""
+    part = target / f"{TREE}.part{os.getpid()}"
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.move(unpacked, part)
+        shutil.rmtree(target / TREE, ignore_errors=True)
+        part.replace(target / TREE)
+    except OSError as error:
+        shutil.rmtree(part, ignore_errors=True)
+        raise SetupError(f"cannot write to {target}: {error}") from error
 
 
 def obtain(
-    find: Callable[[], Library],
+    find: Callable[[], Found],
     *,
     what: str,
     choose: Choose,
-    wheel: str,
+    wheel: str | None = None,
+    place: Place = copy_libraries,
     folders: Sequence[Path],
     choice: str,
     report: Report,
-) -> Library:
-    """Find a library; else obtain it with apt-get as root, or unpacked from Debian packages or from a wheel.
+) -> Found:
+    """Find a library or program; else obtain it with apt-get as root, or unpacked from Debian packages or a wheel.
 
-    ``find`` looks for the library called ``what``, also in ``folders``, or raises a SetupError that says where it
-    looked. ``choose`` gives Debian's packages, ``wheel`` is the requirement that pip downloads; the first of
-    ``folders`` that can be written to is unpacked into. The environment variable ``choice`` names a library of the
-    user's, and ``report`` is called with a line of text for each step. SetupError, with the reason of each, where the
-    user's choice does not serve, or no way led to a library.
+    ``find`` looks for what is called ``what``, also in ``folders``, or raises a SetupError that says where it looked.
+    ``choose`` gives Debian's packages, ``wheel`` is the requirement that pip downloads, if there is one. ``place``
+    takes what was unpacked into the first of ``folders`` that can be written to. The environment variable ``choice``
+    names the user's own, and ``report`` is called with a line of text for each step. SetupError, with the reason of
+    each, where the user's choice does not serve, or no way led to it.
     """
     try:
         return find()
@@ -51,9 +83,12 @@ def obtain(
     standing = {folder: next(parent for parent in (folder, *folder.parents) if parent.exists()) for folder in folders}
     target = next((folder for folder, existing in standing.items() if os.access(existing, os.W_OK)), None)
     if target is None:
-        raise SetupError(f"no folder to unpack libraries into: none of {list(map(str, folders))} can be written to")
+        raise SetupError(f"no folder to unpack {what} into: none of {list(map(str, folders))} can be written to")
+    ways = [partial(_install_packages, choose), partial(_unpack_packages, choose, place)]
+    if wheel is not None:
+        ways.append(partial(_unpack_wheel, wheel, place))
     refusals = []
-    for way in (partial(_install_packages, choose), partial(_unpack_packages, choose), partial(_unpack_wheel, wheel)):
+    for way in ways:
         try:
             with tempfile.TemporaryDirectory() as scratch:
                 way(Path(scratch), target, lambda line: report(f"{what}: {line}"))
@@ -80,8 +115,8 @@ def _install_packages(choose: Choose, scratch: Path, target: Path, report: Repor
     _with_fresh_lists(install, [], report)
 
 
-def _unpack_packages(choose: Choose, scratch: Path, target: Path, report: Report) -> None:
-    """Without root: unpack the libraries of packages, and of those they need that the system lacks, into a folder."""
+def _unpack_packages(choose: Choose, place: Place, scratch: Path, target: Path, report: Report) -> None:
+    """Without root: unpack packages, and those they need that the system lacks, into a folder."""
     if shutil.which("apt-get") is None:
         raise SetupError("apt-get download: not possible, needs apt-get")
 
@@ -95,7 +130,7 @@ def _unpack_packages(choose: Choose, scratch: Path, target: Path, report: Report
         run_command(["apt-get", *options, "download", *wanted], folder=scratch)
         for archive in scratch.glob("*.deb"):
             run_command(["dpkg-deb", "--extract", str(archive), str(scratch / "unpacked")])
-        _copy_libraries(scratch / "unpacked", target)
+        place(scratch / "unpacked", target)
 
     # An ordinary user cannot renew the system's lists but can keep lists of his own.
     for folder in ("lists/partial", "cache/archives/partial"):
@@ -115,29 +150,24 @@ def _with_fresh_lists(take: Callable[[Sequence[str]], None], options: Sequence[s
         take(options)
 
 
-def _unpack_wheel(requirement: str, scratch: Path, target: Path, report: Report) -> None:
-    """Without apt-get: unpack the libraries of a wheel, by pip, into a folder."""
+def _unpack_wheel(requirement: str, place: Place, scratch: Path, target: Path, report: Report) -> None:
+    """Without apt-get: unpack a wheel, by pip, into a folder."""
     report(f"unpacking the wheel {requirement} into {target}")
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     run_command([*pip, "download", "--no-deps", "--only-binary=:all:", "--dest", str(scratch), requirement])
     for wheel in scratch.glob("*.whl"):
         with zipfile.ZipFile(wheel) as archive:
             archive.extractall(scratch / "unpacked")
-    _copy_libraries(scratch / "unpacked", target)
+    place(scratch / "unpacked", target)
 
 
-def _copy_libraries(unpacked: Path, target: Path) -> None:
-    """Copy all shared libraries into one flat folder, in which they find each other."""
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        for library in unpacked.rglob("lib*.so*"):
-            if library.is_file() and not library.is_symlink():
-                # Renamed into place: a library of that name may be in use, and must not change under its user.
-                part = target / f"{library.name}.part{os.getpid()}"
-                shutil.copyfile(library, part)
-                part.replace(target / library.name)
-    except OSError as error:
-        raise SetupError(f"cannot write to {target}: {error}") from error
+def first_offered(names: Sequence[str], options: Sequence[str]) -> str:
+    """The first package that the package lists of apt-get's options offer; SetupError where they offer none."""
+    policy = run_command(["apt-cache", *options, "policy", *names])
+    offered = set(re.findall(r"^(\S+):\n  Installed: .*\n  Candidate: (?!\(none\))", policy, flags=re.MULTILINE))
+    if name := next((name for name in names if name in offered), None):
+        return name
+    raise SetupError(f"apt-get: there is none of {', '.join(names)}")
 
 
 def run_command(

@@ -266,11 +266,11 @@ def test_debian_package_offered_by_the_lists_is_taken(monkeypatch):
         "libllvm18:\n  Installed: (none)\n  Candidate: 1:18.1.8-1\n  Version table:\n"
         "libllvm17:\n  Installed: 1:17.0.6-1\n  Candidate: 1:17.0.6-1\n  Version table:\n"
     )
-    monkeypatch.setattr(llvm, "run_command", lambda command: policy)
-    assert llvm._offered([]) == ["libllvm18", "libatomic1"]
-    monkeypatch.setattr(llvm, "run_command", lambda command: "")
+    monkeypatch.setattr(packages, "run_command", lambda command: policy)
+    assert packages.first_offered(llvm.DEBIAN_PACKAGES, []) == "libllvm18"
+    monkeypatch.setattr(packages, "run_command", lambda command: "")
     with pytest.raises(SetupError, match="there is none of libllvm19"):
-        llvm._offered([])
+        packages.first_offered(llvm.DEBIAN_PACKAGES, [])
 
 
 def test_command_line_shows_what_is_there_and_fails_without(capsys, monkeypatch, machine_library, foreign_library):
