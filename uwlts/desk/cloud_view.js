@@ -18,8 +18,8 @@ export default {
     <div class="cloud-view" tabindex="0" aria-label="point cloud; arrow keys turn it, plus and minus zoom, F fits it">
       <canvas></canvas>
       <canvas class="axes" width="90" height="90"></canvas>
-      <div class="scale"><div class="bar"></div><span></span></div>
-      <div class="legend" v-show="legend"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span>
+      <div class="scale" v-show="count"><div class="bar"></div><span></span></div>
+      <div class="legend" v-show="count"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span>
         <b>{{ legend }}</b></div>
       <div class="empty" v-show="!count">no points yet</div>
     </div>`,
@@ -27,7 +27,9 @@ export default {
   data: () => ({ legend: "", low: "", high: "", count: 0 }),
   mounted() {
     this.renderer = new THREE.WebGLRenderer({ canvas: this.$el.children[0], antialias: true, preserveDrawingBuffer: true });
-    this.renderer.setClearColor(0x10151c);
+    // Colours are shown as they are given.
+    this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    this.renderer.setClearColor(new THREE.Color().setRGB(0.06, 0.08, 0.11));
     this.scene = new THREE.Scene();
     // Orthographic, so that the scale holds at every depth.
     this.camera = new THREE.OrthographicCamera(-100, 100, 100, -100, -1e5, 1e5);
@@ -115,11 +117,12 @@ export default {
       const colours = new Float32Array(3 * this.count).fill(0.4);
       for (let k = 0; k < this.count; k++) {
         const value = this.table[COLUMNS * k + column];
-        if (!Number.isNaN(value)) colours.set(turbo(Math.min(1, Math.max(0, (value - low) / span))), 3 * k);
+        if (!Number.isNaN(value)) colours.set(turbo(0.05 + 0.95 * Math.min(1, Math.max(0, (value - low) / span))), 3 * k);
       }
       this.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       const unit = this.field === "intensity" ? "grey values" : "mm";
-      const text = (value) => Number((value + offset).toPrecision(column < 3 ? 6 : 3)).toString();
+      const digits = Math.max(0, 2 - Math.floor(Math.log10(span)));
+      const text = (value) => (value + offset).toFixed(Math.min(digits, 6));
       this.legend = values.length ? `${this.field}, ${unit}` : `${this.field}: not known`;
       this.low = values.length ? text(low) : "";
       this.high = values.length ? text(high) : "";

@@ -52,7 +52,7 @@ def kind_of(name: str) -> str:
         case [_, *_, "json"]:
             return "calibration"
         case [_, *_, "toml"]:
-            return "plan"
+            return "description"
         case [_, *_, "html"]:
             return "report"
         case _:

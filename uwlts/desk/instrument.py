@@ -53,7 +53,7 @@ class State(StrEnum):
     DISCONNECTED = "not connected"
     BUSY = "busy"
     READY = "ready"
-    LOCKED = "stopped: home the stage, or unlock it where it stood still"
+    LOCKED = "the stage has to be homed, or unlocked where it stood still"
     SCANNING = "scanning"
     PAUSED = "paused"
 

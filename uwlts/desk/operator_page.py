@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -120,12 +121,17 @@ class _Desk:
         else:
             build_board(board, False)
 
-    def plans(self) -> dict[str, str]:
-        """The plans to choose from, by their paths."""
-        names = {str(self.folder / file.name): file.name for file in listed(self.folder) if file.kind == "plan"}
-        if self.plan_path is not None:
-            names.setdefault(str(self.plan_path), self.plan_path.name)
-        return names
+    def plans(self, load: Callable[[Path], object]) -> dict[str, str]:
+        """Names of the valid plans to choose from, as ``load`` reads them, by their paths."""
+        paths = [self.folder / file.name for file in listed(self.folder) if file.kind == "description"]
+        if self.plan_path is not None and self.plan_path not in paths:
+            paths.append(self.plan_path)
+        found = {}
+        for path in paths:
+            with suppress(Error):
+                load(path)
+                found[str(path)] = path.name
+        return found
 
     def calibrations(self) -> list[str]:
         """The calibrations to choose from."""
@@ -218,7 +224,7 @@ class _OperatorPage:
     # Connect
 
     def _connect_part(self) -> None:
-        plans, begun = self._desk.plans(), self._desk.plan
+        plans, begun = self._desk.plans(load_plan), self._desk.plan
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
         self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
         self._camera = ui.input("camera", placeholder="gige:NAME, genicam:PRODUCER.cti, replay:FILE").classes("w-full")
@@ -253,7 +259,7 @@ class _OperatorPage:
 
     def _chosen_plan(self) -> ScanPlan:
         if self._desk.plan is None:
-            raise DescriptionError("choose a plan first: a .toml file in the folder with sensor, medium and stage")
+            raise DescriptionError("choose a plan first; valid ones of the folder are offered (docs/how-to/scan.md)")
         return self._desk.plan
 
     def _connect(self) -> None:
@@ -288,7 +294,9 @@ class _OperatorPage:
     # Calibrate
 
     def _calibrate_part(self) -> None:
-        self._guided_plan = ui.select(self._desk.plans(), label="plan of the calibration").classes("w-full")
+        self._guided_plan = ui.select(self._desk.plans(load_guided_plan), label="plan of the calibration").classes(
+            "w-full"
+        )
         self._calibration_name = ui.input("name of the calibration", value="calibration").classes("w-full")
         self._replace = ui.checkbox("replace an existing one")
         with ui.row():
@@ -379,8 +387,8 @@ class _OperatorPage:
             return
         self._files = files
         self._calibration.set_options(self._desk.calibrations(), value=self._calibration.value)
-        for choice in (self._plan, self._guided_plan):
-            choice.set_options(self._desk.plans(), value=choice.value)
+        for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
+            choice.set_options(self._desk.plans(load), value=choice.value)
         self._rows.clear()
         with self._rows:
             for file in files:

@@ -26,8 +26,9 @@ _STYLE = """
   .cloud-view { height: 60vh !important; }
   .desk .log { height: 200px; }
 }
-.image { grid-area: image; overflow: auto; padding: 8px; }
-.image img { width: 100%; object-fit: contain; background: #111; image-rendering: auto; }
+.image { grid-area: image; overflow: hidden; padding: 8px; display: flex; flex-direction: column; }
+.image img { width: 100%; min-height: 0; object-fit: contain; object-position: top; }
+.tools .q-tab { padding: 0 9px; }
 .cloud { grid-area: cloud; display: flex; flex-direction: column; }
 .tools { grid-area: tools; overflow: auto; }
 .log { grid-area: log; overflow: auto; padding: 6px 10px; font-family: monospace; font-size: 13px; }
@@ -74,6 +75,7 @@ class BoardView:
         """The latest image, its histogram and what is known of it."""
         with ui.element("section").classes("image").props('aria-label="latest image"'):
             self._image = ui.element("img").props('alt="latest image"')
+            self._image.set_visibility(False)
             self._caption = ui.label("no image yet").classes("text-sm")
             self._histogram = ui.html("", sanitize=False)
 
@@ -117,7 +119,7 @@ class BoardView:
         self._bar.set_value(progress.done / progress.total if progress.total else 0.0)
         if board.pictures != self._pictures and (picture := board.picture) is not None:
             self._pictures = board.pictures
-            self._image.props(f'src="picture.jpg?{self._pictures}"')
+            self._image.props(f'src="picture.jpg?{self._pictures}"').set_visibility(True)
             self._caption.set_text(picture.caption)
             self._histogram.set_content(_histogram(picture))
         if board.coverage is not None and board.coverage is not self._coverage:
