@@ -75,8 +75,8 @@ def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
             position = np.diff(position)
         noise = noise_mm(known[ends]) @ unit
         random = float(np.sqrt(noise @ noise + position @ position))
-        stated["length"] = FigureUncertainty(random, float(np.linalg.norm(together)))
-    return Inspected("length", {"length": length}, stated, 2, 0)
+        stated["distance"] = FigureUncertainty(random, float(np.linalg.norm(together)))
+    return Inspected("length", {"distance": length}, stated, 2, 0)
 
 
 def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape: Shape) -> Inspected:
