@@ -12,9 +12,11 @@ import numpy as np
 from uwlts.desk.thinned_cloud import ThinnedCloud
 
 Kind = Literal["note", "warning", "error"]
+LaserState = Literal["none", "off", "flashing", "on", "unknown"]
+"""None is connected; off; lit while images are exposed; lit; its controller cannot be reached."""
 _LONGEST_SIDE_PX = 1000
 _BINS = 64
-_KEPT_LINES = 1000
+KEPT_LINES = 1000
 _FOUND, _STRIPE = (0, 140, 0), (40, 60, 255)
 
 
@@ -78,26 +80,29 @@ class Line:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the work is: ``phase`` in words, images ``done`` of a ``total``, and the time left in s."""
+    """How far the work is: ``phase`` in words, images ``done`` of a ``total``, and the time left in s.
+
+    ``busy`` is whether something is being done.
+    """
 
     phase: str = "not connected"
     done: int = 0
     total: int | None = None
     left_s: float | None = None
+    busy: bool = False
 
 
 @dataclass
 class Board:
     """The content of the page. Its attributes are replaced as wholes, never changed in place; the log is kept by `say`.
 
-    ``laser`` is on, off, or None where no laser is connected. ``request`` is what the operator is asked to do, and
+    ``request`` is what the operator is asked to do, and
     ``answers`` what the buttons for it are called. ``coverage`` is a PNG of what a guided calibration has seen.
     """
 
     title: str
     progress: Progress = Progress()
-    laser: bool | None = None
-    laser_note: str = ""
+    laser: LaserState = "none"
     position_mm: float | None = None
     picture: Picture | None = None
     pictures: int = 0
@@ -108,7 +113,7 @@ class Board:
     cloud_name: str = ""
 
     def __post_init__(self) -> None:
-        self._lines: deque[Line] = deque(maxlen=_KEPT_LINES)
+        self._lines: deque[Line] = deque(maxlen=KEPT_LINES)
         self._lock, self._began_s = threading.Lock(), 0.0
 
     def say(self, text: str, kind: Kind = "note") -> None:
@@ -122,10 +127,10 @@ class Board:
         with self._lock:
             return [line for line in self._lines if line.number > after]
 
-    def phase(self, name: str) -> None:
-        """Begin another phase of the work."""
+    def phase(self, name: str, *, busy: bool = True) -> None:
+        """Begin another phase of the work, or of waiting for the operator."""
         self._began_s = time.monotonic()
-        self.progress = Progress(name)
+        self.progress = Progress(name, busy=busy)
 
     def count(self, done: int, total: int, *, before: int = 0) -> None:
         """So much of the phase is done, ``before`` of it when it began; the time left follows."""

@@ -21,12 +21,17 @@ export default {
       <div class="scale" v-show="count"><div class="bar"></div><span></span></div>
       <div class="legend" v-show="count"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span>
         <b>{{ legend }}</b></div>
-      <div class="empty" v-show="!count">no points yet</div>
+      <div class="empty" v-show="!count">{{ problem }}</div>
     </div>`,
   props: { field: String, version: Number, marks: Array, fit: Number },
-  data: () => ({ legend: "", low: "", high: "", count: 0 }),
+  data: () => ({ legend: "", low: "", high: "", count: 0, problem: "no points yet" }),
   mounted() {
-    this.renderer = new THREE.WebGLRenderer({ canvas: this.$el.children[0], antialias: true, preserveDrawingBuffer: true });
+    try {
+      this.renderer = new THREE.WebGLRenderer({ canvas: this.$el.children[0], antialias: true });
+    } catch {
+      this.problem = "this browser draws no WebGL: the cloud cannot be shown";
+      return;
+    }
     // Colours are shown as they are given.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     this.renderer.setClearColor(new THREE.Color().setRGB(0.06, 0.08, 0.11));
@@ -66,9 +71,9 @@ export default {
     this.load();
   },
   beforeUnmount() {
-    this.resized.disconnect();
-    this.controls.dispose();
-    this.renderer.dispose();
+    this.resized?.disconnect();
+    this.controls?.dispose();
+    this.renderer?.dispose();
   },
   watch: {
     version() { this.load(); },
@@ -78,6 +83,7 @@ export default {
   },
   methods: {
     async load() {
+      if (!this.renderer) return;
       // One at a time; what came meanwhile is fetched afterwards.
       if (this.loading) { this.again = true; return; }
       this.loading = true;
@@ -104,6 +110,7 @@ export default {
     },
     column() { return { depth: 2, intensity: 3, deviation: 4, uncertainty: 5 }[this.field] ?? 2; },
     colour() {
+      if (!this.renderer) return;
       const column = this.column();
       const values = [];
       for (let k = column; k < this.table.length; k += COLUMNS) if (!Number.isNaN(this.table[k])) values.push(this.table[k]);
@@ -129,6 +136,7 @@ export default {
       this.draw();
     },
     mark() {
+      if (!this.renderer) return;
       const places = new Float32Array((this.marks ?? []).flat());
       this.marked.geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
       this.draw();

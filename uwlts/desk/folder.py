@@ -1,6 +1,7 @@
 """The files of the desk's folder: plans, captures, calibrations, clouds and reports."""
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from uwlts.model.input_file import is_regular_file
 from uwlts.storage.capture import part_path
 
 _SHOWN = 500
+_LONGEST_NAME = 200
+"""Of a new file, in bytes: file systems take 255, with all that is appended."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,11 @@ def listed(folder: Path) -> list[ListedFile]:
         raise DescriptionError(f"the folder {folder} cannot be read: {error.strerror}") from error
     for entry in entries:
         kind = kind_of(entry.name)
-        if kind and not entry.name.startswith(".") and entry.is_file():
-            about = entry.stat()
-            found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
+        # What was renamed or removed meanwhile, and links in a circle, are none.
+        with suppress(OSError):
+            if kind and not entry.name.startswith(".") and entry.is_file():
+                about = entry.stat()
+                found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
     return sorted(found, key=lambda file: file.time_s, reverse=True)[:_SHOWN]
 
 
@@ -62,7 +67,7 @@ def kind_of(name: str) -> str:
 def file_in(folder: Path, name: str) -> Path:
     """A listed file's path; DescriptionError for names that lead elsewhere or to no regular file."""
     path = folder / name
-    if Path(name).name != name or not kind_of(name) or not is_regular_file(path):
+    if not _is_plain(name) or not kind_of(name) or not is_regular_file(path):
         raise DescriptionError(f"'{name}' is not a file of the folder {folder}")
     return path
 
@@ -70,9 +75,14 @@ def file_in(folder: Path, name: str) -> Path:
 def new_in(folder: Path, name: str, *, suffix: str) -> Path:
     """Path for a result in the folder; DescriptionError for names that lead elsewhere."""
     name = name.strip()
-    if not name or Path(name).name != name or name.startswith("."):
+    if not _is_plain(name) or len(name.encode()) > _LONGEST_NAME:
         raise DescriptionError(f"'{name}' is no name for a file of the folder: give letters, digits, - and _")
     return folder / (name if name.endswith(suffix) else f"{name}{suffix}")
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a name is that of a file in the folder itself, and not hidden."""
+    return bool(name) and Path(name).name == name and not name.startswith(".") and name.isprintable()
 
 
 def interrupted(path: Path) -> bool:

@@ -23,6 +23,10 @@ _COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
 _MAP_CELL_PX = 48
 
 
+class Ended(Exception):
+    """The operator has ended what was being recorded."""
+
+
 class BoardScreen:
     """Shows a guided calibration on a board, whose buttons answer."""
 
@@ -30,10 +34,15 @@ class BoardScreen:
         self._board = board
         self._given: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._stage: LaserStage | None = None
+        self._ending = False
 
     def press(self, answer: str) -> None:
         """A button's answer."""
         self._given.put(answer)
+
+    def end(self) -> None:
+        """End the recording when an answer is next asked for; what was accepted is kept."""
+        self._ending = True
 
     def laser_off(self) -> None:
         """Switch the laser off, whatever is being done; the recording ends, what was accepted is kept."""
@@ -44,7 +53,9 @@ class BoardScreen:
             self._board.say("no laser is connected to this program: switch it off by its own switch", "warning")
 
     def answer(self) -> str | None:
-        """The answer of a button that was pressed since it was last asked; the first of several."""
+        """The answer of a button that was pressed since it was last asked, the first of several; Ended after `end`."""
+        if self._ending:
+            raise Ended
         return None if self._given.empty() else self._given.get()
 
     def request(self, text: str) -> None:
@@ -57,7 +68,7 @@ class BoardScreen:
         """Show an image (H, W) with the points (N, 2) of the target and the stripe's pixels (N, 2) found in it."""
         self._board.show(picture_of(image, full_dn=full_dn, caption=remark, stripe=stripe, points=points))
         if isinstance(self._stage, GrblStage):
-            self._board.laser = self._stage.laser_power > 0
+            self._board.laser = "on" if self._stage.laser_power > 0 else "flashing"
 
     def recorded(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
         """Show the coverage, with the points (N, 2) of every image."""
@@ -70,7 +81,7 @@ class BoardScreen:
     def connected(self, stage: LaserStage | None) -> None:
         """The stage that switches the laser from now on; None once it is closed."""
         self._stage = stage
-        self._board.laser = False if isinstance(stage, GrblStage) else None
+        self._board.laser = "flashing" if isinstance(stage, GrblStage) else "none"
 
 
 def coverage_picture(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray:

@@ -19,7 +19,7 @@ import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, picture_of
-from uwlts.desk.guided import BoardScreen
+from uwlts.desk.guided import BoardScreen, Ended
 from uwlts.desk.recording_view import RecordingView
 from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
@@ -58,17 +58,12 @@ class State(StrEnum):
     PAUSED = "paused"
 
 
-class _Stopped(Exception):
-    """The operator has ended a scan."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Connected:
     plan: ScanPlan
     sensor: Sensor
     camera: CameraDevice
     stage: LaserStage
-    rig: Rig
     closing: ExitStack
 
 
@@ -83,6 +78,8 @@ class Instrument:
         self.state = State.DISCONNECTED
         self.light: Light | None = None
         self._screen: BoardScreen | None = None
+        self._rig: Rig | None = None
+        self._darkened = False
         self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
@@ -101,10 +98,18 @@ class Instrument:
             return
         self._stop.set()
         self._paused.clear()
-        connected.stage.darken()
-        self._board.laser = False
-        self._board.say("laser switched off by hand; the controller was reset", "warning")
+        self._darkened = True
+        if connected.stage.darken():
+            self._board.say("laser switched off by hand: unlock the stage if it stood still, else home it", "warning")
+        else:
+            self._board.say("the laser CANNOT be switched off: switch its power off before going near", "error")
+        self._show_laser()
         self._ask(self._after_darkening)
+
+    @property
+    def laser_in_use(self) -> bool:
+        """Whether the laser is lit now and then, or may be."""
+        return self._board.laser in ("on", "flashing") or self.state in (State.SCANNING, State.BUSY)
 
     def pause(self) -> None:
         """Wait, with the laser off, after the image that is being taken."""
@@ -116,9 +121,11 @@ class Instrument:
         self._paused.clear()
 
     def stop(self) -> None:
-        """End a scan after the image that is being taken; it can be continued later."""
+        """End a scan or a guided calibration after the image that is being taken; it can be continued later."""
         self._stop.set()
         self._paused.clear()
+        if (screen := self._screen) is not None:
+            screen.end()
 
     # What waits for its turn.
 
@@ -166,9 +173,8 @@ class Instrument:
 
     def close(self) -> None:
         """End everything; the laser goes off."""
-        self._stop.set()
-        self._paused.clear()
         self._ending.set()
+        self.stop()
         self._ask(lambda: None)
         self._thread.join(30.0)
 
@@ -190,10 +196,12 @@ class Instrument:
     def _do(self, work: Callable[[], None]) -> None:
         try:
             work()
-        except _Stopped:
+        except Ended:
             self._board.say("stopped")
         except Error as error:
-            self._board.say(str(error), "error")
+            # What was under way when the laser was switched off by hand fails, as it should.
+            if not self._darkened:
+                self._board.say(str(error), "error")
             self.light = None
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
@@ -206,16 +214,25 @@ class Instrument:
         if connected is None:
             self.state = State.DISCONNECTED
         elif isinstance(connected.stage, GrblStage) and not connected.stage.position_known:
+            self._rig = None
             self.state = State.LOCKED
         else:
             self.state = State.READY
-        if board.progress.phase not in (self.state, "finished", "stopped"):
-            board.phase(self.state)
+        how_it_ended = self.state == State.READY and board.progress.phase in ("finished", "stopped")
+        if board.progress.phase != self.state and not how_it_ended:
+            board.phase(self.state, busy=False)
         self._show_laser()
 
     def _show_laser(self) -> None:
         stage = None if self._connected is None else self._connected.stage
-        self._board.laser = stage.laser_power > 0 if isinstance(stage, GrblStage) else None
+        if not isinstance(stage, GrblStage):
+            self._board.laser = "none"
+        elif stage.laser_unreachable:
+            self._board.laser = "unknown"
+        elif stage.laser_power > 0:
+            self._board.laser = "on"
+        else:
+            self._board.laser = "flashing" if self.light == "laser" or self.state == State.SCANNING else "off"
 
     def _begin(self, phase: str) -> _Connected:
         if self._connected is None:
@@ -238,8 +255,7 @@ class Instrument:
             moved: LaserStage = HandSwitchedLaser(self._board.say)
             if port is not None:
                 moved = stack.enter_context(GrblStage(port))
-            rig = Rig(plan, plan.stage, sensor, opened, moved, ahead=plan.stage.step_mm)
-            self._connected = _Connected(plan, sensor, opened, moved, rig, stack.pop_all())
+            self._connected = _Connected(plan, sensor, opened, moved, stack.pop_all())
         self.exposure_ms |= plan.planned_ms()
         self._board.say(f"connected: {opened.info.name} {opened.info.serial}".strip())
         if isinstance(moved, GrblStage):
@@ -251,7 +267,7 @@ class Instrument:
         self.light = "lamp"
 
     def _disconnect(self) -> None:
-        connected, self._connected, self.light = self._connected, None, None
+        connected, self._connected, self._rig, self.light = self._connected, None, None, None
         if connected is not None:
             self._board.position_mm = None
             connected.closing.close()
@@ -262,8 +278,15 @@ class Instrument:
             raise HardwareError("no stage is connected")
         return connected.stage
 
+    def _rig_of(self, connected: _Connected) -> Rig:
+        """What takes images; made anew when something else has used camera or stage."""
+        if self._rig is None:
+            plan, stage = connected.plan, connected.stage
+            self._rig = Rig(plan, plan.stage, connected.sensor, connected.camera, stage, ahead=plan.stage.step_mm)
+        return self._rig
+
     def _moving(self, phase: str, work: Callable[[GrblStage], float]) -> None:
-        stage = self._stage(self._begin(phase))
+        stage, self._rig = self._stage(self._begin(phase)), None
         self._stop.clear()
         self._board.position_mm = work(stage)
         self._board.say(f"{phase} done: the stage is at {self._board.position_mm:.3f} mm")
@@ -271,7 +294,7 @@ class Instrument:
     def _move(self, position_mm: float) -> None:
         connected = self._begin(f"moving to {position_mm:.3f} mm")
         self._stage(connected)
-        self._board.position_mm = connected.rig.move_to(position_mm)
+        self._board.position_mm = self._rig_of(connected).move_to(position_mm)
 
     def _jog(self, by_mm: float) -> None:
         stage = self._stage(self._begin("moving"))
@@ -280,33 +303,42 @@ class Instrument:
 
     def _after_darkening(self) -> None:
         connected = self._connected
-        if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
-            # Meets the reset, so that what it did is known.
-            connected.stage.position_mm()
+        try:
+            if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
+                # Meets the reset, so that what it did is known.
+                connected.stage.position_mm()
+        except HardwareError:
+            pass
+        finally:
+            self._darkened = False
+
+    def _shown_light(self, connected: _Connected) -> Light | None:
+        """The light that is shown; nothing switches a laser without a stage, or with one that is locked."""
+        switched = isinstance(connected.stage, GrblStage) and connected.stage.position_known
+        return self.light if switched else self.light and "lamp"
 
     def _find_exposure(self) -> None:
-        light, connected = self.light, self._begin("finding the exposure")
+        connected = self._begin("finding the exposure")
+        light = self._shown_light(connected)
         if light is None:
             raise HardwareError("choose first which light is shown")
-        found = connected.rig.settled_exposure(light, start_ms=self.exposure_ms[light])
+        found = self._rig_of(connected).settled_exposure(light, start_ms=self.exposure_ms[light])
         if found is None:
             self._board.say(f"too dark for a {light} image even at the longest exposure", "warning")
             return
         self.exposure_ms[light] = found
-        self._board.say(f"{light}: exposed by {found:.3g} ms")
+        self._board.say(f"{light}: exposed by {found:.4g} ms")
 
     def _preview(self) -> None:
-        connected, light = self._connected, self.light
-        if connected is None or light is None or self.state != State.READY:
+        connected = self._connected
+        if connected is None or connected.stage.faulty or (light := self._shown_light(connected)) is None:
             return
-        if light == "laser" and not isinstance(connected.stage, GrblStage):
-            light = "lamp"
-        image, exposure_ms = connected.rig.image(light, self.exposure_ms[light])
+        image, exposure_ms = self._rig_of(connected).image(light, self.exposure_ms[light])
         seen = brightness(image, connected.sensor, light)
         full = connected.sensor.detector.full_scale_dn()
         pixels, caption = (
             None,
-            f"live, {light}, exposure {exposure_ms:.3g} ms, {100 * seen.level:.0f} % of the full scale",
+            f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of the full scale",
         )
         if light == "laser":
             stripe = stripe_of(image, connected.sensor)
@@ -341,7 +373,9 @@ class Instrument:
             if line in ("recording", "finding the exposures", "checking for lost steps"):
                 board.phase(line)
 
-        self.state, kept_light = State.SCANNING, self.light
+        # The rig knows neither exposure nor place any more.
+        self.state, self._rig, kept_light = State.SCANNING, None, self.light
+        self._show_laser()
         try:
             with shown:
                 seen = record_scan(
@@ -358,17 +392,14 @@ class Instrument:
                     recorded=lambda frame, number: shown.put(view, frame, number),
                 )
         finally:
-            board.phase("stopped")
-            # The rig knows neither exposure nor place any more.
-            rig = Rig(connected.plan, connected.plan.stage, connected.sensor, connected.camera, stage, ahead=1.0)
-            self._connected = _Connected(
-                connected.plan, connected.sensor, connected.camera, stage, rig, connected.closing
-            )
-            self.light = kept_light
+            board.phase("stopped", busy=False)
+            # Never the laser again by itself.
+            self.light = kept_light and "lamp"
+        board.position_mm = stage.position_mm()
         for warning in seen.warnings():
             board.say(warning, "warning")
         board.say(f"wrote {out.name}")
-        board.phase("finished")
+        board.phase("finished", busy=False)
 
     def _calibrate(self, plan: GuidedPlan, out: Path, resume: bool, overwrite: bool) -> None:
         self._disconnect()
@@ -394,7 +425,7 @@ class Instrument:
         for warning in found.origin().warnings:
             board.say(warning, "warning")
         board.say(f"wrote {out.name}")
-        board.phase("finished")
+        board.phase("finished", busy=False)
 
     def _between(self) -> None:
         """Between two images of a scan."""
@@ -405,7 +436,7 @@ class Instrument:
                 time.sleep(0.05)
             self.state, self._board.progress = State.SCANNING, before
         if self._stop.is_set():
-            raise _Stopped
+            raise Ended
         self._show_laser()
 
 

@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import get_args
+from urllib.parse import quote
 
 import numpy as np
 from nicegui import ui
+from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from uwlts.desk.board import Board
-from uwlts.desk.folder import file_in, interrupted, listed, new_in
+from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, State
 from uwlts.desk.page import BoardView, build_board, laser_off_button, timed
@@ -26,6 +28,7 @@ from uwlts.measurement.reconstruction import reconstruct
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.files import refuse_unsuitable
 
 _LIST_S = 2.0
 _MOST_SHOWN = 300_000
@@ -106,11 +109,13 @@ class _Desk:
         """Let browsers fetch the folder's reports."""
 
         @server.app.get("/files/{name}")
-        def file(name: str) -> Response:
+        def file(name: str, request: Request) -> Response:
             try:
                 path = file_in(self.folder, name)
             except Error as error:
                 return PlainTextResponse(f"{error}\n", 404)
+            if kind_of(name) != "report" and not server.is_operator(request):
+                return PlainTextResponse("only the operator may fetch this\n", 403)
             # A report's own scripts must not press the operator's buttons.
             return FileResponse(path, headers={"Content-Security-Policy": "sandbox allow-scripts allow-popups"})
 
@@ -147,7 +152,7 @@ class _Desk:
         std = None if known is None else np.linalg.norm(known[kept].std_mm(), axis=1)
         deviation = None if cloud.deviation_mm is None else cloud.deviation_mm[kept]
         self.board.cloud.add(
-            cloud.points_mm[kept], intensity=cloud.intensity[kept], deviation=deviation, uncertainty=std
+            cloud.points_mm[kept], len(cloud), intensity=cloud.intensity[kept], deviation=deviation, uncertainty=std
         )
 
     def measured(self) -> PointCloud:
@@ -167,17 +172,18 @@ class _OperatorPage:
         self._view = BoardView(desk.board, picked=self._picked)
         self._only: list[tuple[ui.button, tuple[State, ...]]] = []
         self._files: tuple[object, ...] = ()
+        self._exposed: tuple[object, float] | None = None
 
     def build(self) -> None:
         """Build all of it."""
         view, instrument = self._view, self._instrument
         with view.header():
-            laser_off_button(instrument.laser_off)
+            laser_off_button(instrument.laser_off, in_use=lambda: instrument.laser_in_use)
         with ui.element("main").classes("desk"):
             view.image()
             view.cloud()
             with ui.element("section").classes("tools").props('aria-label="controls"'):
-                with ui.tabs().props("dense align=left inline-label") as tabs:
+                with ui.tabs().props("dense no-caps align=left") as tabs:
                     names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Measure"]
                     shown = {name: ui.tab(name) for name in names}
                 with ui.tab_panels(tabs, value=shown["Connect"]).classes("w-full").props("keep-alive"):
@@ -218,6 +224,11 @@ class _OperatorPage:
     def _refresh(self) -> None:
         self._view.refresh()
         self._show_request()
+        light = self._instrument.light
+        self._light.value = light or "none"
+        if (shown := (light, self._instrument.exposure_ms[light or "lamp"])) != self._exposed:
+            # Not while the operator types in it.
+            self._exposed, self._exposure.value = shown, shown[1]
         for element, states in self._only:
             element.set_enabled(self._instrument.state in states)
 
@@ -237,7 +248,7 @@ class _OperatorPage:
         ui.separator()
         ui.label("live image").classes("text-sm")
         with ui.row().classes("items-center"):
-            self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="lamp")
+            self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
             self._light.on_value_change(lambda event: self._look(event.value))
             self._button("find exposure", self._instrument.find_exposure, (State.READY,)).props("outline")
         self._exposure = ui.number("exposure, ms", min=0.001, step=0.1, format="%.3g")
@@ -245,8 +256,10 @@ class _OperatorPage:
         ui.label("With the laser's light the laser is lit only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
+        if not self._plan.value:
+            return
         try:
-            plan = load_plan(Path(self._plan.value or ""))
+            plan = load_plan(Path(self._plan.value))
         except Error as error:
             self._board.say(str(error), "error")
             return
@@ -267,7 +280,6 @@ class _OperatorPage:
 
     def _look(self, light: str) -> None:
         self._instrument.light = None if light == "none" else "laser" if light == "laser" else "lamp"
-        self._exposure.value = self._instrument.exposure_ms.get(self._instrument.light or "lamp")
 
     def _expose(self) -> None:
         light, value = self._instrument.light, self._exposure.value
@@ -305,6 +317,7 @@ class _OperatorPage:
                 "outline"
             )
         self._show_request = answer_buttons(self._board, self._instrument.answer)
+        self._button("stop", self._instrument.stop, (State.BUSY,)).props("color=warning")
         self._view.coverage()
 
     def _calibrate(self, *, resume: bool) -> None:
@@ -379,13 +392,15 @@ class _OperatorPage:
     def _list(self) -> None:
         """Bring the list of files and the choices up to date where the folder has changed."""
         try:
-            files = tuple(listed(self._desk.folder))
+            files = listed(self._desk.folder)
         except Error as error:
             self._board.say(str(error), "error")
             return
-        if files == self._files:
+        # A recording that grows is no other file.
+        known = tuple((file.name, None if file.kind == "interrupted capture" else file.time_s) for file in files)
+        if known == self._files:
             return
-        self._files = files
+        self._files = known
         self._calibration.set_options(self._desk.calibrations(), value=self._calibration.value)
         for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
             choice.set_options(self._desk.plans(load), value=choice.value)
@@ -397,7 +412,7 @@ class _OperatorPage:
                     ui.label(f"{file.kind}, {_size_text(file.size)}").classes("text-xs text-slate-500")
                     name = file.name
                     if file.kind == "report":
-                        ui.link("open", f"files/{name}", new_tab=True)
+                        ui.link("open", f"files/{quote(name)}", new_tab=True)
                         continue
                     if file.kind == "cloud":
                         self._button("show", partial(self._show, name)).props("flat dense")
@@ -425,6 +440,7 @@ class _OperatorPage:
         folder, board = self._desk.folder, self._board
         capture, calibration = file_in(folder, name), file_in(folder, known)
         out = new_in(folder, Path(name).stem, suffix=".ply")
+        refuse_unsuitable(out, overwrite=False)
         board.say(f"reconstructing {name} with {known}")
         cloud = await asyncio.to_thread(reconstruct, capture, calibration)
         await asyncio.to_thread(write_cloud, out, cloud, overwrite=False)
@@ -446,11 +462,13 @@ class _OperatorPage:
         with ui.row().classes("items-center"):
             self._radius = ui.number("radius about the point, mm", value=15.0, min=0.01)
             for shape in get_args(Shape):
-                self._button(shape, partial(self._shape, shape)).props("outline")
+                self._button(shape, partial(self._shape, shape)).props("outline dense")
         self._results = ui.column().classes("w-full gap-1 text-sm font-mono")
 
     def _picked(self, place: np.ndarray) -> None:
         picked = self._desk.opened.picked
+        if picked and np.array_equal(picked[-1], place):
+            return
         picked.append(place)
         del picked[:-2]
         self._view.mark(picked)

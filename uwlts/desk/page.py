@@ -9,13 +9,20 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from uwlts.desk.board import Board, Line, Picture
+from uwlts.desk.board import KEPT_LINES, Board, LaserState, Line, Picture
 from uwlts.desk.cloud_view import CloudView
 from uwlts.desk.thinned_cloud import FIELDS
 
 _REFRESH_S = 0.2
+_LASER: dict[LaserState, tuple[str, str]] = {
+    "none": ("no laser", "bg-slate-600"),
+    "off": ("laser off", "bg-green-700"),
+    "flashing": ("laser ON for images", "bg-red-600"),
+    "on": ("laser ON", "bg-red-600"),
+    "unknown": ("laser may be ON: switch its power off", "bg-red-600"),
+}
 _STYLE = """
-.desk { display: grid; gap: 10px; grid-template-columns: minmax(300px, 1fr) minmax(340px, 1.5fr) minmax(320px, 1fr);
+.desk { display: grid; gap: 10px; grid-template-columns: minmax(300px, 1fr) minmax(340px, 1.5fr) minmax(370px, 1fr);
   grid-template-rows: minmax(0, 1fr) 170px; grid-template-areas: "image cloud tools" "log log tools";
   height: calc(100vh - 84px); width: 100%; }
 .desk.looking { grid-template-columns: 1fr 1.6fr; grid-template-areas: "image cloud" "log log"; }
@@ -23,12 +30,13 @@ _STYLE = """
 .desk.guided { grid-template-columns: 1fr 1fr; grid-template-areas: "image cloud" "log log"; }
 @media (max-width: 1000px) {
   .desk, .desk.looking, .desk.guided { display: flex; flex-direction: column; height: auto; }
-  .cloud-view { height: 60vh !important; }
+  .cloud-view { min-height: 50vh; }
+  .image img { max-height: 45vh; }
   .desk .log { height: 200px; }
 }
 .image { grid-area: image; overflow: hidden; padding: 8px; display: flex; flex-direction: column; }
 .image img { width: 100%; min-height: 0; object-fit: contain; object-position: top; }
-.tools .q-tab { padding: 0 9px; }
+.tools .q-tab { padding: 0 6px; min-height: 40px; }
 .cloud { grid-area: cloud; display: flex; flex-direction: column; }
 .tools { grid-area: tools; overflow: auto; }
 .log { grid-area: log; overflow: auto; padding: 6px 10px; font-family: monospace; font-size: 13px; }
@@ -108,15 +116,14 @@ class BoardView:
     def refresh(self) -> None:
         """Show what has changed."""
         board = self._board
-        lit = board.laser
-        self._laser.set_text("laser ON" if lit else "no laser" if lit is None else "laser off")
-        self._laser.classes(
-            remove="bg-red-600 bg-green-700 bg-slate-600",
-            add="bg-red-600" if lit else "bg-slate-600" if lit is None else "bg-green-700",
-        )
+        text, colour = _LASER[board.laser]
+        self._laser.set_text(text)
+        self._laser.classes(remove=" ".join(each for _, each in _LASER.values()), add=colour)
         self._phase.set_text(_progress_text(board))
         progress = board.progress
         self._bar.set_value(progress.done / progress.total if progress.total else 0.0)
+        waiting = progress.busy and not progress.total
+        self._bar.props(add="indeterminate" if waiting else None, remove=None if waiting else "indeterminate")
         if board.pictures != self._pictures and (picture := board.picture) is not None:
             self._pictures = board.pictures
             self._image.props(f'src="picture.jpg?{self._pictures}"').set_visibility(True)
@@ -136,6 +143,8 @@ class BoardView:
             with self._log:
                 shown = ui.label(_line_text(line)).classes(line.kind)
             shown.move(target_index=0)
+            if len(self._log.default_slot.children) > KEPT_LINES:
+                self._log.remove(-1)
 
 
 def _progress_text(board: Board) -> str:
@@ -186,11 +195,12 @@ def timed(refresh: Callable[[], object]) -> None:
     ui.timer(_REFRESH_S, refresh)
 
 
-def laser_off_button(switch_off: Callable[[], None]) -> None:
-    """A button that works in every state; so does the key Escape."""
+def laser_off_button(switch_off: Callable[[], None], *, in_use: Callable[[], bool] = lambda: True) -> None:
+    """A button that works in every state; so does the key Escape while the laser is ``in_use``."""
 
     def pressed(event: KeyEventArguments) -> None:
-        if event.action.keydown and event.key.escape:
+        # It also closes menus, which must not reset a controller at rest.
+        if event.action.keydown and event.key.escape and in_use():
             switch_off()
 
     ui.button("Laser off", on_click=switch_off, icon="flash_off", color="red").props('size="lg"')

@@ -168,7 +168,7 @@ def watch(
                 count = number + 1
                 if isinstance(planned, int) and planned >= count:
                     board.count(count, planned, before=begun)
-            board.progress = replace(board.progress, phase="finished", left_s=None)
+            board.progress = replace(board.progress, phase="finished", left_s=None, busy=False)
             report(f"{path} is finished with {count} images; the page stays until Ctrl-C")
             threading.Event().wait()
         except KeyboardInterrupt:

@@ -5,11 +5,12 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
-from typing import Self
+from functools import cache
+from typing import Any, Self
 
 import uvicorn
 from fastapi import FastAPI
-from nicegui import ui
+from nicegui import Client, ui
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -21,15 +22,33 @@ _START_S = 30.0
 _PORTS = 100
 """Ports that are tried after the wanted one."""
 _LATEST = {"Cache-Control": "no-store"}
+_ALONE = threading.Lock()
+"""Held by the page that is served."""
+
+
+def _application(**settings: Any) -> FastAPI:
+    return FastAPI(openapi_url=None, docs_url=None, redoc_url=None, **settings)
+
+
+@cache
+def _nicegui() -> FastAPI:
+    """NiceGUI, of which a process has one; it shows what its ``state.show`` builds, of one page after another."""
+    app = _application()
+
+    def root(request: Request) -> None:
+        app.state.show(request)
+
+    ui.run_with(app, root=root, show_welcome_message=False, reconnect_timeout=10.0, language="en-US")
+    return app
 
 
 class DeskServer:
-    """A page that shows a board; served from construction on, until the ``with`` ends. One per process.
+    """A page that shows a board; served from construction on, until the ``with`` ends. One at a time.
 
     A browser finds it at its ``address``. Everybody who opens it there may look; controls are shown, and obeyed, at the
     ``operator_address``, which has a token. ``warning`` is what to say where the page can be seen from other machines.
     ``build`` adds what the page has besides the board, and is told whether for the operator. SetupError where no port
-    is free or the address is not one of this machine.
+    is free, the address is not one of this machine, or this process serves a page already.
     """
 
     def __init__(
@@ -42,36 +61,42 @@ class DeskServer:
     ):
         from uwlts.desk.page import build_board
 
-        access, self._app = PageAccess(host), FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+        self._access, nicegui = PageAccess(host), _nicegui()
+        self._app = _application(lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
+        # What nothing else answers, whenever that is added.
+        self._app.router.default = nicegui
 
-        def root(request: Request) -> None:
-            operator = access.is_operator(request.headers)
-            (build or build_board)(board, operator)
+        def show(request: Request) -> None:
+            ui.page_title(board.title)
+            (build or build_board)(board, self.is_operator(request))
 
-        ui.run_with(
-            self._app,
-            root=root,
-            title=board.title,
-            show_welcome_message=False,
-            reconnect_timeout=10.0,
-            language="en-US",
-        )
-        self._socket = _bound(host, port)
-        named = f"[{host}]" if ":" in host else host
-        self.address = f"http://{named}:{self._socket.getsockname()[1]}"
-        self.operator_address = f"{self.address}/?token={access.token}"
-        self.warning = None
-        if not is_local(host):
-            self.warning = (
-                f"everybody who reaches {host} in the network can see the page, and what is sent is not encrypted: "
-                "safer is the default host with `ssh -L`"
-            )
-        # Only errors: a browser that goes away in the middle of an answer is none.
-        config = uvicorn.Config(GuardedApp(self._app, access), log_level=logging.CRITICAL, ws_max_size=2**20)
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="page", daemon=True)
-        self._thread.start()
+        if not _ALONE.acquire(blocking=False):
+            raise SetupError("this program serves a page already: close that one first")
+        try:
+            self._socket = _bound(host, port)
+            named = f"[{host}]" if ":" in host else host
+            self.address = f"http://{named}:{self._socket.getsockname()[1]}"
+            self.operator_address = f"{self.address}/?token={self._access.token}"
+            self.warning = None
+            if not is_local(host):
+                self.warning = (
+                    f"everybody who reaches {host} in the network can see the page, and what is sent is not encrypted: "
+                    "safer is the default host with `ssh -L`"
+                )
+            self._open = True
+            nicegui.state.show = show
+            # Only errors: a browser that goes away in the middle of an answer is none.
+            config = uvicorn.Config(GuardedApp(self._app, self._access), log_level=logging.CRITICAL, ws_max_size=2**20)
+            self._server = uvicorn.Server(config)
+            self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="page", daemon=True)
+            self._thread.start()
+            self._await_start()
+        except BaseException:
+            _ALONE.release()
+            raise
+
+    def _await_start(self) -> None:
         started = threading.Event()
         deadline = _START_S
         while not self._server.started:
@@ -104,11 +129,22 @@ class DeskServer:
         """The application, to serve more than the board."""
         return self._app
 
+    def is_operator(self, request: Request) -> bool:
+        """Whether a request is the operator's."""
+        return self._access.is_operator(request.headers)
+
     def close(self) -> None:
         """End the page."""
+        if not self._open:
+            return
+        self._open = False
         self._server.should_exit = self._server.force_exit = True
         self._thread.join(_START_S)
         self._socket.close()
+        # A browser that still shows this page must not reach it through the next one.
+        for client in list(Client.instances.values()):
+            client.delete()
+        _ALONE.release()
 
     def __enter__(self) -> Self:
         return self

@@ -22,7 +22,7 @@ class ThinnedCloud:
 
     def _clear(self) -> None:
         self._table = np.empty((self._at_most, _COLUMNS))
-        self._count, self._stride, self.total = 0, 1, 0
+        self._count, self._added, self._stride, self.total = 0, 0, 1, 0
 
     def clear(self) -> None:
         """Begin anew without points."""
@@ -30,11 +30,12 @@ class ThinnedCloud:
             self._clear()
             self.version += 1
 
-    def add(self, points_mm: np.ndarray, **fields: np.ndarray | None) -> None:
-        """Add points (N, 3) with fields (N,), by the names in `FIELDS`."""
+    def add(self, points_mm: np.ndarray, of: int | None = None, **fields: np.ndarray | None) -> None:
+        """Add points (N, 3), a part ``of`` so many, with fields (N,), by the names in `FIELDS`."""
         with self._lock:
-            first = -self.total % self._stride
-            self.total += len(points_mm)
+            first = -self._added % self._stride
+            self._added += len(points_mm)
+            self.total += len(points_mm) if of is None else of
             kept = slice(first, None, self._stride)
             table = np.full((len(points_mm[kept]), _COLUMNS), np.nan)
             table[:, :3] = points_mm[kept]

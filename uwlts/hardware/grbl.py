@@ -315,12 +315,18 @@ class GrblStage:
             self._recover()
         return self.position_mm()
 
-    def darken(self) -> None:
+    @property
+    def laser_unreachable(self) -> bool:
+        """Whether the last command to switch the laser off could not be sent."""
+        return self._line.unreachable
+
+    def darken(self) -> bool:
         """Switch the laser off from any thread, whatever the stage does: by Ctrl-X, which also stops a movement.
 
-        What is under way fails at its next exchange with the controller; then `unlock` where nothing moved, or `home`.
+        Returns whether the command could be sent. What is under way fails at its next exchange with the controller;
+        then `unlock` where nothing moved, or `home`.
         """
-        self._line.darken()
+        return self._line.darken()
 
     def close(self, error: BaseException | None = None) -> None:
         """Switch the laser off and close the port; HardwareError where the controller does not confirm."""
