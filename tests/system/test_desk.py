@@ -22,7 +22,7 @@ from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -84,6 +84,7 @@ def page(desk: Desk, chromium: "Browser") -> "Iterator[Page]":
         opened.set_default_timeout(SLOW_MS)
         opened.goto(desk.operator_address)
         yield opened
+        print(opened.locator("header").inner_text(), opened.locator(".log").inner_text(), sep="\n")
 
 
 class watched:
@@ -136,6 +137,24 @@ def connected(page: "Page") -> None:
 
 def dark(served: ServedTwin) -> bool:
     return within(1.0, lambda: not served.controller.state().laser_on)
+
+
+def write_scan(path: Path, sensor_file: Path) -> None:
+    """A capture with three images of noise."""
+    sensor = uwlts.load_sensor(sensor_file)
+    header = CaptureHeader(
+        name="old",
+        sensor=sensor,
+        medium_name="air",
+        medium=sensor.medium("air"),
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=sensor.detector.full_scale_dn(),
+    )
+    rng = np.random.default_rng(0)
+    with CaptureWriter(path, header, dtype=np.dtype(np.uint8)) as writer:
+        for k in range(3):
+            image = rng.integers(3, 9, (sensor.camera.height_px, sensor.camera.width_px), np.uint8)
+            writer.append(Frame(image, float(k), False, 1.0, float(k)))
 
 
 def kept(page: "Page", name: str) -> None:
@@ -266,6 +285,44 @@ def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page,
     assert not served.controller.state().laser_on
 
 
+def test_a_camera_whose_cable_is_pulled_ends_the_scan_and_is_connected_again(desk, page, served):
+    connected(page)
+    tab(page, "Scan")
+    page.get_by_label("positions").fill("16")
+    press(page, "start")
+    shows(page, "of 16")
+    served.camera.disconnect()
+    try:
+        says(page, "check power and cable")
+        assert dark(served)
+    finally:
+        served.camera.connect()
+    tab(page, "Connect")
+    press(page, "connect")
+    page.locator(".log").get_by_text("connected: Grbl").nth(1).wait_for()
+    tab(page, "Stage")
+    press(page, "home")
+    page.locator(".log").get_by_text("homing done").nth(1).wait_for()
+    tab(page, "Scan")
+    press(page, "continue interrupted")
+    says(page, "wrote scan.h5")
+    with Capture(desk.folder / "scan.h5") as scan:
+        assert len(scan) == 16
+
+
+def test_a_recorded_capture_is_shown_like_a_camera(desk, page, folder):
+    sensor_file = desk.folder / "sensor.toml"
+    write_scan(desk.folder / "old.h5", sensor_file)
+    page.get_by_label("camera").fill(f"replay:{desk.folder / 'old.h5'}")
+    page.get_by_label("stage").fill("")
+    tab(page, "Connect")
+    press(page, "connect")
+    says(page, "no stage is connected")
+    page.locator('img[src^="picture.jpg"]').wait_for()
+    says(page, "all 3 images of")
+    shows(page, "no laser")
+
+
 def test_viewers_look_and_have_no_control(desk, page, chromium, served):
     connected(page)
     with watched(chromium.new_page()) as other:
@@ -282,7 +339,7 @@ def test_viewers_look_and_have_no_control(desk, page, chromium, served):
         assert other.locator(".log").get_by_text("by hand").count() == 0
 
 
-def test_mistakes_are_said_and_cost_nothing(desk, page):
+def test_mistakes_are_said_and_cost_nothing(desk, page, served):
     tab(page, "Scan")
     assert page.get_by_role("button", name="start", exact=True).is_disabled()
     tab(page, "Connect")
@@ -291,8 +348,9 @@ def test_mistakes_are_said_and_cost_nothing(desk, page):
     says(page, "error: ")
     shows(page, "not connected")
     page.get_by_label("camera").fill("")
-    tab(page, "Stage")
-    tab(page, "Connect")
+    press(page, "connect")
+    says(page, "give the camera's address")
+    page.get_by_label("camera").fill(served.camera.address)
     (desk.folder / "taken.h5").write_bytes(b"a capture")
     connected(page)
     tab(page, "Scan")

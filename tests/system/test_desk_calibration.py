@@ -47,4 +47,5 @@ def test_a_guided_calibration_is_led_through_and_calculated(plan, served, chromi
         page.close()
     finally:
         desk.send_signal(signal.SIGINT)
-        assert desk.wait(60) == 0
+        with desk:
+            assert desk.wait(60) == 0

@@ -1,4 +1,4 @@
-"""Access control of the page: requests of other sites are refused, and one operator's clicks count.
+"""Access control of the page: requests of other sites are refused, and only the operator's clicks count.
 
 The rules stand in front of the whole application (ASGI), so that they hold for pages, files and the connection by which
 browsers send clicks. Who only looks gets a page without a single control, so there is nothing of his to obey.

@@ -43,11 +43,13 @@ _WAITING = 64
 """Images that wait to be shown while a scan goes on; more are recorded, and not shown."""
 
 
+_MOST_LOST = 2
+"""Images in a row that may be lost without an end of the live image."""
 _EARLIER = 200
 """Images of an interrupted scan that are shown again when it is continued."""
 
 
-class State(StrEnum):
+class InstrumentState(StrEnum):
     """What the instrument does; it decides which buttons make sense."""
 
     DISCONNECTED = "not connected"
@@ -75,11 +77,11 @@ class Instrument:
         self._work: queue.Queue[Callable[[], None]] = queue.Queue()
         self._connected: _Connected | None = None
         self._ending, self._paused, self._stop = threading.Event(), threading.Event(), threading.Event()
-        self.state = State.DISCONNECTED
+        self.state = InstrumentState.DISCONNECTED
         self.light: Light | None = None
         self._screen: BoardScreen | None = None
         self._rig: Rig | None = None
-        self._darkened = False
+        self._darkened, self._lost = False, 0
         self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
         self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
         self._thread.start()
@@ -109,11 +111,11 @@ class Instrument:
     @property
     def laser_in_use(self) -> bool:
         """Whether the laser is lit now and then, or may be."""
-        return self._board.laser in ("on", "flashing") or self.state in (State.SCANNING, State.BUSY)
+        return self._board.laser in ("on", "flashing") or self.state in (InstrumentState.SCANNING, InstrumentState.BUSY)
 
     def pause(self) -> None:
         """Wait, with the laser off, after the image that is being taken."""
-        if self.state == State.SCANNING:
+        if self.state == InstrumentState.SCANNING:
             self._paused.set()
 
     def resume(self) -> None:
@@ -129,9 +131,9 @@ class Instrument:
 
     # What waits for its turn.
 
-    def connect(self, plan: ScanPlan, *, camera: str | None, stage: str | None) -> None:
+    def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
         """Open the camera and the stage, where addresses are given, of a plan's sensor."""
-        self._ask(lambda: self._connect(plan, camera or None, stage or None))
+        self._ask(lambda: self._connect(plan, camera, stage))
 
     def disconnect(self) -> None:
         """Close both."""
@@ -172,7 +174,7 @@ class Instrument:
             screen.press(answer)
 
     def close(self) -> None:
-        """End everything; the laser goes off."""
+        """End everything; the laser goes off. Without effect the second time."""
         self._ending.set()
         self.stop()
         self._ask(lambda: None)
@@ -212,13 +214,13 @@ class Instrument:
     def _settle_state(self) -> None:
         connected, board = self._connected, self._board
         if connected is None:
-            self.state = State.DISCONNECTED
+            self.state = InstrumentState.DISCONNECTED
         elif isinstance(connected.stage, GrblStage) and not connected.stage.position_known:
             self._rig = None
-            self.state = State.LOCKED
+            self.state = InstrumentState.LOCKED
         else:
-            self.state = State.READY
-        how_it_ended = self.state == State.READY and board.progress.phase in ("finished", "stopped")
+            self.state = InstrumentState.READY
+        how_it_ended = self.state == InstrumentState.READY and board.progress.phase in ("finished", "stopped")
         if board.progress.phase != self.state and not how_it_ended:
             board.phase(self.state, busy=False)
         self._show_laser()
@@ -232,25 +234,24 @@ class Instrument:
         elif stage.laser_power > 0:
             self._board.laser = "on"
         else:
-            self._board.laser = "flashing" if self.light == "laser" or self.state == State.SCANNING else "off"
+            self._board.laser = "flashing" if self.light == "laser" or self.state == InstrumentState.SCANNING else "off"
 
     def _begin(self, phase: str) -> _Connected:
         if self._connected is None:
             raise HardwareError("nothing is connected: connect a camera first")
-        self.state = State.BUSY
+        self.state = InstrumentState.BUSY
         self._board.phase(phase)
         return self._connected
 
-    def _connect(self, plan: ScanPlan, camera: str | None, stage: str | None) -> None:
+    def _connect(self, plan: ScanPlan, camera: str, port: str | None) -> None:
         self._disconnect()
-        self.state = State.BUSY
+        self.state = InstrumentState.BUSY
         self._board.phase("connecting")
-        address, port = camera or plan.camera, stage or plan.stage.port
-        if address is None:
+        if not camera:
             raise DescriptionError("give the camera's address, as in gige:NAME or replay:scan.h5")
         sensor = plan.described_sensor()
         with ExitStack() as stack:
-            opened = stack.enter_context(open_camera(address))
+            opened = stack.enter_context(open_camera(camera))
             check_camera(opened, sensor)
             moved: LaserStage = HandSwitchedLaser(self._board.say)
             if port is not None:
@@ -270,7 +271,10 @@ class Instrument:
         connected, self._connected, self._rig, self.light = self._connected, None, None, None
         if connected is not None:
             self._board.position_mm = None
-            connected.closing.close()
+            try:
+                connected.closing.close()
+            except Error as error:
+                self._board.say(str(error), "warning")
             self._board.say("disconnected")
 
     def _stage(self, connected: _Connected) -> GrblStage:
@@ -333,7 +337,15 @@ class Instrument:
         connected = self._connected
         if connected is None or connected.stage.faulty or (light := self._shown_light(connected)) is None:
             return
-        image, exposure_ms = self._rig_of(connected).image(light, self.exposure_ms[light])
+        try:
+            image, exposure_ms = self._rig_of(connected).image(light, self.exposure_ms[light])
+        except HardwareError:
+            # A busy computer loses frames now and then.
+            self._lost += 1
+            if self._lost > _MOST_LOST or connected.stage.faulty or not connected.camera.running:
+                raise
+            return
+        self._lost = 0
         seen = brightness(image, connected.sensor, light)
         full = connected.sensor.detector.full_scale_dn()
         pixels, caption = (
@@ -374,7 +386,7 @@ class Instrument:
                 board.phase(line)
 
         # The rig knows neither exposure nor place any more.
-        self.state, self._rig, kept_light = State.SCANNING, None, self.light
+        self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
         self._show_laser()
         try:
             with shown:
@@ -404,7 +416,7 @@ class Instrument:
     def _calibrate(self, plan: GuidedPlan, out: Path, resume: bool, overwrite: bool) -> None:
         self._disconnect()
         board = self._board
-        self.state = State.BUSY
+        self.state = InstrumentState.BUSY
         board.phase("guided calibration")
         screen = self._screen = BoardScreen(board)
         nobody = os.open(os.devnull, os.O_RDONLY)
@@ -430,11 +442,11 @@ class Instrument:
     def _between(self) -> None:
         """Between two images of a scan."""
         if self._paused.is_set():
-            self.state, before = State.PAUSED, self._board.progress
+            self.state, before = InstrumentState.PAUSED, self._board.progress
             self._board.say("paused, the laser is off")
             while self._paused.is_set():
                 time.sleep(0.05)
-            self.state, self._board.progress = State.SCANNING, before
+            self.state, self._board.progress = InstrumentState.SCANNING, before
         if self._stop.is_set():
             raise Ended
         self._show_laser()

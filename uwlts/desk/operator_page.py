@@ -3,7 +3,7 @@
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from uwlts.desk.board import Board
 from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
 from uwlts.desk.guided import answer_buttons
-from uwlts.desk.instrument import Instrument, State
+from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.page import BoardView, build_board, laser_off_button, timed
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.guided.plan import load_guided_plan
@@ -33,8 +33,8 @@ from uwlts.storage.files import refuse_unsuitable
 _LIST_S = 2.0
 _MOST_SHOWN = 300_000
 _JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)
-_FREE = (State.READY, State.LOCKED)
-_RUNNING = (State.SCANNING, State.PAUSED)
+_FREE = (InstrumentState.READY, InstrumentState.LOCKED)
+_RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
 
 
 @dataclass
@@ -46,7 +46,7 @@ class _Opened:
 
 
 def serve_desk(
-    folder: str | Path = ".",
+    folder: str | Path = Path(),
     *,
     plan: str | Path | None = None,
     host: str = "127.0.0.1",
@@ -80,19 +80,19 @@ def serve_desk(
         raise DescriptionError(f"there is no folder {place}: give one for captures and results")
     begun = None if plan is None else load_plan(Path(plan))
     board = Board(f"desk: {place.resolve().name}")
-    instrument = Instrument(board)
-    work = _Desk(place, board, instrument, None if plan is None else Path(plan), begun)
-    try:
+    with closing(Instrument(board)) as instrument:
+        work = _Desk(place, board, instrument, None if plan is None else Path(plan), begun)
         with DeskServer(board, build=work.build, host=host, port=port) as server:
-            work.serve_files(server)
-            report(f"open {server.operator_address} to work, {server.address} to look; Ctrl-C ends it")
-            if server.warning:
-                report(f"warning: {server.warning}")
-            threading.Event().wait()
-    except KeyboardInterrupt:
-        report("closed")
-    finally:
-        instrument.close()
+            try:
+                work.serve_files(server)
+                report(f"open {server.operator_address} to work, {server.address} to look; Ctrl-C ends it")
+                if server.warning:
+                    report(f"warning: {server.warning}")
+                threading.Event().wait()
+            except KeyboardInterrupt:
+                # Before the page, which may take its time.
+                instrument.close()
+                report("closed")
 
 
 class _Desk:
@@ -170,7 +170,7 @@ class _OperatorPage:
     def __init__(self, desk: _Desk):
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
         self._view = BoardView(desk.board, picked=self._picked)
-        self._only: list[tuple[ui.button, tuple[State, ...]]] = []
+        self._only: list[tuple[ui.button, tuple[InstrumentState, ...]]] = []
         self._files: tuple[object, ...] = ()
         self._exposed: tuple[object, float] | None = None
 
@@ -204,7 +204,9 @@ class _OperatorPage:
             self._measure_part,
         )
 
-    def _button(self, label: str, press: Callable[[], object], states: tuple[State, ...] | None = None) -> ui.button:
+    def _button(
+        self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
+    ) -> ui.button:
         """A button whose errors are shown; it can be pressed in some states only."""
 
         async def pressed() -> None:
@@ -243,20 +245,20 @@ class _OperatorPage:
         if begun is not None:
             self._fill(begun)
         with ui.row():
-            self._button("connect", self._connect, (State.DISCONNECTED, *_FREE))
+            self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
             self._button("disconnect", self._instrument.disconnect, _FREE).props("outline")
         ui.separator()
         ui.label("live image").classes("text-sm")
         with ui.row().classes("items-center"):
             self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
             self._light.on_value_change(lambda event: self._look(event.value))
-            self._button("find exposure", self._instrument.find_exposure, (State.READY,)).props("outline")
+            self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
         self._exposure = ui.number("exposure, ms", min=0.001, step=0.1, format="%.3g")
         self._exposure.on("change", self._expose)
         ui.label("With the laser's light the laser is lit only while an image is exposed.").classes("text-xs")
 
     def _choose(self) -> None:
-        if not self._plan.value:
+        if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
             return
         try:
             plan = load_plan(Path(self._plan.value))
@@ -276,7 +278,7 @@ class _OperatorPage:
         return self._desk.plan
 
     def _connect(self) -> None:
-        self._instrument.connect(self._chosen_plan(), camera=self._camera.value, stage=self._stage.value)
+        self._instrument.connect(self._chosen_plan(), camera=self._camera.value or "", stage=self._stage.value or None)
 
     def _look(self, light: str) -> None:
         self._instrument.light = None if light == "none" else "laser" if light == "laser" else "lamp"
@@ -296,12 +298,12 @@ class _OperatorPage:
         with ui.row().classes("gap-1"):
             for by in _JOGS_MM:
                 label = f"{by:+g}".replace("-", "−")
-                self._button(label, partial(self._instrument.jog, by), (State.READY,)).props(
+                self._button(label, partial(self._instrument.jog, by), (InstrumentState.READY,)).props(
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):
             place = ui.number("position, mm", value=0.0, format="%.3f")
-            self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (State.READY,))
+            self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (InstrumentState.READY,))
 
     # Calibrate
 
@@ -312,12 +314,12 @@ class _OperatorPage:
         self._calibration_name = ui.input("name of the calibration", value="calibration").classes("w-full")
         self._replace = ui.checkbox("replace an existing one")
         with ui.row():
-            self._button("begin", lambda: self._calibrate(resume=False), (State.DISCONNECTED, *_FREE))
-            self._button("go on with it", lambda: self._calibrate(resume=True), (State.DISCONNECTED, *_FREE)).props(
-                "outline"
-            )
+            self._button("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
+            self._button(
+                "go on with it", lambda: self._calibrate(resume=True), (InstrumentState.DISCONNECTED, *_FREE)
+            ).props("outline")
         self._show_request = answer_buttons(self._board, self._instrument.answer)
-        self._button("stop", self._instrument.stop, (State.BUSY,)).props("color=warning")
+        self._button("stop", self._instrument.stop, (InstrumentState.BUSY,)).props("color=warning")
         self._view.coverage()
 
     def _calibrate(self, *, resume: bool) -> None:
@@ -342,11 +344,13 @@ class _OperatorPage:
         self._out = ui.input("name of the capture", value="scan").classes("w-full")
         self._overwrite = ui.checkbox("replace an existing capture")
         with ui.row():
-            self._button("start", lambda: self._record(resume=False), (State.READY,))
-            self._button("continue interrupted", lambda: self._record(resume=True), (State.READY,)).props("outline")
+            self._button("start", lambda: self._record(resume=False), (InstrumentState.READY,))
+            self._button("continue interrupted", lambda: self._record(resume=True), (InstrumentState.READY,)).props(
+                "outline"
+            )
         with ui.row():
-            self._button("pause", self._instrument.pause, (State.SCANNING,))
-            self._button("go on", self._instrument.resume, (State.PAUSED,))
+            self._button("pause", self._instrument.pause, (InstrumentState.SCANNING,))
+            self._button("go on", self._instrument.resume, (InstrumentState.PAUSED,))
             self._button("stop", self._instrument.stop, _RUNNING).props("color=warning")
         if self._desk.plan is not None:
             self._fill_scan(self._desk.plan)

@@ -18,7 +18,7 @@ from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board import Board
 from uwlts.model.errors import SetupError
 
-_START_S = 30.0
+_START_S, _END_S = 30.0, 5.0
 _PORTS = 100
 """Ports that are tried after the wanted one."""
 _LATEST = {"Cache-Control": "no-store"}
@@ -139,7 +139,7 @@ class DeskServer:
             return
         self._open = False
         self._server.should_exit = self._server.force_exit = True
-        self._thread.join(_START_S)
+        self._thread.join(_END_S)
         self._socket.close()
         # A browser that still shows this page must not reach it through the next one.
         for client in list(Client.instances.values()):

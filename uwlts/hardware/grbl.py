@@ -124,9 +124,10 @@ class GrblStage:
         return self.position_mm()
 
     def _recover(self) -> None:
-        if self._line.fault is None and not self._held:
+        line = self._line
+        if line.fault is None and not self._held and not line.darkened_by_hand:
             return
-        self._position_known = self._position_known and self._line.fault is None
+        self._position_known = self._position_known and line.fault is None and not line.darkened_by_hand
         self._power, self._timed_speed, self._held = 0.0, 0.0, False
         self._line.restart()
         # A reset that met a movement leaves an alarm behind.

@@ -252,7 +252,7 @@ class GrblLine:
         self._serial = _open(port, baud)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
-        self._darken, self._writing, self.unreachable = False, threading.Lock(), False
+        self.darkened_by_hand, self._writing, self.unreachable = False, threading.Lock(), False
         try:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
@@ -393,7 +393,7 @@ class GrblLine:
 
         Nothing else is sent until `restart`: what is under way fails at its next exchange.
         """
-        self._darken = True
+        self.darkened_by_hand = True
         # Not for long: a write that hangs must not hold it up.
         held = self._writing.acquire(timeout=_HUNG_WRITE_S)
         try:
@@ -411,7 +411,7 @@ class GrblLine:
 
     def restart(self) -> None:
         """Reset by Ctrl-X: the laser goes off and a fault is over; the position is kept only if nothing moved."""
-        self._darken = False
+        self.darkened_by_hand = False
         self._reset()
         # After an alarm there may be a greeting more, which must not look like a restart of its own.
         while self._read_line(time.monotonic() + _QUIET_S) is not None:
@@ -437,7 +437,7 @@ class GrblLine:
         # What the guard's reset makes the controller say would be taken for a fault of the controller.
         if self._told_dark():
             what = _STOOD_STILL
-        elif self._darken:
+        elif self.darkened_by_hand:
             what = _ASKED_TO_DARKEN
         self.fault = what
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
@@ -476,14 +476,14 @@ class GrblLine:
             raise HardwareError(f"the stage on {self.port} is closed: open it again")
         if self.fault is not None:
             raise HardwareError(f"the stage on {self.port} has stopped after a fault: {self.fault}; home or unlock it")
-        if self._darken:
+        if self.darkened_by_hand:
             raise self.failed(_ASKED_TO_DARKEN)
 
     def _write(self, data: bytes) -> None:
         try:
             with self._writing:
                 # Behind the Ctrl-X of another thread a command would light the laser again.
-                if self._darken:
+                if self.darkened_by_hand and data != SOFT_RESET:
                     raise self.failed(_ASKED_TO_DARKEN)
                 self._serial.write(data)
         except OSError as error:
