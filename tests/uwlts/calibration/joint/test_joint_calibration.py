@@ -169,6 +169,10 @@ def test_every_derivative_is_what_differences_say(view, kind):
     assert sum(len(part.values) for part in found) >= 30
     assert max(np.abs(part.values).max() for part in found) < 1e-8
     assert_derivatives(evidence, parameters, global_values, local, within=1e-5)
+    # What is known before is linear, and of none of these other than zero.
+    off, by_local = evidence.known_before(local, BUILT.uncertainty)
+    assert len(off) == (len(local) - 6 if kind is TargetEvidence else 0)
+    assert by_local @ local == pytest.approx(off, rel=1e-12)
 
 
 def _without_residuals(evidence, parts):
@@ -279,6 +283,19 @@ def test_outliers_do_not_count(in_water, thesis):
     moved = np.abs(result.estimate.values - clean.estimate.values) / np.sqrt(np.diag(clean.estimate.covariance))
     assert result.estimate.outliers >= 50
     assert moved.max() < 1.0
+
+
+def test_images_that_no_camera_explains_are_refused_and_the_worst_named(thesis):
+    """Points in waves of 4 px, in one image of 6; a thousandth of the focal length, 2.4 px, is allowed."""
+    air = target_series(BUILT, window=False, positions=AIR[::2], columns=13)
+
+    def off(number, image):
+        return (6.0 if number == 3 else 4.0) * np.sin(image.pixels[:, ::-1] / 30.0)
+
+    images = [replace(each, pixels=each.pixels + off(number, each)) for number, each in enumerate(air.found.images)]
+    spoilt = replace(air, found=replace(air.found, images=images))
+    with pytest.raises(CalibrationError, match="no camera explains the target images in air: .* in target, frame 3: "):
+        solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
 
 
 def test_a_target_without_stripes_is_refused(in_water, thesis):

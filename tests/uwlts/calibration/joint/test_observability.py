@@ -116,6 +116,22 @@ def test_a_height_that_is_the_cause_is_named_though_it_moves_no_point():
     assert found[0].confused
 
 
+def test_what_changes_lengths_most_is_named_where_knowing_one_would_not_help():
+    """Five trade places, each a fifth of the direction; knowing the height would close a quarter of it."""
+    covariance = np.eye(6)
+    covariance[:5, 5] = covariance[5, :5] = 0.5 / np.sqrt(5)
+    names = keys("window_distance", "glass_index", "f", "cx", "cy", "height of the 23 mm step")
+    (found,) = weaknesses(lengths([[0.0100, 0.0098, 0.0096, 0.0094, 0.0092, 0.0]]), names, covariance)
+    assert found.parameters == tuple(names[:3])
+
+
+@pytest.mark.parametrize(("smaller_mm", "count"), [(0.006, 1), (0.007, 2)])
+def test_a_direction_of_less_than_a_tenth_of_the_variance_is_not_named(smaller_mm, count):
+    """Beside 0.02 mm, 0.006 mm are 8 % of the sum of squares, and 0.007 mm are 11 %."""
+    found = weaknesses(lengths([[0.02, 0.0], [0.0, smaller_mm]]), keys("window_distance", "f"), np.eye(2))
+    assert [each.cost_mm for each in found] == pytest.approx([0.02, smaller_mm][:count])
+
+
 def without(known, key):
     """The covariance where a parameter is known."""
     place = known.parameters.keys.index(key)

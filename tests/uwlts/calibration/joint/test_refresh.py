@@ -23,7 +23,7 @@ from uwlts.calibration.joint.stored_estimate import found_estimate, stored_estim
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import CalibrationError, DescriptionError, RangeError
-from uwlts.model.parameter_keys import MediumIndex, StepHeight, parameter_of
+from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, parameter_of
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
@@ -202,6 +202,34 @@ def test_evidence_without_information_leaves_everything_as_it_was(earlier, thesi
     off = (result.covariance[:count, :count] - known.covariance) / np.outer(std, std)
     assert np.abs(off).max() < 1e-5
     assert abs(result.values[-1] - 20.0) > 0.1
+
+
+def test_what_was_held_is_as_the_calibration_says(earlier):
+    """A bow of 1 deg and a window turned by 2 deg, known exactly: points as another calculation has them."""
+    joint, sheet = earlier.joint, earlier.sheet
+    held = {SheetParameter.BOW, SheetParameter.WINDOW_TURN}
+    kept = [place for place, key in enumerate(joint.parameters) if key not in held]
+    assert len(joint.parameters) - len(kept) == 2
+    fewer = {name: tuple(getattr(joint, name)[place] for place in kept) for name in ("parameters", "values", "std")}
+    covariance = tuple(map(tuple, joint.covariance_matrix()[np.ix_(kept, kept)].tolist()))
+    turned = sheet.fan.model_copy(update={"bow_rad": np.radians(1.0), "window_turn_rad": np.radians(2.0)})
+    calibration = earlier.model_copy(
+        update={
+            "joint": joint.model_copy(update=fewer | {"covariance": covariance}),
+            "sheet": sheet.model_copy(update={"fan": turned}),
+        }
+    )
+    known, pixels = found_estimate(calibration, WARM), np.array([[150.0, 480.0], [640.0, 520.0], [1100.0, 450.0]])
+    found = known.parameters.on_sheet(known.values, known.view, pixels).points
+    index, along = calibration.index_of(WARM), np.eye(3)[0]
+    frame = calibration.object_transform()
+
+    def expected(by):
+        return reconstruct_pixels(by, pixels, medium_index=index, stage_mm=0.0, stage_direction=along).points_mm
+
+    assert frame[:3, :3].T @ (found - frame[:3, 3:]) == pytest.approx(expected(calibration).T, abs=1e-6)
+    # A tenth of a millimetre is at stake.
+    assert np.abs(expected(calibration) - expected(earlier)).max() > 0.1
 
 
 def test_correlations_of_the_earlier_estimate_count(earlier, thesis):

@@ -119,6 +119,7 @@ def test_four_of_many_are_named():
         "the evidence contradicts itself: a; b; image 3 is off; image 4 is off; image 5 is off; c; and 2 more "
         "contradictions"
     )
+    assert Findings([*"abcdef"], {}, {}, []).refusal() == "the evidence contradicts itself: a; b; c; d; e; f"
 
 
 @pytest.mark.parametrize(("together", "wrong"), [(7.5, None), (8.5, False), (19.5, False), (20.5, True)])
@@ -209,11 +210,14 @@ def staged():
     ],
 )
 def test_a_stage_that_does_not_move_as_described_is_told(staged, tilt_deg, errors_mm, said):
-    """0.5 deg and 0.005 mm are stated: six of these are too much, three of the mean square of all positions."""
+    """0.5 deg and 0.005 mm are stated: six of these are too much, three of the mean square of all positions.
+
+    Also where other evidence, which has no stage, comes first.
+    """
     piece, local = staged
     local = np.concatenate([local[:6], [np.tan(np.radians(tilt_deg)), 0.0], errors_mm])
-    result, _ = estimate_of(local=[local], residuals=[[]])
-    found = findings(result, [piece], sensor=SENSOR).contradictions
+    result, other = estimate_of(local=[np.empty(0), local], residuals=[[], []])
+    found = findings(result, [*other, piece], sensor=SENSOR).contradictions
     assert len(found) == (0 if said is None else 1)
     assert all(words.startswith(said) for words in found)
 

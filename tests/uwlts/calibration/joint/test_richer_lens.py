@@ -1,0 +1,48 @@
+"""What a lens has besides the usual is estimated where that explains the evidence better: on little evidence, fast."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.virtual_sensors import altered
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.lens import LensChoice
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.model.parameter_keys import LensParameter
+
+BUILT = built_sensor()
+OPTIONS = CalibrationOptions(poses="stage", correct_circles=False, lens=LensChoice())
+
+
+def few_views(sensor, *, stripe_px):
+    """Four images of 49 points in air, and of each stripe every fourth point."""
+    noise = Noise(circles_px=0.03, stripe_px=stripe_px, stage_mm=0.003, rng=np.random.default_rng(8))
+    positions = np.linspace(-200.0, 60.0, 4)
+    series = target_series(sensor, window=False, positions=positions, noise=noise, columns=7)
+    return replace(series, found=replace(series.found, stripes=[pixels[::4] for pixels in series.found.stripes]))
+
+
+def test_a_lens_that_is_not_centred_is_found(thesis):
+    """Its points are off by pixels without p1; that k3 is given too happens by chance."""
+    lens = altered(BUILT, {"camera": {"distortion": {"p1": -0.005}}})
+    result = solve_jointly(gathered(thesis, [few_views(lens, stripe_px=0.1)]), options=OPTIONS)
+    assert any(said.startswith("the lens was given p1, p2") for said in result.warnings)
+    found = result.estimate.values[result.estimate.parameters.keys.index(LensParameter.P1)]
+    assert abs(found + 0.005) < 4.5 * result.estimate.std()[LensParameter.P1]
+
+
+def test_a_wrong_spacing_is_not_taken_for_pixels_that_are_not_square(thesis):
+    """Rows described 0.3 % too wide, and a stripe that is too noisy for any lens.
+
+    Pixels of another shape explain that somewhat better, but leave nearly the same scatter.
+    """
+    series = few_views(BUILT, stripe_px=1.8)
+    images = [replace(image, points_mm=image.points_mm * [1.003, 1.0, 1.0]) for image in series.found.images]
+    wide = replace(series, found=replace(series.found, images=images))
+    result = solve_jointly(gathered(thesis, [wide]), options=OPTIONS)
+    assert any("images show something that the model lacks" in said for said in result.warnings)
+    camera = result.calibration.camera
+    assert camera.fy_px / camera.fx_px == pytest.approx(1.0, abs=1e-12)
