@@ -559,8 +559,6 @@ def test_a_laser_that_is_lit_at_rest_goes_off_by_hand(controller, stage, at_most
     "exchange",
     [
         lambda stage: stage.position_mm(),
-        lambda stage: stage.unlock(),
-        lambda stage: stage.home(),
         lambda stage: stage.laser(True),
         lambda stage: stage.move_to(5.0, feed_mm_per_min=900.0),
     ],
@@ -578,6 +576,14 @@ def test_darkness_by_hand_is_met_at_the_next_exchange(controller, stage, exchang
     assert stage.faulty and not controller.state().laser_on
     assert stage.unlock() == 2.0
     assert stage.move_to(4.0, feed_mm_per_min=900.0) == 4.0
+
+
+def test_after_darkness_by_hand_the_stage_is_unlocked_or_homed_at_once(controller, stage):
+    for recover in (stage.unlock, stage.home):
+        stage.darken()
+        assert recover() == 2.0 and stage.position_known
+        assert stage.move_to(4.0, feed_mm_per_min=900.0) == 4.0
+        stage.move_to(2.0, feed_mm_per_min=900.0)
 
 
 @pytest.mark.parametrize("at_most_s", [None, 5.0])
