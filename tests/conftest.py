@@ -70,6 +70,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # These tests serve cameras and pages at fixed ports of this machine, or look for
 # what is served: only one of them can run at a time.
 SERVING = {
+    "test_desk.py",
+    "test_desk_calibration.py",
     "test_serve.py",
     "test_gige_camera.py",
     "test_calibrate_live.py",

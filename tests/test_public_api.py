@@ -14,7 +14,7 @@ import uwlts
 import uwlts.cli
 
 ROOT = Path(__file__).resolve().parents[1]
-HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "viser"}
+HEAVY = {"cv2", "scipy", "h5py", "mitsuba", "drjit", "matplotlib", "plotly", "optuna", "nicegui"}
 
 WRITES = {"out", "overwrite"}
 """Options of commands that write what their function returns."""
@@ -48,6 +48,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts verify": ("uwlts.verify", {"limit"}, {"limit_mm"}),
     "uwlts scan": ("uwlts.scan", set(), set()),
     "uwlts watch": ("uwlts.watch", set(), set()),
+    "uwlts desk": ("uwlts.serve_desk", set(), set()),
     "uwlts doctor": ("uwlts.examine", set(), set()),
     "twin simulate": ("twin.simulate", set(), {"show_progress"}),
     "twin serve": ("twin.serve", set(), set()),

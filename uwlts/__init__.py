@@ -12,9 +12,11 @@ if TYPE_CHECKING:
     from uwlts.calibration.model_comparison.comparison import Comparison, compare_models
     from uwlts.calibration.photographs import CameraCalibration, calibrate_camera, write_camera
     from uwlts.calibration.polynomial import PolynomialResult, calibrate_polynomials
+    from uwlts.desk.guided import record_guided
+    from uwlts.desk.operator_page import serve_desk
+    from uwlts.desk.recording_view import watch
     from uwlts.doctor import Finding, examine
-    from uwlts.hardware.guided.recording import GuidedRecording, record_guided
-    from uwlts.hardware.live_view import watch
+    from uwlts.hardware.guided.recording import GuidedRecording
     from uwlts.hardware.scanning import scan
     from uwlts.measurement.evaluation import Evaluation, evaluate, write_evaluation
     from uwlts.measurement.reconstruction import ScanCloud, reconstruct
@@ -88,6 +90,7 @@ __all__ = [
     "record_guided",
     "refresh",
     "scan",
+    "serve_desk",
     "verify",
     "watch",
     "write_calibration",
@@ -142,11 +145,12 @@ _MODULES = {
     "read_cloud": "uwlts.storage.cloud",
     "read_truth": "uwlts.storage.truth",
     "reconstruct": "uwlts.measurement.reconstruction",
-    "record_guided": "uwlts.hardware.guided.recording",
+    "record_guided": "uwlts.desk.guided",
     "refresh": "uwlts.calibration.joint.refresh",
     "scan": "uwlts.hardware.scanning",
+    "serve_desk": "uwlts.desk.operator_page",
     "verify": "uwlts.measurement.verification",
-    "watch": "uwlts.hardware.live_view",
+    "watch": "uwlts.desk.recording_view",
     "write_calibration": "uwlts.storage.calibration_file",
     "write_camera": "uwlts.calibration.photographs",
     "write_camera_page": "uwlts.report.camera_page",

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from twin.devices.gige_camera import GigeCamera
+from uwlts.desk.board import Board
+from uwlts.desk.recording_view import RecordingView, frames_of
 from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
-from uwlts.hardware.live_view import images_of
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
@@ -121,10 +122,16 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
     sensor = load_sensor("thesis")
     calibration = nominal_calibration(sensor, sensor.medium("air"))
     moments: list[float] = []
+    board, view = Board("bench"), None
     ready.set()
-    for seen in images_of(out, calibration):
+    for seen in frames_of(out):
         if seen is None:
             time.sleep(0.25)
-        elif len(seen.points_mm):
+            continue
+        header, number, frame = seen
+        view = view or RecordingView(board, header, calibration)
+        before = board.cloud.total
+        view.see(frame, number)
+        if board.cloud.total > before:
             moments.append(time.perf_counter())
     result.send((len(moments), (len(moments) - 1) / (moments[-1] - moments[0])))

@@ -9,10 +9,14 @@ import time
 import urllib.request
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from uwlts.hardware.live_view import images_of, look
+from uwlts.desk.board import Board
+from uwlts.desk.recording_view import RecordingView, frames_of
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
@@ -43,21 +47,68 @@ def write(path: Path, sensor: Sensor, images: list[tuple[np.ndarray, bool]]) -> 
             writer.append(Frame(image, float(k), laser_on, 1.0, float(k)))
 
 
+def seen(path: Path, number: int, calibration: AnyCalibration | None) -> Board:
+    """A board that shows one image of a recording."""
+    board = Board("live")
+    with Capture(path) as capture:
+        RecordingView(board, capture.header, calibration).see(capture[number], number)
+    return board
+
+
+def warnings(board: Board) -> str:
+    assert all(line.kind == "warning" for line in board.lines())
+    return "; ".join(line.text for line in board.lines())
+
+
 def test_an_image_shows_its_stripe_points_and_faults(thesis, tmp_path):
     dark = stripe_image(thesis, height_dn=0.0)
     images = [(stripe_image(thesis, height_dn=h), True) for h in (150.0, 12.0, 900.0)] + [(dark, True), (dark, False)]
     write(tmp_path / "live.h5", thesis, images)
     calibration = nominal_calibration(thesis, thesis.medium("water"))
-    with Capture(tmp_path / "live.h5") as capture:
-        good, faint, bright, empty, lamp = (look(capture, number, calibration) for number in range(5))
-    assert good.found == good.lines == 1280 and good.remarks == ()
+    good, faint, bright, empty, lamp = (seen(tmp_path / "live.h5", number, calibration) for number in range(5))
+    assert "image 1, laser" in good.picture.caption and "stripe on 1,280 of 1,280 profile lines" in good.picture.caption
+    assert warnings(good) == "" and good.picture.saturated == 0.0
     # On a row near the image's middle the stripe lies near the stand-off, all along one depth.
-    assert len(good.points_mm) == 1280 and np.abs(good.points_mm[:, 2]).max() < 20
-    assert good.picture.ndim == 3 and (good.picture == (255, 60, 40)).all(axis=2).any()
-    assert any("faint" in remark for remark in faint.remarks)
-    assert any("saturated" in remark for remark in bright.remarks)
-    assert any("hardly any stripe" in remark for remark in empty.remarks) and len(empty.points_mm) == 0
-    assert not lamp.laser_on and lamp.lines == 0 and lamp.remarks == ()
+    points = good.cloud.points()
+    assert len(points) == 1280 and np.abs(points[:, 2]).max() < 20
+    assert points[:, 3] == pytest.approx(150, abs=20)
+    picture = cv2.imdecode(np.frombuffer(good.picture.jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
+    red = picture[..., 2] - picture[..., 0] > 50
+    # Row 500 of 1024, shown at 1000 / 1280 of its size; a JPEG spreads colours over some rows and weakens them.
+    assert picture.shape == (800, 1000, 3) and np.abs(np.flatnonzero(red.any(axis=1)) - 500.3 / 1.28).max() < 3
+    assert red.any(axis=0).mean() > 0.99
+    assert "image 2: faint" in warnings(faint)
+    assert "image 3: saturated" in warnings(bright) and bright.picture.saturated > 0.9
+    assert "image 4: faint" in warnings(empty) and "image 4: hardly any stripe" in warnings(empty)
+    assert empty.cloud.total == 0
+    assert "lamp" in lamp.picture.caption and "stripe" not in lamp.picture.caption and warnings(lamp) == ""
+    assert lamp.position_mm == 4.0 and lamp.cloud.total == 0
+
+
+def test_a_warning_is_said_once_and_a_cloud_grows(thesis, tmp_path):
+    image, faint = stripe_image(thesis, height_dn=150.0), stripe_image(thesis, height_dn=12.0)
+    write(tmp_path / "live.h5", thesis, [(faint, True), (image, True), (faint, True), (image, True)])
+    board = Board("live")
+    with Capture(tmp_path / "live.h5") as capture:
+        view = RecordingView(board, capture.header, nominal_calibration(thesis, thesis.medium("water")), name="wall.h5")
+        totals = []
+        for number in range(4):
+            view.see(capture[number], number)
+            totals.append(board.cloud.total)
+    assert [line.text.split(":")[0] for line in board.lines()] == ["image 1"]
+    assert np.diff([0, *totals])[[1, 3]].tolist() == [1280, 1280] and board.pictures == 4
+    # The stage moves by 1 mm from image to image.
+    last = board.cloud.points()[-1280:, 0] - board.cloud.points()[totals[0] : totals[0] + 1280, 0]
+    np.testing.assert_allclose(last, 2.0, atol=0.01)
+    # The next recording begins anew.
+    RecordingView(board, header(thesis), None)
+    assert (board.cloud.total, board.cloud_name) == (0, "live")
+
+
+def test_without_a_calibration_the_stripe_is_shown_and_no_cloud(thesis, tmp_path):
+    write(tmp_path / "live.h5", thesis, [(stripe_image(thesis, height_dn=150.0), True)])
+    board = seen(tmp_path / "live.h5", 0, None)
+    assert "stripe on 1,280 of 1,280" in board.picture.caption and board.cloud.total == 0
 
 
 def test_a_recording_is_followed_while_it_grows(thesis, tmp_path):
@@ -73,16 +124,24 @@ def test_a_recording_is_followed_while_it_grows(thesis, tmp_path):
     recorder = threading.Thread(target=record)
     recorder.start()
     shown, pauses = [], 0
-    for seen in images_of(path, None):
-        if seen is None:
+    for following in frames_of(path):
+        if following is None:
             pauses += 1
             time.sleep(0.05)
         else:
-            shown.append((seen.number, path.exists()))
+            head, number, frame = following
+            assert head.name == "live" and frame.stage_mm == number
+            shown.append((number, path.exists()))
     recorder.join()
     assert [number for number, _ in shown] == list(range(6))
     # The first images were seen before the file was finished.
     assert not shown[0][1] and pauses >= 2
+
+
+def test_a_damaged_file_is_no_recording_to_wait_for(tmp_path):
+    (tmp_path / "live.h5").write_bytes(b"no capture")
+    with pytest.raises(CaptureError):
+        list(frames_of(tmp_path / "live.h5"))
 
 
 def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path):
@@ -103,7 +162,10 @@ def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path)
         else:
             pytest.fail(f"the command ended: {watching.stderr.read()}")
         with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as answer:
-            assert answer.status == 200 and b"<html" in answer.read().lower()
+            text = answer.read()
+            assert answer.status == 200 and b"<title>live.h5" in text and b"Laser off" not in text
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/picture.jpg", timeout=10) as answer:
+            assert answer.read().startswith(b"\xff\xd8")
         listening = Path("/proc/net/tcp").read_text().splitlines()[1:]
         ports = [
             row.split()[1] for row in listening if row.split()[3] == "0A" and row.split()[1].endswith(f"{port:04X}")

@@ -1,181 +1,447 @@
-"""Requests to a live page as browsers, other sites and bystanders send them: what is refused, whose clicks count."""
+"""Requests to a page as browsers, other sites and bystanders send them: what is refused, whose clicks count."""
 
+import html
 import http.client
+import json
+import re
+import signal
 import socket
-from collections.abc import Callable, Iterator
-from urllib.parse import parse_qs, urlsplit
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import parse_qs, urlencode, urlsplit
 
-import msgspec
+import numpy as np
 import pytest
-import viser
-from viser import _messages
+from nicegui import ui
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from tests.waiting import within
-from uwlts.hardware.guided.operator import GuidedPage
-from uwlts.hardware.live_view import LivePage
-from uwlts.hardware.page_access import PageAccess
+from uwlts.desk.access import PageAccess
+from uwlts.desk.board import Board, picture_of
+from uwlts.desk.guided import BoardScreen, answer_buttons
+from uwlts.desk.page import BoardView, laser_off_button, timed
+from uwlts.desk.server import DeskServer
+from uwlts.model.errors import SetupError
 
-Answer = tuple[int, dict[str, str]]
+SOCKET = "/_nicegui_ws/socket.io/"
+PROTECTION = {"X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 
 
-@pytest.fixture(scope="module")
-def page() -> Iterator[GuidedPage]:
-    opened = GuidedPage("guarded", port=18080)
+@dataclass(frozen=True)
+class Place:
+    """Where a page is found, and where its operator finds it."""
+
+    address: str
+    operator_address: str
+
+
+@dataclass(frozen=True)
+class Page(Place):
+    """A page with the controls of a guided calibration, and what was pressed on it."""
+
+    board: Board
+    screen: BoardScreen
+    server: DeskServer
+
+
+def guarded(title: str, **options: object) -> Page:
+    """Serve such a page."""
+    board = Board(title)
+    screen = BoardScreen(board)
+
+    def build(shown: Board, operator: bool) -> None:
+        view = BoardView(shown)
+        with view.header():
+            if operator:
+                laser_off_button(screen.laser_off)
+        with ui.element("main"):
+            view.image()
+            view.cloud()
+            view.log()
+            if operator:
+                answer_buttons(shown, screen.press)
+        timed(view.refresh)
+
+    server = DeskServer(board, build=build, **({"port": 0} | options))
+    return Page(server.address, server.operator_address, board, screen, server)
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    opened = guarded("guarded")
     yield opened
-    opened.close()
+    opened.server.close()
 
 
-def get(page: LivePage, path: str = "/", **headers: str) -> Answer:
-    """Status and headers of the answer to a raw request; ``Host`` replaces the page's own."""
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    headers: http.client.HTTPMessage
+    body: bytes
+
+
+def asked(page: Place, path: str = "/", *, method: str = "GET", **headers: str) -> Answer:
+    """Answer to a raw request; ``Host`` replaces the page's own."""
     place = urlsplit(page.address)
-    connection = http.client.HTTPConnection(place.hostname, place.port, timeout=5)
-    connection.putrequest("GET", path, skip_host="Host" in headers)
+    connection = http.client.HTTPConnection(place.hostname, place.port, timeout=20)
+    connection.putrequest(method, path, skip_host="Host" in headers)
     for name, value in headers.items():
         connection.putheader(name.replace("_", "-"), value)
     connection.endheaders()
     answer = connection.getresponse()
-    answer.read()
+    body = answer.read()
     connection.close()
-    return answer.status, dict(answer.headers)
+    return Answer(answer.status, answer.headers, body)
 
 
-def opened(page: LivePage, **headers: str) -> ClientConnection:
+def opened(page: Place, *, client: str = "", **headers: str) -> ClientConnection:
+    """The connection by which a browser's page sends its clicks, that of a ``client`` if given."""
     place, origin = urlsplit(page.address), headers.pop("Origin", None)
+    query = {"EIO": 4, "transport": "websocket"}
+    if client:
+        query |= {"client_id": client, "next_message_id": 0, "implicit_handshake": "true"}
+        # One tab, which may come back.
+        query |= {"tab_id": client, "document_id": str(uuid.uuid4())}
     return connect(
-        f"ws://{headers.pop('Host', place.netloc)}",
-        sock=socket.create_connection((place.hostname, place.port), timeout=5),
-        subprotocols=[f"viser-v{viser.__version__}"],
+        f"ws://{headers.pop('Host', place.netloc)}{SOCKET}?{urlencode(query)}",
+        sock=socket.create_connection((place.hostname, place.port), timeout=20),
         origin=origin,
         additional_headers=headers,
     )
 
 
-def cookie(page: LivePage) -> str:
-    status, headers = get(page, page.operator_address.removeprefix(page.address))
-    assert status == 303 and headers["Location"] == "/"
-    assert "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
-    return headers["Set-Cookie"].split(";")[0]
+def cookie(page: Place) -> str:
+    answer = asked(page, page.operator_address.removeprefix(page.address))
+    assert answer.status == 303 and answer.headers["Location"] == "/"
+    assert "HttpOnly" in answer.headers["Set-Cookie"] and "SameSite=strict" in answer.headers["Set-Cookie"]
+    return answer.headers["Set-Cookie"].split(";")[0]
 
 
-def port(page: LivePage) -> int:
-    return page.server.get_port()
+def port(page: Place) -> int:
+    return urlsplit(page.address).port
+
+
+class Browser:
+    """The page as a browser has it: its elements, and a connection that sends clicks."""
+
+    def __init__(self, page: Place, **headers: str):
+        text = asked(page, **headers).body.decode()
+        self.client = re.search(r"'client_id': '([0-9a-f-]{36})'", text)[1]
+        elements = re.search(r"parseElements\(String\.raw`(.*?)`\)", text, re.DOTALL)[1]
+        self.elements: dict[str, dict] = json.loads(html.unescape(elements))
+        self.place, self._headers = page, headers
+
+    def buttons(self) -> dict[str, tuple[int, str]]:
+        """Buttons by their labels: number and listener."""
+        return {
+            element["props"]["label"]: (int(number), element["events"][0]["listener_id"])
+            for number, element in self.elements.items()
+            if element["tag"] == "q-btn"
+        }
+
+    def open(self) -> str:
+        """Connect; the server's answer, which begins with 40 where it knows the page."""
+        self.connection = opened(self.place, client=self.client, Origin=self.place.address, **self._headers)
+        assert self.connection.recv(timeout=20).startswith("0{")
+        self.connection.send("40")
+        return self.connection.recv(timeout=20)
+
+    def __enter__(self) -> "Browser":
+        assert self.open().startswith("40{")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.connection.close()
+
+    def click(self, button: tuple[int, str], *, client: str = "") -> None:
+        """Send a click on a button, of this browser's page or, forged, of another client's."""
+        number, listener = button
+        event = {"id": number, "client_id": client or self.client, "listener_id": listener, "args": []}
+        self.connection.send(f"42{json.dumps(['event', event])}")
+
+
+def pressed(page: Page) -> bool:
+    """Whether a button was pressed on a machine however busy."""
+    return within(20.0, lambda: page.screen.answer() == "take")
+
+
+def ever_pressed(page: Page) -> bool:
+    """Whether a button was pressed where none must be: what is obeyed is obeyed within some ms."""
+    return within(1.0, lambda: page.screen.answer() is not None)
+
+
+# Who may reach it
 
 
 def test_the_page_itself_is_shown_to_this_machine(page):
     for host in ("127.0.0.1", "localhost", "[::1]"):
-        status, headers = get(page, Host=f"{host}:{port(page)}")
-        assert status == 200 and headers["X-Frame-Options"] == "DENY"
+        assert asked(page, Host=f"{host}:{port(page)}").status == 200
     # The page's own address, another one by port forwarding.
-    assert get(page, Origin=page.address)[0] == 200
-    assert get(page, Host="localhost:9000", Origin="http://localhost:9000")[0] == 200
+    assert asked(page, Origin=page.address).status == 200
+    assert asked(page, Host="localhost:9000", Origin="http://localhost:9000").status == 200
+    with opened(page, Host="localhost:9000", Origin="http://localhost:9000") as connection:
+        assert connection.recv(timeout=20).startswith("0{")
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "127.0.0.1.evil.example", "192.168.1.7", "", "localhost@evil.example"]
 )
 def test_another_host_is_refused(page, host):
-    assert get(page, Host=f"{host}:{port(page)}")[0] == 403
+    for path in ("/", "/picture.jpg", "/cloud", f"{SOCKET}?EIO=4&transport=polling"):
+        assert asked(page, path, Host=f"{host}:{port(page)}").status == 403
     with pytest.raises(InvalidStatus, match="403"):
         opened(page, Host=f"{host or 'x'}:{port(page)}".replace("@", "."))
 
 
+def test_a_request_with_no_host_or_two_is_refused(page):
+    for hosts in ([], [f"127.0.0.1:{port(page)}", "evil.example"]):
+        with socket.create_connection(("127.0.0.1", port(page)), timeout=20) as line:
+            line.sendall("".join(["GET / HTTP/1.0\r\n", *(f"Host: {host}\r\n" for host in hosts), "\r\n"]).encode())
+            assert line.recv(100).split()[1] in (b"403", b"400")
+
+
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://localhost:3000", "null", "file://"])
 def test_another_origin_is_refused(page, origin):
-    assert get(page, Origin=origin)[0] == 403
     # With the operator's cookie too: that is what a forged request would have.
-    with pytest.raises(InvalidStatus, match="403"):
-        opened(page, Origin=origin, Cookie=cookie(page))
+    for headers in ({}, {"Cookie": cookie(page)}):
+        assert asked(page, Origin=origin, **headers).status == 403
+        for method in ("GET", "POST"):
+            polling = f"{SOCKET}?EIO=4&transport=polling"
+            assert asked(page, polling, method=method, Origin=origin, **headers).status == 403
+        with pytest.raises(InvalidStatus, match="403"):
+            opened(page, Origin=origin, **headers)
 
 
 def test_another_site_can_link_to_the_page_but_not_load_it(page):
-    assert get(page, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")[0] == 200
-    assert get(page, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="no-cors")[0] == 403
+    assert asked(page, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate").status == 200
+    for path in ("/", "/picture.jpg", "/cloud"):
+        assert asked(page, path, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="no-cors").status == 403
+
+
+def test_no_answer_can_be_framed_or_tells_the_address(page):
+    static = re.search(r'src="(/_nicegui/[^"]+)"', asked(page).body.decode())[1]
+    answers = [asked(page, path) for path in ("/", "/picture.jpg", "/coverage.png", "/cloud", "/elsewhere", static)]
+    answers += [asked(page, "/?token=wrong"), asked(page, Origin="http://evil.example")]
+    answers += [asked(page, page.operator_address.removeprefix(page.address))]
+    assert [answer.status for answer in answers] == [200, 204, 204, 200, 200, 200, 403, 403, 303]
+    for answer in answers:
+        assert {name: answer.headers[name] for name in PROTECTION} == PROTECTION
 
 
 def test_a_wrong_token_is_refused_and_the_right_one_does_not_lead_elsewhere(page):
-    assert get(page, "/?token=wrong")[0] == 403
     token = parse_qs(urlsplit(page.operator_address).query)["token"][0]
-    status, headers = get(page, f"//evil.example?token={token}")
-    assert status == 303 and headers["Location"] == "/evil.example"
+    assert len(token) >= 20
+    for wrong in ("wrong", token[:-1], f"{token}x", "", f"{token}&token={token}", "%ff"):
+        answer = asked(page, f"/?token={wrong}&shown=1")
+        assert answer.status in (200, 403) and "Set-Cookie" not in answer.headers
+        assert b"Laser off" not in answer.body
+    assert asked(page, "/?token=wrong").status == 403
+    answer = asked(page, f"//evil.example?token={token}")
+    assert answer.status == 303 and answer.headers["Location"] == "/evil.example"
 
 
-CAMERA = _messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 10.0, 480, 640, (0, 0, 1), (0, 1, 0))
+# Who may press
 
 
-def send(connection: ClientConnection, message: _messages.Message) -> None:
-    connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+def test_only_the_operator_has_controls(page):
+    bystander, operator = Browser(page), Browser(page, Cookie=cookie(page))
+    assert set(bystander.buttons()) == {"fit"}
+    assert set(operator.buttons()) == {"fit", "Laser off", "take", "skip", "done"}
+    # No key either.
+    tags = [element["tag"] for element in bystander.elements.values()]
+    assert "nicegui-keyboard" not in tags and "nicegui-keyboard" in [e["tag"] for e in operator.elements.values()]
 
 
-def soon(condition: Callable[[], bool]) -> bool:
-    """Whether a condition comes true on a machine however busy."""
-    return within(20.0, condition)
+def test_the_operators_clicks_are_obeyed_and_no_bystanders_are(page):
+    operator = Browser(page, Cookie=cookie(page))
+    take, off = (operator.buttons()[label] for label in ("take", "Laser off"))
+    with Browser(page) as bystander:
+        # As if he knew the buttons: in his own page, and in one that he made up.
+        for button in (take, off):
+            bystander.click(button)
+            bystander.click(button, client=str(uuid.uuid4()))
+        assert not ever_pressed(page)
+        with operator:
+            assert not ever_pressed(page)
+            operator.click(take)
+            assert pressed(page)
+            assert page.board.lines() == []
+            operator.click(off)
+            assert within(20.0, lambda: "no laser is connected" in "".join(line.text for line in page.board.lines()))
 
 
-def ever(condition: Callable[[], bool]) -> bool:
-    """Whether a condition comes true that must not: what is obeyed is obeyed within some ms."""
-    return within(1.0, condition)
+def test_what_is_said_reaches_everybody(page):
+    bystander = Browser(page)
+    with bystander:
+        page.board.say("as loud as <b>this</b>", "warning")
+        assert within(20.0, lambda: "as loud as" in bystander.connection.recv(timeout=20))
 
 
-def button_of(page: LivePage) -> str:
-    """The latest client's button."""
-    client = page.server.get_clients()[max(page.server.get_clients())]
-    assert soon(lambda: len(client.gui._gui_input_handle_from_uuid) == 1)
-    (uuid,) = client.gui._gui_input_handle_from_uuid
-    return uuid
-
-
-def test_only_the_operator_has_a_button_and_only_the_latest_one_is_obeyed(page):
-    with opened(page, Origin=page.address) as bystander:
-        # What is shown reaches everybody.
-        assert bystander.recv(timeout=5)
-        send(bystander, CAMERA)
-        assert not ever(lambda: bool(page.server.get_clients()))
-        with opened(page, Origin=page.address, Cookie=cookie(page)) as operator:
-            send(operator, CAMERA)
-            assert soon(lambda: len(page.server.get_clients()) == 1)
-            click = _messages.GuiUpdateMessage(button_of(page), {"value": True})
-            send(bystander, click)
-            assert not ever(page.pressed)
-            send(operator, click)
-            assert soon(page.pressed)
-            with opened(page, Origin=page.address, Cookie=cookie(page)) as again:
-                send(again, CAMERA)
-                assert soon(lambda: len(page.server.get_clients()) == 2)
-                send(operator, click)
-                assert not ever(page.pressed)
-                send(again, _messages.GuiUpdateMessage(button_of(page), {"value": True}))
-                assert soon(page.pressed)
-
-
-def test_a_cookie_with_another_token_is_no_operators(page):
+@pytest.mark.parametrize("value", ["wrong", "", '""', "é"])
+def test_a_cookie_with_another_token_is_no_operators(page, value):
     name = cookie(page).split("=")[0]
-    with opened(page, Cookie=f"{name}=wrong") as bystander:
-        send(bystander, CAMERA)
-        assert not ever(lambda: bool(page.server.get_clients()))
+    assert set(Browser(page, Cookie=f"{name}={value}").buttons()) == {"fit"}
 
 
-def test_nothing_is_shared_by_way_of_the_internet(page):
-    with opened(page, Cookie=cookie(page)) as operator:
-        send(operator, _messages.ShareUrlRequest())
-        assert not ever(lambda: page.server._share_tunnel is not None)
-    assert page.server.request_share_url() is None
+def test_another_pages_cookie_is_no_operators(page):
+    kept = cookie(page)
+    page.server.close()
+    later = guarded("later")
+    try:
+        assert set(Browser(later, Cookie=kept).buttons()) == {"fit"}
+        token = kept.partition("=")[2]
+        assert asked(later, f"/?token={token}").status == 403
+    finally:
+        later.server.close()
+
+
+def test_everything_comes_from_this_machine(page):
+    text = asked(page, Cookie=cookie(page)).body.decode()
+    named = re.findall(r'(?:src|href)="([^"]*)"', text) + re.findall(r'from "([^"]+)"', text)
+    named += [
+        *json.loads(re.search(r'<script type="importmap">(.*?)</script>', text, re.DOTALL)[1])["imports"].values()
+    ]
+    assert len(named) > 10
+    assert [name for name in named if "//" in name] == []
+
+
+# What it gives
+
+
+def test_the_latest_image_and_the_cloud_are_fetched_anew(page):
+    empty = asked(page, "/picture.jpg")
+    assert (empty.status, empty.body) == (204, b"")
+    image = np.full((64, 80), 100, np.uint8)
+    page.board.show(picture_of(image, full_dn=255, caption="grey"))
+    shown = asked(page, "/picture.jpg?1")
+    assert shown.status == 200 and shown.body == page.board.picture.jpeg
+    assert shown.headers["content-type"] == "image/jpeg" and shown.headers["cache-control"] == "no-store"
+    page.board.cloud.add(np.array([[1.0, 2.0, 3.0], [1001.0, 2.0, 3.5]]), intensity=np.array([7.0, 8.0]))
+    cloud = asked(page, "/cloud")
+    origin = np.array([float(x) for x in cloud.headers["x-origin"].split(",")])
+    table = np.frombuffer(cloud.body, "<f4").reshape(-1, 6)
+    np.testing.assert_allclose(table[:, :3] + origin, [[1, 2, 3], [1001, 2, 3.5]], atol=1e-4)
+    assert table[:, 3].tolist() == [7, 8] and np.isnan(table[:, 4:]).all()
+    assert cloud.headers["cache-control"] == "no-store"
+
+
+@pytest.mark.parametrize("path", ["/picture.jpg", "/coverage.png", "/cloud"])
+def test_nothing_can_be_sent_to_what_is_only_fetched(page, path):
+    for method in ("POST", "PUT", "DELETE", "HEAD"):
+        assert asked(page, path, method=method).status == 405
+
+
+def test_what_is_added_later_is_served_too(page):
+    @page.server.app.get("/later/{name}")
+    def later(name: str) -> str:
+        return f"later: {name}"
+
+    assert json.loads(asked(page, "/later/x").body) == "later: x"
+    assert asked(page, "/later/x", Host="evil.example").status == 403
+
+
+# Where it is served
 
 
 def test_a_page_for_the_network_takes_its_own_names_and_warns():
-    shown = LivePage("network", host="0.0.0.0", port=18180)
+    shown = guarded("network", host="0.0.0.0")
     try:
-        assert "everybody" in shown.warning and "ssh -L" in shown.warning
-        own = [f"{name}:{shown.server.get_port()}" for name in ("192.168.1.7", "localhost", "127.0.0.1")]
-        assert [get(shown, Host=host)[0] for host in own] == [200] * 3
-        assert get(shown, Host="evil.example")[0] == 403
+        assert "everybody" in shown.server.warning and "ssh -L" in shown.server.warning
+        own = [f"{name}:{port(shown)}" for name in ("192.168.1.7", "localhost", "127.0.0.1")]
+        here = Place(f"http://127.0.0.1:{port(shown)}", shown.operator_address)
+        assert [asked(here, Host=host).status for host in own] == [200] * 3
+        assert asked(here, Host="evil.example").status == 403
     finally:
-        shown.close()
+        shown.server.close()
 
 
 def test_a_page_for_this_machine_does_not_warn(page):
-    assert page.warning is None
+    assert page.server.warning is None
+
+
+def test_a_port_in_use_is_passed_over_and_a_foreign_address_refused():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        wanted = taken.getsockname()[1]
+        with DeskServer(Board("beside"), port=wanted) as server:
+            assert wanted < int(server.address.rpartition(":")[2]) <= wanted + 99
+    for host in ("192.0.2.1", "no such host"):
+        with pytest.raises(SetupError, match="page at"):
+            DeskServer(Board("nowhere"), host=host)
+
+
+def test_one_page_is_served_at_a_time_and_the_next_is_no_continuation(page):
+    with pytest.raises(SetupError, match="serves a page already"):
+        DeskServer(Board("second"), port=0)
+    operator = Browser(page, Cookie=cookie(page))
+    with operator:
+        page.server.close()
+    page.server.close()
+    later = guarded("later", port=port(page))
+    try:
+        assert port(later) == port(page)
+        assert "<title>later" in asked(later).body.decode()
+        # A browser that still shows the first page comes back, and presses its buttons in vain.
+        operator.place = later
+        assert operator.open().startswith("44{")
+        operator.click(operator.buttons()["take"])
+        assert not ever_pressed(page) and not ever_pressed(later)
+        operator.connection.close()
+        with Browser(later, Cookie=cookie(later)) as again:
+            again.click(again.buttons()["take"])
+            assert pressed(later)
+    finally:
+        later.server.close()
+
+
+# The desk itself
+
+
+def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_folder(tmp_path):
+    folder = tmp_path / "tank"
+    folder.mkdir()
+    (folder / "wall.html").write_text("<p>report</p>", encoding="utf-8")
+    (folder / "secret.txt").write_text("secret", encoding="utf-8")
+    (tmp_path / "outside.html").write_text("outside", encoding="utf-8")
+    (folder / "link.html").symlink_to(tmp_path)
+    desk = subprocess.Popen(
+        [sys.executable, "-m", "uwlts.cli", "desk", str(folder), "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )
+    try:
+        line = desk.stdout.readline()
+        operator, address = re.fullmatch(r"open (\S+) to work, (\S+) to look; Ctrl-C ends it\n", line).groups()
+
+        served = Place(address, operator)
+        kept = cookie(served)
+        assert set(Browser(served).buttons()) == {"fit"}
+        controls = Browser(served, Cookie=kept).buttons()
+        assert {"Laser off", "connect", "home", "start", "stop", "length"} <= set(controls)
+        report = asked(served, "/files/wall.html")
+        assert report.status == 200 and report.body == b"<p>report</p>"
+        policy = report.headers["content-security-policy"]
+        assert policy.startswith("sandbox") and "same-origin" not in policy
+        for name in ("secret.txt", "../outside.html", "..%2foutside.html", "link.html", "none.html", "%00.html"):
+            answer = asked(served, f"/files/{name}")
+            assert b"outside" not in answer.body and b"secret\n" not in answer.body
+            assert answer.status == 404 or b"<title>desk: tank" in answer.body, name
+        # A browser that is still there is no reason to complain.
+        with Browser(served, Cookie=kept):
+            desk.send_signal(signal.SIGINT)
+            _, said = desk.communicate(timeout=30)
+        assert desk.returncode == 0 and said == ""
+    finally:
+        desk.kill()
+        desk.wait()
 
 
 @pytest.mark.parametrize(

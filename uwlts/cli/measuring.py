@@ -96,6 +96,24 @@ def watch(capture: Path, *, calibration: Path | None = None, host: str = "127.0.
 
 
 @app.command
+def desk(folder: Path = Path(), *, plan: Path | None = None, host: str = "127.0.0.1", port: int = 8080) -> None:
+    """Serve the operator's page: connect, look, move, calibrate, scan, reconstruct and measure in a browser.
+
+    The address with the token is the operator's; at the other one everybody who reaches it may look. Results are
+    written to the folder. The page works without internet.
+
+    Example: uwlts desk tank --plan plan.toml
+
+    Args:
+        folder: Folder with plans, calibrations, captures and clouds; the present one unless given.
+        plan: Plan of a scan (docs/how-to/scan.md) to begin with; others can be chosen on the page.
+        host: Address at which the page is served; the default can be reached from this machine only.
+        port: Port of the page; the next free one is taken if it is in use.
+    """
+    uwlts.serve_desk(folder, plan=plan, host=host, port=port, report=say)
+
+
+@app.command
 def doctor(*, folder: Path = Path(), camera: str | None = None, stage: str | None = None) -> None:
     """Examine libraries, libLLVM, cameras, serial ports, permissions and speed of this machine, with advice.
 

@@ -124,9 +124,10 @@ class GrblStage:
         return self.position_mm()
 
     def _recover(self) -> None:
-        if self._line.fault is None and not self._held:
+        line = self._line
+        if line.fault is None and not self._held and not line.darkened_by_hand:
             return
-        self._position_known = self._position_known and self._line.fault is None
+        self._position_known = self._position_known and line.fault is None and not line.darkened_by_hand
         self._power, self._timed_speed, self._held = 0.0, 0.0, False
         self._line.restart()
         # A reset that met a movement leaves an alarm behind.
@@ -314,6 +315,19 @@ class GrblStage:
         if reset:
             self._recover()
         return self.position_mm()
+
+    @property
+    def laser_unreachable(self) -> bool:
+        """Whether the last command to switch the laser off could not be sent."""
+        return self._line.unreachable
+
+    def darken(self) -> bool:
+        """Switch the laser off from any thread, whatever the stage does: by Ctrl-X, which also stops a movement.
+
+        Returns whether the command could be sent. What is under way fails at its next exchange with the controller;
+        then `unlock` where nothing moved, or `home`.
+        """
+        return self._line.darken()
 
     def close(self, error: BaseException | None = None) -> None:
         """Switch the laser off and close the port; HardwareError where the controller does not confirm."""

@@ -7,6 +7,7 @@ import errno
 import math
 import re
 import termios
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -231,6 +232,8 @@ _STOOD_STILL = (
     f"the laser was switched off by its guard, as this program stood still for over {GRACE_S:g} s while it was on: "
     "suspended (Ctrl-Z), hung in a driver, or the computer too busy; what is recorded is kept"
 )
+_HUNG_WRITE_S = 0.2
+_ASKED_TO_DARKEN = "the laser was switched off by hand: unlock the stage if it stood still, else home it"
 
 
 class GrblLine:
@@ -249,6 +252,7 @@ class GrblLine:
         self._serial = _open(port, baud)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
+        self.darkened_by_hand, self._writing, self.unreachable = False, threading.Lock(), False
         try:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
@@ -384,8 +388,30 @@ class GrblLine:
         self._refuse_after_fault()
         self._write(byte)
 
+    def darken(self) -> bool:
+        """Send Ctrl-X and wait for nothing, from any thread; whether it could be sent.
+
+        Nothing else is sent until `restart`: what is under way fails at its next exchange.
+        """
+        self.darkened_by_hand = True
+        # Not for long: a write that hangs must not hold it up.
+        held = self._writing.acquire(timeout=_HUNG_WRITE_S)
+        try:
+            return self._send_reset()
+        finally:
+            if held:
+                self._writing.release()
+
+    def _send_reset(self) -> bool:
+        self.unreachable = True
+        with suppress(OSError):
+            self._serial.write(SOFT_RESET)
+            self.unreachable = False
+        return not self.unreachable
+
     def restart(self) -> None:
         """Reset by Ctrl-X: the laser goes off and a fault is over; the position is kept only if nothing moved."""
+        self.darkened_by_hand = False
         self._reset()
         # After an alarm there may be a greeting more, which must not look like a restart of its own.
         while self._read_line(time.monotonic() + _QUIET_S) is not None:
@@ -406,12 +432,13 @@ class GrblLine:
     def failed(self, what: str) -> HardwareError:
         """Make everything safe after a fault and return the error to raise."""
         laser = "the laser CANNOT be switched off: switch its power off before going near"
-        with suppress(OSError):
-            self._serial.write(SOFT_RESET)
+        if self._send_reset():
             laser = "the command to switch the laser off was sent"
         # What the guard's reset makes the controller say would be taken for a fault of the controller.
         if self._told_dark():
             what = _STOOD_STILL
+        elif self.darkened_by_hand:
+            what = _ASKED_TO_DARKEN
         self.fault = what
         return HardwareError(f"stage on {self.port}: {what} ({laser})")
 
@@ -432,8 +459,7 @@ class GrblLine:
                 self.darkened()
                 self._reset()
             else:
-                with suppress(OSError):
-                    self._serial.write(SOFT_RESET)
+                self._send_reset()
         finally:
             if self._guard is not None:
                 self._guard.end()
@@ -450,10 +476,16 @@ class GrblLine:
             raise HardwareError(f"the stage on {self.port} is closed: open it again")
         if self.fault is not None:
             raise HardwareError(f"the stage on {self.port} has stopped after a fault: {self.fault}; home or unlock it")
+        if self.darkened_by_hand:
+            raise self.failed(_ASKED_TO_DARKEN)
 
     def _write(self, data: bytes) -> None:
         try:
-            self._serial.write(data)
+            with self._writing:
+                # Behind the Ctrl-X of another thread a command would light the laser again.
+                if self.darkened_by_hand and data != SOFT_RESET:
+                    raise self.failed(_ASKED_TO_DARKEN)
+                self._serial.write(data)
         except OSError as error:
             raise self.failed(f"the connection is lost: {error}; is the cable plugged in?") from error
 

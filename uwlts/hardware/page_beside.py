@@ -47,7 +47,7 @@ class PageBeside:
         threading.Thread(target=self._announce, args=(self._process,), daemon=True).start()
 
     def _announce(self, process: "subprocess.Popen[str]") -> None:
-        # The server's own banner comes first; what comes later must not fill the pipe.
+        # What comes later must not fill the pipe.
         for line in process.stdout or ():
             if line.startswith("open "):
                 self._say(f"{line.split(';')[0]}, while the scan runs")

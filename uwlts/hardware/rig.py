@@ -8,6 +8,7 @@ with the brightest one.
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -252,6 +253,9 @@ class Rig:
                 frame = self._one()
             except HardwareError as error:
                 if self._stage.faulty or not self._camera.running:
+                    # At once: closing a camera that is gone takes its time.
+                    with suppress(HardwareError):
+                        self._rest()
                     raise
                 last = error
                 self._laser(False)

@@ -141,53 +141,90 @@ def scan(
         if not watch:
             raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
         load_calibration(calibration)
+    with ExitStack() as stack:
+        page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
+        moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
+        if home:
+            report("homing")
+            moved.home()
+        elif unlock:
+            moved.unlock()
+        return record_scan(
+            plan,
+            out,
+            camera=opened,
+            stage=moved,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            report=report,
+            warn=warn,
+            recorded=lambda frame, number: None if page is None else page.start(),
+        )
+
+
+@keeps_inputs
+def record_scan(
+    plan: ScanPlan,
+    out: Path,
+    *,
+    camera: CameraDevice,
+    stage: GrblStage,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    report: Callable[[str], None] = lambda line: None,
+    warn: Callable[[str], None] = lambda text: None,
+    between: Callable[[], None] = lambda: None,
+    recorded: Callable[[Frame, int], None] = lambda frame, number: None,
+) -> ScanProgress:
+    """Record a scan with a camera and a stage that are open and may move; parameters and errors as for `scan`.
+
+    ``between`` is called before every image, with the laser off: it may wait, or end the scan by an exception.
+    ``recorded`` is called with every image that is in the file, and its number.
+    """
     positions_mm = plan.stage.positions_mm()
     shots = list(product(positions_mm, plan.lights))
     images = len(positions_mm) * (len(plan.lights) + int(plan.background and "laser" in plan.lights))
     report(
         f"{len(positions_mm)} positions from {positions_mm[0]:g} to {positions_mm[-1]:g} mm, {images} images to take"
     )
-    with ExitStack() as stack:
-        page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
-        moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
-        if home:
-            moved.home()
-        elif unlock:
-            moved.unlock()
-        sensor = plan.described_sensor()
-        check_camera(opened, sensor)
-        plan.check(moved)
-        dtype = np.dtype(np.uint16 if plan.background or opened.info.bits > 8 else np.uint8)
-        header = with_provenance(
-            plan.header(out.stem),
-            plan,
-            opened,
-            source="scan",
-            stage=f"Grbl {moved.version}",
-            images=len(shots),
-            background=plan.background,
-        )
-        known_ms, before_s = left_over(out) if resume else ({}, 0.0)
-        seen = ScanProgress(exposure_ms=known_ms)
-        writer = stack.enter_context(
-            CaptureWriter(out, header, dtype=dtype, plan=plan.recorded(), overwrite=overwrite, resume=resume)
-        )
+    sensor = plan.described_sensor()
+    check_camera(camera, sensor)
+    plan.check(stage)
+    dtype = np.dtype(np.uint16 if plan.background or camera.info.bits > 8 else np.uint8)
+    header = with_provenance(
+        plan.header(out.stem),
+        plan,
+        camera,
+        source="scan",
+        stage=f"Grbl {stage.version}",
+        images=len(shots),
+        background=plan.background,
+    )
+    known_ms, before_s = left_over(out) if resume else ({}, 0.0)
+    seen = ScanProgress(exposure_ms=known_ms)
+    with CaptureWriter(out, header, dtype=dtype, plan=plan.recorded(), overwrite=overwrite, resume=resume) as writer:
         begun = len(writer)
         if begun == len(shots):
             return seen
-        rig = Rig(plan, plan.stage, sensor, opened, moved, ahead=plan.stage.step_mm)
+        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
         taking = _Taking(plan, sensor, rig, seen, warn)
-        taking.settle_exposures()
+        report("finding the exposures")
+        taking.settle_exposures(between)
+        report("recording")
         start_s = time.monotonic() - before_s
         for done, (position_mm, light) in enumerate(shots[begun:], begun + 1):
+            between()
             position, image, exposure_ms = taking.take(position_mm, light, last=done == len(shots))
             image = image.astype(dtype, copy=False)
-            writer.append(Frame(image, position, light == "laser", exposure_ms, time.monotonic() - start_s))
+            frame = Frame(image, position, light == "laser", exposure_ms, time.monotonic() - start_s)
+            writer.append(frame)
             progress(done, len(shots))
-            if page:
-                page.start()
+            recorded(frame, done - 1)
         # What is replayed does not know where the stage is.
-        if plan.check_steps and not isinstance(opened, ReplayCamera):
+        if plan.check_steps and not isinstance(camera, ReplayCamera):
+            report("checking for lost steps")
             taking.check_steps()
         return seen
 
@@ -225,7 +262,7 @@ class _Taking:
         self._watch = LaserWatch(rig, sensor, self._positions_mm, difference=plan.background)
         self._slip = SlipWatch()
 
-    def settle_exposures(self) -> None:
+    def settle_exposures(self, between: Callable[[], None]) -> None:
         """Exposures as planned, or the shortest that is needed at positions over the whole plan."""
         exposures, planned_ms = self._seen.exposure_ms, self._plan.planned_ms()
         lights: list[Light] = [light for light in dict.fromkeys(self._plan.lights) if light not in exposures]
@@ -236,6 +273,7 @@ class _Taking:
         for position in looked + further if missing else ():
             if position in further and "laser" in exposures:
                 break
+            between()
             self._rig.move_to(position)
             for light in missing:
                 self._settle(light, position)

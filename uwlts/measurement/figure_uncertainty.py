@@ -71,7 +71,8 @@ def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
     # The covariance is v v^T: its column with the largest element on the diagonal is v times that of v.
     largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
     rows = np.arange(len(covariance))
-    return covariance[rows, largest] / np.sqrt(covariance[rows, largest, largest])[:, None]
+    size = np.sqrt(covariance[rows, largest, largest])[:, None]
+    return np.divide(covariance[rows, largest], size, out=np.zeros((len(rows), 3)), where=size > 0)
 
 
 class _MovedFit:

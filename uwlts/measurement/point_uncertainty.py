@@ -17,7 +17,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.optics.brightness import BLUR_STD, beside_std
-from uwlts.storage.capture import Capture, CaptureHeader
+from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 from uwlts.storage.files import sha256_of
 
@@ -50,7 +50,7 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
 
 
 def point_uncertainty(
-    capture: Capture,
+    capture: Capture | FrameTable,
     calibration: Calibration,
     frame: np.ndarray,
     line: np.ndarray,
@@ -84,7 +84,7 @@ def point_uncertainty(
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
     noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
     pose = capture.pose[:, :3, :3]
-    posed = np.isfinite(capture.pose).all(axis=(1, 2))[:, None, None]
+    posed = np.all(np.isfinite(capture.pose), axis=(1, 2), keepdims=True)
     into_scene = np.where(posed, pose, np.eye(3)) @ calibration.object_transform()[:3, :3].T
     root = covariance_root(known.covariance)
     stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))

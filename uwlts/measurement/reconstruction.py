@@ -15,7 +15,7 @@ from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightn
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
-from uwlts.storage.capture import Capture, opened_capture
+from uwlts.storage.capture import Capture, FrameTable, opened_capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
 
@@ -85,7 +85,7 @@ def reconstruct(
 
 
 def reconstruct_stripes(
-    capture: Capture,
+    capture: Capture | FrameTable,
     stripes: FoundStripes,
     calibration: AnyCalibration,
     *,
@@ -156,7 +156,9 @@ def reconstruct_stripes(
     )
 
 
-def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes, index: float) -> MeasuredPoints:
+def _points(
+    capture: Capture | FrameTable, calibration: AnyCalibration, stripes: FoundStripes, index: float
+) -> MeasuredPoints:
     """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
     stage, direction = capture.stage_mm[stripes.frame], np.array(capture.header.stage_direction)
     line, centre = stripes.line, stripes.centre_px
@@ -168,7 +170,7 @@ def _points(capture: Capture, calibration: AnyCalibration, stripes: FoundStripes
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
 
 
-def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:
+def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:
     """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
     if np.isfinite(capture.pose).any():
         return np.zeros((len(stripes.line), 3))
@@ -178,7 +180,7 @@ def _beside(capture: Capture, calibration: Calibration, stripes: FoundStripes, i
     return beside_sheet(calibration, *where, medium_index=index, stage_direction=direction)
 
 
-def _posed(points: np.ndarray, capture: Capture, frame: np.ndarray) -> np.ndarray:
+def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:
     """Points of frames that carry a full pose ``T_scene_object`` are placed by it instead of by the stage."""
     points = points.copy()
     for number in np.flatnonzero(np.isfinite(capture.pose).all(axis=(1, 2))):

@@ -64,6 +64,33 @@ class Frame:
     pose: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class FrameTable:
+    """What is known of each image of a recording besides its pixels, as of a `Capture`.
+
+    ``stage_mm`` and ``exposure_ms`` are (N,), ``pose`` is (N, 4, 4), NaN where an image has none; ``path`` is what the
+    recording is called.
+    """
+
+    header: CaptureHeader
+    path: Path
+    stage_mm: np.ndarray
+    exposure_ms: np.ndarray
+    pose: np.ndarray
+
+    @classmethod
+    def of(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
+        """The table of frames that are in memory."""
+        none = np.full((4, 4), np.nan)
+        return cls(
+            header,
+            Path(header.name),
+            np.array([frame.stage_mm for frame in frames]),
+            np.array([frame.exposure_ms for frame in frames]),
+            np.array([none if frame.pose is None else frame.pose for frame in frames]).reshape(-1, 4, 4),
+        )
+
+
 def part_path(path: Path) -> Path:
     """Name of an unfinished recording of ``path``."""
     return path.with_name(path.name + ".part")

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field, fields
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -58,6 +59,10 @@ class PointUncertainty:
     random_mm2: np.ndarray
     position_mm: np.ndarray
     patterns_mm: np.ndarray
+
+    def __getitem__(self, selection: Any) -> "PointUncertainty":
+        """That of a selection of the points, by a slice, indices or a mask."""
+        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], self.patterns_mm[:, selection])
 
     def systematic_mm2(self) -> np.ndarray:
         """Covariance (N, 6) of each point by calibration and stage."""

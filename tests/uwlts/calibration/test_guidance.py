@@ -275,6 +275,16 @@ def test_an_image_seen_again_gains_little(setting):
     assert gain_of(state, again, state.poses[-1]) < 0.4 * wish.gain
 
 
+def test_poses_that_are_skipped_give_way_to_the_next_best(setting):
+    state = led(setting, Wanted(), np.random.default_rng(3), most=1)
+    count = len(candidates(setting, state.camera))
+    first, second, last, again = (best_pose(state, skipped=skipped) for skipped in (0, 1, count - 1, count))
+    assert first.gain >= second.gain >= last.gain and first.gain > last.gain
+    assert len({wish.candidate.pose.tobytes() for wish in (first, second, last)}) == 3
+    # Who skips them all begins again.
+    np.testing.assert_array_equal(again.candidate.pose, first.candidate.pose)
+
+
 def test_pose_advice_is_in_plain_words(setting):
     state = state_of(recorded(setting, [target_pose(middle_mm=(-60, -40, 330.0))], np.random.default_rng(0)), setting)
     wish = best_pose(state)
@@ -374,3 +384,12 @@ def test_the_step_standard_is_wanted_at_three_depths(thesis):
     assert not is_new(300.0, [282.0], thesis) and is_new(314.0, [282.0], thesis)
     assert apart_mm([282.0, 282.5, 319.0, 381.0], thesis) == [282.0, 319.0, 381.0]
     assert next_depth_mm([282.0, 282.5, 319.0, 381.0], thesis) is None
+
+
+def test_a_depth_that_is_skipped_gives_way_to_the_next_in_turn(thesis):
+    third = 220 / 6
+    # Farthest from 330 mm is the near third, then the far one, then the middle one, and the near one again.
+    asked = [next_depth_mm([330.0], thesis, skipped=count) for count in range(4)]
+    assert asked == pytest.approx([200 + third, 200 + 5 * third, 200 + 3 * third, 200 + third])
+    assert len({next_depth_mm([], thesis, skipped=count) for count in range(3)}) == 3
+    assert next_depth_mm([282.0, 319.0, 381.0], thesis, skipped=1) is None

@@ -480,6 +480,153 @@ def test_homing_that_fails_says_so():
         assert not stage.position_known
 
 
+# Darkness by hand, from another thread
+
+
+def darkened(controller: GrblController, stage: GrblStage) -> None:
+    """Press the button and see that the laser is off within 0.2 s."""
+    stage.darken()
+    assert wait_for(lambda: not controller.state().laser_on, 0.2)
+
+
+def later(seconds: float, work: Callable[[], None]) -> threading.Thread:
+    """Another thread that does something in a while."""
+
+    def run() -> None:
+        time.sleep(seconds)
+        work()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+BY_HAND = "the laser was switched off by hand: unlock the stage if it stood still, else home it"
+
+
+def test_the_laser_goes_off_by_hand_while_the_stage_moves(controller, stage):
+    stage.move_to(60.0, feed_mm_per_min=900.0)
+    stage.laser(True)
+    dark = []
+
+    def press() -> None:
+        assert controller.state().moving and controller.state().laser_on
+        stage.darken()
+        dark.append(wait_for(lambda: not controller.state().laser_on, 0.2))
+
+    pressing = later(0.2, press)
+    with pytest.raises(HardwareError, match=BY_HAND):
+        stage.move_to(700.0, feed_mm_per_min=900.0)
+    pressing.join()
+    assert dark == [True] and not controller.state().moving
+    assert stage.faulty and stage.laser_power == 0.0 and not stage.position_known
+    with pytest.raises(HardwareError, match=f"has stopped after a fault: {BY_HAND}"):
+        stage.laser(True)
+    assert not controller.state().laser_on
+    assert stage.home() == 2.0
+    assert stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0 == controller.state().position_mm
+
+
+def test_homing_ends_by_hand(controller, stage):
+    stage.move_to(700.0, feed_mm_per_min=900.0)
+    pressing = later(0.1, stage.darken)
+    with pytest.raises(HardwareError, match=BY_HAND):
+        stage.home()
+    pressing.join()
+    assert not stage.position_known and not controller.state().moving
+    assert stage.home() == 2.0
+
+
+@pytest.mark.parametrize("at_most_s", [None, 5.0])
+def test_a_laser_that_is_lit_at_rest_goes_off_by_hand(controller, stage, at_most_s):
+    stage.move_to(60.0, feed_mm_per_min=900.0)
+    stage.laser(True, at_most_s=at_most_s)
+    assert controller.state().laser_on
+    later(0.0, lambda: darkened(controller, stage)).join()
+    assert not controller.state().laser_on
+    with pytest.raises(HardwareError, match=BY_HAND):
+        stage.laser(False)
+    assert stage.faulty and stage.laser_power == 0.0
+    # Nothing moved: the position is still right.
+    assert stage.unlock() == 60.0
+    stage.laser(True, at_most_s=at_most_s)
+    assert controller.state().laser_on
+    stage.laser(False)
+    assert stage.move_to(61.0, feed_mm_per_min=900.0) == 61.0
+
+
+@pytest.mark.parametrize(
+    "exchange",
+    [
+        lambda stage: stage.position_mm(),
+        lambda stage: stage.laser(True),
+        lambda stage: stage.move_to(5.0, feed_mm_per_min=900.0),
+    ],
+)
+def test_darkness_by_hand_is_met_at_the_next_exchange(controller, stage, exchange):
+    stage.darken()
+    time.sleep(0.1)
+    # Twice is no more than once.
+    stage.darken()
+    # Nothing is lit, so that nothing is exchanged.
+    stage.keep_lit()
+    assert not stage.faulty
+    with pytest.raises(HardwareError, match=BY_HAND):
+        exchange(stage)
+    assert stage.faulty and not controller.state().laser_on
+    assert stage.unlock() == 2.0
+    assert stage.move_to(4.0, feed_mm_per_min=900.0) == 4.0
+
+
+def test_after_darkness_by_hand_the_stage_is_unlocked_or_homed_at_once(controller, stage):
+    for recover in (stage.unlock, stage.home):
+        stage.darken()
+        assert recover() == 2.0 and stage.position_known
+        assert stage.move_to(4.0, feed_mm_per_min=900.0) == 4.0
+        stage.move_to(2.0, feed_mm_per_min=900.0)
+
+
+@pytest.mark.parametrize("at_most_s", [None, 5.0])
+def test_whenever_darkness_is_asked_for_the_laser_is_off_and_stays_off(controller, stage, at_most_s):
+    """Also in the middle of lighting it, when the command that lights it is on its way already."""
+    stage.move_to(60.0, feed_mm_per_min=900.0)
+    rng = np.random.default_rng(11)
+
+    def flash() -> None:
+        while True:
+            stage.laser(True, at_most_s=at_most_s)
+            stage.laser(False)
+
+    seen = []
+
+    def press() -> None:
+        stage.darken()
+        # Lines that were sent before are done with by then.
+        time.sleep(0.05)
+        for _ in range(100):
+            seen.append(controller.state().laser_on)
+            time.sleep(0.002)
+
+    for wait_s in rng.uniform(0, 0.2, 12).tolist():
+        pressing = later(wait_s, press)
+        with pytest.raises(HardwareError, match=BY_HAND):
+            flash()
+        pressing.join()
+        assert stage.faulty and not controller.state().laser_on
+        assert stage.unlock() == 60.0
+    assert len(seen) == 1200 and not any(seen)
+
+
+def test_a_stage_that_was_darkened_by_hand_closes_as_any_other(controller):
+    with GrblStage(controller.port) as stage:
+        stage.home()
+        stage.laser(True)
+        stage.darken()
+    assert wait_for(lambda: not controller.state().port_open)
+    stage.darken()
+    assert not controller.state().laser_on
+
+
 # The laser's end, whatever ends the program
 
 

@@ -390,13 +390,16 @@ def _untilted(state: State) -> np.ndarray:
     return np.maximum(1 - reached / state.wanted.tilt_rad, 0.0)
 
 
-def best_pose(state: State, *, spin_rad: float = 0.0) -> PoseAdvice | None:
-    """The candidate pose that leaves least missing; None where the target can be found in none."""
+def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseAdvice | None:
+    """The candidate pose that leaves least missing, after so many that were ``skipped``.
+
+    None where the target can be found in none.
+    """
     options = candidates(state.setting, state.camera, spin_rad=spin_rad)
     if not options:
         return None
     after = [lack(state.with_image(each.pose, each.pixels, each.information)) for each in options]
-    best = int(np.argmin(after))
+    best = int(np.argsort(after, kind="stable")[skipped % len(after)])
     place, distance = middle_of(options[best].pose, state)
     return PoseAdvice(options[best], lack(state) - after[best], place, distance)
 

@@ -31,16 +31,18 @@ class StepQuality:
     reasons: tuple[str, ...]
 
 
-def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor) -> float | None:
+def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor, *, skipped: int = 0) -> float | None:
     """Depth for the standard's next image, mm outside the window; None once it was seen at three depths apart.
 
-    Of the middles of the measuring volume's thirds the one farthest from where it was seen.
+    Of the middles of the measuring volume's thirds the one farthest from where it was seen; the next in turn where so
+    many were ``skipped``.
     """
     if len(apart_mm(seen_mm, sensor)) >= PLACES:
         return None
     near, far = sensor.volume.near_mm, sensor.volume.far_mm
     middles = [near + (far - near) * (2 * k + 1) / (2 * PLACES) for k in range(PLACES)]
-    return max(middles, key=lambda middle: min((abs(middle - depth) for depth in seen_mm), default=np.inf))
+    middles.sort(key=lambda middle: min((abs(middle - depth) for depth in seen_mm), default=np.inf), reverse=True)
+    return middles[skipped % PLACES]
 
 
 def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:

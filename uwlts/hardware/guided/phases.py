@@ -40,7 +40,7 @@ from uwlts.calibration.image_quality import (
     way_px,
     why_not_found,
 )
-from uwlts.hardware.guided.operator import GuidedPage, Operator
+from uwlts.hardware.guided.operator import Operator, Screen
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
 from uwlts.hardware.rig import START_MS, Rig
 from uwlts.hardware.scan_plan import Light, RigPlan
@@ -75,13 +75,13 @@ class Session:
         plan: RigPlan,
         writer: CaptureWriter,
         operator: Operator,
-        page: GuidedPage,
+        screen: Screen,
         *,
         dtype: np.dtype,
         known_ms: dict[Light, float],
         before_s: float,
     ):
-        self.rig, self.operator, self.page = rig, operator, page
+        self.rig, self.operator, self.screen = rig, operator, screen
         self._plan, self._writer, self._dtype = plan, writer, dtype
         self._exposure_ms = plan.planned_ms() | known_ms
         self._start_s = time.monotonic() - before_s
@@ -109,14 +109,14 @@ class Session:
     def show(
         self, image: np.ndarray, remark: str, *, points: np.ndarray | None = None, stripe: np.ndarray | None = None
     ) -> None:
-        """Show an image (H, W) with points (N, 2) and stripe pixels (N, 2) on the page."""
+        """Show an image (H, W) with points (N, 2) and stripe pixels (N, 2) on the screen."""
         full = self._writer.header.saturation_dn
-        self.page.live(image, full_dn=full, points=points, stripe=stripe, remark=remark)
+        self.screen.live(image, full_dn=full, points=points, stripe=stripe, remark=remark)
 
     def report(self, line: str) -> None:
-        """Say a line, and add it to the page's list of images."""
+        """Say a line, and add it to the screen's list of images."""
         self.operator.say(line)
-        self.page.add(line)
+        self.screen.add(line)
 
     def record(self, image: np.ndarray, exposure_ms: float, *, stage_mm: float, laser_on: bool) -> None:
         """Write an image (H, W) to the capture."""
@@ -255,7 +255,7 @@ class TargetPhase:
 
     def __init__(self, plan: GuidedPlan, session: Session, judge: PoseJudge):
         self._plan, self._session, self._judge = plan, session, judge
-        self._operator, self._page = session.operator, session.page
+        self._operator, self._screen = session.operator, session.screen
         self._settled_s = -np.inf
 
     def run(self, state: State) -> State:
@@ -269,7 +269,12 @@ class TargetPhase:
     def _by_stage(self, state: State) -> State:
         places = self._plan.places_left(state.recorded)
         for number, place in enumerate(places):
-            self._page.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
+            self._screen.request(f"the stage goes to {place:.2f} mm, {len(places) - number} positions left")
+            answer = self._operator.answer()
+            if answer == "done":
+                break
+            if answer == "skip":
+                continue
             position = self._session.rig.move_to(place)
             for _ in range(_TRIES):
                 found = self._judge.attempt(self._session, state, position)
@@ -284,13 +289,16 @@ class TargetPhase:
         advice: PoseAdvice | None = None
         refused: list[TargetView] = []
         still: TargetView | None = None
-        since_s = time.monotonic()
+        since_s, skipped = time.monotonic(), 0
         while still_missing(state) and len(state.recorded) < self._plan.most_images:
             found = self._judge.find(self._session.take("lamp")[0])
-            advice = advice or best_pose(state, spin_rad=_spin(found.usable, state))
+            advice = advice or best_pose(state, spin_rad=_spin(found.usable, state), skipped=skipped)
             answer = self._operator.answer()
             if answer == "done":
                 break
+            if answer == "skip":
+                advice, skipped = None, skipped + 1
+                continue
             if found.view is None or still is None or way_px(still, found.view) > _STILL_PX:
                 still, since_s = found.view, time.monotonic()
             self._improve_light(found.reasons)
@@ -304,7 +312,7 @@ class TargetPhase:
             state = self._done(found, state, f"image {len(state.recorded) + 1}")
             still, since_s = None, time.monotonic()
             if isinstance(found, Accepted):
-                advice = None
+                advice, skipped = None, 0
             else:
                 refused = [] if found.view is None else [found.view]
         return state
@@ -329,7 +337,7 @@ class TargetPhase:
         request = "move the target" if advice is None else format_pose_advice(advice, state, pose)
         if sheet and not missing(state):
             request = f"move the target so that the laser line lies on it, nearer and farther: {sheet[0]}"
-        self._page.request(request if reasons else "hold it still")
+        self._screen.request(request if reasons else "hold it still")
         self._operator.hint(f"next: {request if advice is None or sheet else format_pose_advice(advice, state, None)}")
         points = None if found.view is None else found.view.pixels
         self._session.show(found.image, "; ".join(reasons) or "good", points=points)
@@ -359,7 +367,7 @@ class TargetPhase:
         return state
 
     def _show_state(self, state: State) -> None:
-        self._page.recorded(state.coverage, [pose.view.pixels for pose in state.recorded])
+        self._screen.recorded(state.coverage, [pose.view.pixels for pose in state.recorded])
 
 
 def _spin(view: TargetView | None, state: State) -> float:
@@ -403,14 +411,19 @@ class StepPhase:
 
     def run(self, seen_mm: Sequence[float]) -> list[float]:
         """Go on after the depths that are recorded; all depths then. Errors as `TargetPhase.run`."""
-        seen, session = list(seen_mm), self._session
-        while (wanted := next_depth_mm(seen, self._judge.sensor)) is not None:
+        seen, session, skipped = list(seen_mm), self._session, 0
+        while (wanted := next_depth_mm(seen, self._judge.sensor, skipped=skipped)) is not None:
             request = (
                 f"put the step standard about {wanted:.0f} mm outside the window, with the laser line across its step"
             )
-            session.page.request(request)
-            if session.operator.wait(request, lambda: session.show(session.unlit(), "the laser is off")) == "done":
+            session.screen.request(request)
+            answer = session.operator.wait(request, lambda: session.show(session.unlit(), "the laser is off"))
+            if answer == "done":
                 break
+            if answer == "skip":
+                skipped += 1
+                continue
+            skipped = 0
             before = tuple(seen)
             for position in self._judge.step.positions_mm or (None,):
                 taken = self._take(position, before)

@@ -128,6 +128,14 @@ class GuidedPlan(RigPlan):
         stage = self.stage if port is None else (self.stage or GuidedStage()).model_copy(update={"port": port})
         return self.model_copy(update={"camera": camera or self.camera, "stage": stage})
 
+    def camera_address(self) -> str:
+        """The camera's address; DescriptionError where that, or the port of a planned stage, is not given."""
+        if self.camera is None:
+            raise DescriptionError("neither the plan nor the command line gives the camera: give --camera")
+        if self.stage is not None and self.stage.port is None:
+            raise DescriptionError("neither the plan nor the command line gives the stage's port: give --stage")
+        return self.camera
+
     def target_in_air(self) -> bool:
         """Whether the target stands in air; DescriptionError where the sensor does not know the medium."""
         return self.described_sensor().medium(self.medium).kind == "air"

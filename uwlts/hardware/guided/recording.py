@@ -20,13 +20,12 @@ from uwlts.calibration.intrinsics import CameraOptions
 from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.guided.operator import GuidedPage, Operator
+from uwlts.hardware.guided.operator import Operator, Screen
 from uwlts.hardware.guided.phases import PoseJudge, Session, StepJudge, StepPhase, TargetPhase, still_missing
-from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep, load_guided_plan
+from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep
 from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, with_provenance
 from uwlts.hardware.scanning import check_camera, left_over
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import DescriptionError
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, part_path
 
 
@@ -41,85 +40,43 @@ class GuidedRecording:
     missing: tuple[str, ...]
 
 
-def record_guided(
-    plan: str | Path | GuidedPlan,
-    out: str | Path,
+def guide(
+    plan: GuidedPlan,
+    out: Path,
+    screen: Screen,
     *,
-    camera: str | None = None,
-    stage: str | None = None,
-    port: int = 8080,
     refractions: Literal[1, 2] = 2,
     distortion: tuple[str, ...] = ("k1", "k2"),
     resume: bool = False,
     overwrite: bool = False,
     report: Callable[[str], None] = print,
+    answers: int | None = None,
 ) -> GuidedRecording:
-    """Lead through the images of a calibration and record the good ones, beside the calibration that they are for.
+    """Lead through the images of a calibration on a screen; parameters and errors as of `uwlts.record_guided`.
 
-    Parameters
-    ----------
-    plan : GuidedPlan or path of a TOML file
-    out : str or Path
-        The calibration; captures are called like it, with ``-target.h5`` and ``-step.h5``.
-    camera : str, optional
-        Address of the camera, in place of the plan's.
-    stage : str, optional
-        Serial port of the stage, in place of the plan's.
-    port : int
-        Port of the page for the browser; the next free one is taken if it is in use.
-    refractions, distortion
-        As the calibration is going to be made; see `calibrate`.
-    resume : bool
-        Continue with what is recorded, also with a finished capture of the target that is not enough.
-    overwrite : bool
-        Replace earlier recordings; without effect with ``resume``.
-    report : callable, optional
-        Called with lines of text for the operator, who answers on standard input or on the page.
-
-    Raises
-    ------
-    DescriptionError, RangeError
-        The plan cannot be carried out; nothing has moved.
-    HardwareError
-        Camera, stage or laser fail.
-    CalibrationError
-        The target does not give a calibration by which the step standard could be judged.
-    OutputError
-        A capture exists, or cannot be written.
+    Camera and stage are the plan's. ``answers`` is a file descriptor with the operator's words, standard input unless
+    given.
     """
-    described = plan if isinstance(plan, GuidedPlan) else load_guided_plan(Path(plan))
-    described = described.connected(camera=camera, port=stage)
-    if described.camera is None:
-        raise DescriptionError("neither the plan nor the command line gives the camera: give --camera")
-    if described.stage is not None and described.stage.port is None:
-        raise DescriptionError("neither the plan nor the command line gives the stage's port: give --stage")
-    page = GuidedPage(described.title, port=port)
-    try:
-        report(f"open {page.operator_address}; Ctrl-C ends it, what was accepted is kept")
-        options = CalibrationOptions(
-            refractions=refractions, poses=described.poses, camera=CameraOptions(distortion=distortion)
-        )
-        setting = replace(described.setting(), camera=options.camera)
-        operator = Operator(report, button=page.pressed)
-        phases = _Phases(described, setting, described.camera, page, operator, resume, overwrite and not resume)
-        out = Path(out)
-        target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
-        missing = still_missing(phases.target(target))
-        if described.step is not None:
-            with Capture(target) as capture:
-                known = calibrate_sequentially([capture], (), options=options).calibration
-            sensor = described.described_sensor()
-            window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
-            missing += phases.step(step, described.step, StepJudge(described.step, sensor, known, window))
-        return GuidedRecording(
-            air=(target,) if described.target_in_air() else (),
-            water=() if described.target_in_air() else (target,),
-            step=(step,) if described.step is not None else (),
-            poses=described.poses,
-            missing=tuple(missing),
-        )
-    finally:
-        page.close()
+    camera = plan.camera_address()
+    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))
+    setting = replace(plan.setting(), camera=options.camera)
+    operator = Operator(report, screen, answers=answers)
+    phases = _Phases(plan, setting, camera, screen, operator, resume, overwrite and not resume)
+    target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
+    missing = still_missing(phases.target(target))
+    if plan.step is not None:
+        with Capture(target) as capture:
+            known = calibrate_sequentially([capture], (), options=options).calibration
+        sensor = plan.described_sensor()
+        window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
+        missing += phases.step(step, plan.step, StepJudge(plan.step, sensor, known, window))
+    return GuidedRecording(
+        air=(target,) if plan.target_in_air() else (),
+        water=() if plan.target_in_air() else (target,),
+        step=(step,) if plan.step is not None else (),
+        poses=plan.poses,
+        missing=tuple(missing),
+    )
 
 
 @dataclass(frozen=True)
@@ -129,7 +86,7 @@ class _Phases:
     plan: GuidedPlan
     setting: Setting
     camera: str
-    page: GuidedPage
+    screen: Screen
     operator: Operator
     resume: bool
     overwrite: bool
@@ -167,7 +124,7 @@ class _Phases:
                 return []
             os.replace(path, part_path(path))
         request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
-        self.page.request(request)
+        self.screen.request(request)
         self.operator.wait(request)
         with self._session(path, list(step.positions_mm), self.plan.step_header(path.stem, step)) as session:
             seen = StepPhase(judge, session).run(seen)
@@ -188,7 +145,7 @@ class _Phases:
             known, before_s = left_over(path) if self.resume else ({}, 0.0)
             with CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
                 yield Session(
-                    rig, self.plan, writer, self.operator, self.page, dtype=dtype, known_ms=known, before_s=before_s
+                    rig, self.plan, writer, self.operator, self.screen, dtype=dtype, known_ms=known, before_s=before_s
                 )
 
     @contextmanager
@@ -198,9 +155,13 @@ class _Phases:
             yield HandSwitchedLaser(self.operator.wait)
             return
         with GrblStage(planned.port) as stage:
+            self.screen.connected(stage)
             planned.check(positions_mm, stage)
             if planned.home:
                 stage.home()
             elif not stage.position_known:
                 stage.unlock()
-            yield stage
+            try:
+                yield stage
+            finally:
+                self.screen.connected(None)

@@ -1,0 +1,139 @@
+"""A long scan by the operator's page: ``python -m tests.soak [images]`` records 100,000 images unless told otherwise.
+
+Camera and controller speak their real protocols; the camera sends drawn stripes, since rendering would take days. A
+headless browser looks on all the time. Every tenth of the way a line states the rate and the memory of desk and
+browser; the exit status is 1 where either grew by more than a quarter after the first fifth, or an image is missing.
+"""
+
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import uwlts
+from tests.browser import find_chromium, open_chromium
+from tests.system.small_board import small_sensor
+from twin.devices.gige_camera import GigeCamera
+from twin.devices.grbl_controller import GrblController
+from uwlts.storage.capture import Capture
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+WIDTH, HEIGHT = 96, 512
+TRAVEL_MM, STEP_MM = 120.0, 0.001
+GROWTH = 1.25
+SPEED_UP = 500.0
+
+
+def drawn(exposure_ms: float, *, rng: np.random.Generator, lit: bool) -> np.ndarray:
+    """A stripe across a noisy image (HEIGHT, WIDTH), as bright as it was exposed."""
+    rows = np.arange(HEIGHT)[:, None]
+    stripe = 400.0 * exposure_ms * np.exp(-0.5 * ((rows - 250.0 - 0.1 * np.arange(WIDTH)) / 2.0) ** 2)
+    image = rng.normal(4.0, 1.0, (HEIGHT, WIDTH)) + (stripe if lit else 0.0)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def memory_mib(process: int) -> float:
+    """Memory in use by a process and its children, MiB."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    status = Path(f"/proc/{process}/status").read_text()
+    own = int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024  # type: ignore[index]
+    return own + sum(memory_mib(int(child)) for child in children)
+
+
+def heap_mib(page: "Page") -> float:
+    """Memory of the page's scripts after what is not needed any more is freed, MiB."""
+    session = page.context.new_cdp_session(page)
+    session.send("HeapProfiler.collectGarbage")
+    used = session.send("Runtime.getHeapUsage")["usedSize"] / 2**20
+    session.detach()
+    return used
+
+
+def main(images: int) -> int:
+    """Run the soak; the exit status."""
+    with tempfile.TemporaryDirectory() as place:
+        return _soak(Path(place), images)
+
+
+def _soak(folder: Path, images: int) -> int:
+    rng = np.random.default_rng(0)
+    controller = GrblController(settings={100: 1 / STEP_MM, 130: TRAVEL_MM}, speed_up=SPEED_UP)
+    camera = GigeCamera(
+        lambda exposure_ms: drawn(exposure_ms, rng=rng, lit=controller.state().laser_on),
+        width_px=WIDTH,
+        height_px=HEIGHT,
+    )
+    with controller, camera:
+        stage = (f"travel_mm = {TRAVEL_MM}", f"resolution_mm = {STEP_MM}", "settling_s = 0.0")
+        (folder / "sensor.toml").write_text(small_sensor(*stage))
+        (folder / "plan.toml").write_text(
+            f'title = "Soak"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{camera.address}"\nlaser_ms = 0.4\n'
+            f'[stage]\nport = "{controller.port}"\nstart_mm = 5.0\nstep_mm = {STEP_MM}\ncount = {images}\n'
+            "feed_mm_per_min = 900.0\n"
+        )
+        uwlts.write_calibration(folder / "nominal.json", uwlts.nominal(folder / "sensor.toml", medium="air"))
+        desk = subprocess.Popen(
+            [sys.executable, "-m", "uwlts.cli", "desk", str(folder), "--plan", str(folder / "plan.toml")],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            address = (desk.stdout.readline() if desk.stdout else "").split()[1]
+            with open_chromium(find_chromium()) as browser:
+                page = browser.new_page()
+                page.goto(address)
+                _begin(page)
+                return _watched(page, desk.pid, folder, images)
+        finally:
+            desk.send_signal(signal.SIGINT)
+            desk.wait(60)
+
+
+def _begin(page: "Page") -> None:
+    def press(name: str) -> None:
+        page.get_by_role("button", name=name, exact=True).click()
+
+    press("connect")
+    page.get_by_role("tab", name="Stage").click()
+    press("home")
+    page.get_by_text("homing done").wait_for(timeout=60_000)
+    page.get_by_role("tab", name="Scan").click()
+    page.get_by_label("calibration for the cloud").click()
+    page.get_by_role("option", name="nominal.json").click()
+    press("start")
+
+
+def _watched(page: "Page", desk: int, folder: Path, images: int) -> int:
+    began, measured = time.monotonic(), []
+    print(f"{'images':>8} {'images/s':>9} {'desk/MiB':>9} {'page/MiB':>9}", flush=True)
+    for tenth in range(1, 11):
+        wanted = images * tenth // 10
+        while (done := _done(page)) < wanted and not (folder / "scan.h5").exists():
+            time.sleep(0.2)
+        done = min(done, images)
+        measured.append((memory_mib(desk), heap_mib(page)))
+        rate = done / (time.monotonic() - began)
+        print(f"{done:8d} {rate:9.1f} {measured[-1][0]:9.0f} {measured[-1][1]:9.1f}", flush=True)
+    page.get_by_text("wrote scan.h5").first.wait_for(timeout=60_000)
+    with Capture(folder / "scan.h5") as capture:
+        complete = len(capture) == images
+    grown = [last / first for first, last in zip(measured[1], measured[-1], strict=True)]
+    print(f"grown by {grown[0]:.2f} (desk) and {grown[1]:.2f} (page) since a fifth of the way; complete: {complete}")
+    return int(not complete or max(grown) > GROWTH)
+
+
+def _done(page: "Page") -> int:
+    found = re.search(r"(\d+) of \d+", page.locator("header").inner_text())
+    return int(found[1]) if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000))

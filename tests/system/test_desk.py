@@ -1,0 +1,408 @@
+"""The operator's page in a real browser, with the twin as the hardware: the whole way, faults, viewers.
+
+Screenshots of the first way through are kept in the folder that UWLTS_SCREENSHOTS names.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+import uwlts
+from tests.system.small_board import small_sensor, turned_board
+from tests.waiting import within
+from twin.devices.serve import ServedTwin, serve
+from twin.scene.description import Scene
+from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+COUNT = 8
+DESCRIPTIONS = {
+    "sensor": small_sensor("travel_mm = 120.0", "resolution_mm = 0.01", "settling_s = 0.0"),
+    "board": turned_board("start_mm = -5.0", "step_mm = 2.0", "count = 6"),
+}
+SLOW_MS = 60_000
+
+
+@pytest.fixture(scope="module")
+def served(board: Scene, sensor: Sensor) -> Iterator[ServedTwin]:
+    with serve(board, sensor=sensor, spp=4, speed_up=50.0) as running:
+        yield running
+
+
+class Desk:
+    """A desk in a process of its own, with a folder that holds a plan and a nominal calibration."""
+
+    def __init__(self, folder: Path, served: ServedTwin, sensor_file: Path):
+        self.folder = folder
+        (folder / "sensor.toml").write_text(sensor_file.read_text())
+        (folder / "plan.toml").write_text(
+            f'title = "Board"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{served.camera.address}"\n'
+            f'[stage]\nport = "{served.controller.port}"\nstart_mm = {served.track.start_mm}\nstep_mm = 1.5\n'
+            f'count = {COUNT}\nfeed_mm_per_min = 900.0\n[artefact]\nkind = "plane"\n'
+        )
+        uwlts.write_calibration(folder / "nominal.json", uwlts.nominal(folder / "sensor.toml", medium="air"))
+        words = ["desk", str(folder), "--plan", str(folder / "plan.toml"), "--port", "18300"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "uwlts.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        line = self.process.stdout.readline() if self.process.stdout else ""
+        found = re.search(r"open (\S+) to work, (\S+) to look", line)
+        assert found, line or self.process.communicate()[1]
+        self.operator_address, self.address = found.groups()
+
+    def end(self) -> tuple[int, str]:
+        """Ctrl-C; the exit status and what it wrote to standard error."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+        return self.process.wait(60), self.process.communicate()[1]
+
+
+@pytest.fixture
+def desk(tmp_path: Path, folder: Path, served: ServedTwin) -> Iterator[Desk]:
+    running = Desk(tmp_path, served, folder / "sensor.toml")
+    yield running
+    status, errors = running.end()
+    assert status == 0 and "Traceback" not in errors, errors
+
+
+@pytest.fixture
+def page(desk: Desk, chromium: "Browser") -> "Iterator[Page]":
+    """The operator's page; it asks for nothing beyond this machine, and its scripts fail nowhere."""
+    with watched(chromium.new_page(viewport={"width": 1400, "height": 850})) as opened:
+        opened.set_default_timeout(SLOW_MS)
+        opened.goto(desk.operator_address)
+        yield opened
+        print(opened.locator("header").inner_text(), opened.locator(".log").inner_text(), sep="\n")
+
+
+class watched:
+    """A page whose errors and requests to other machines fail the test."""
+
+    def __init__(self, page: "Page"):
+        self.page = page
+        self.wrong: list[str] = []
+        page.on("pageerror", lambda error: self.wrong.append(str(error)))
+        page.on("request", lambda request: self._asked(request.url))
+
+    def _asked(self, url: str) -> None:
+        if urlsplit(url).hostname not in ("127.0.0.1", None):
+            self.wrong.append(url)
+
+    def __enter__(self) -> "Page":
+        return self.page
+
+    def __exit__(self, *_: Any) -> None:
+        self.page.close()
+        assert not self.wrong
+
+
+def press(page: "Page", name: str) -> None:
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def tab(page: "Page", name: str) -> None:
+    page.get_by_role("tab", name=name, exact=True).click()
+
+
+def says(page: "Page", text: str) -> None:
+    """Wait until the log says something."""
+    page.locator(".log").get_by_text(text).first.wait_for()
+
+
+def shows(page: "Page", text: str) -> None:
+    """Wait until the header says something."""
+    page.locator("header").get_by_text(text).first.wait_for()
+
+
+def connected(page: "Page") -> None:
+    press(page, "connect")
+    says(page, "connected: Grbl")
+    shows(page, "has to be homed")
+    tab(page, "Stage")
+    press(page, "home")
+    says(page, "homing done")
+
+
+def dark(served: ServedTwin) -> bool:
+    return within(1.0, lambda: not served.controller.state().laser_on)
+
+
+def write_scan(path: Path, sensor_file: Path) -> None:
+    """A capture with three images of noise."""
+    sensor = uwlts.load_sensor(sensor_file)
+    header = CaptureHeader(
+        name="old",
+        sensor=sensor,
+        medium_name="air",
+        medium=sensor.medium("air"),
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=sensor.detector.full_scale_dn(),
+    )
+    rng = np.random.default_rng(0)
+    with CaptureWriter(path, header, dtype=np.dtype(np.uint8)) as writer:
+        for k in range(3):
+            image = rng.integers(3, 9, (sensor.camera.height_px, sensor.camera.width_px), np.uint8)
+            writer.append(Frame(image, float(k), False, 1.0, float(k)))
+
+
+def kept(page: "Page", name: str) -> None:
+    if folder := os.environ.get("UWLTS_SCREENSHOTS"):
+        page.screenshot(path=f"{folder}/desk-{name}.png")
+
+
+def test_the_whole_way_of_a_first_time_operator(desk, page, served):
+    kept(page, "begin")
+    connected(page)
+    page.locator('img[src^="picture.jpg"]').wait_for()
+    tab(page, "Connect")
+    press(page, "laser")
+    shows(page, "laser ON for images")
+    page.get_by_text("of 96 profile lines").wait_for()
+    press(page, "find exposure")
+    says(page, "laser: exposed by")
+    kept(page, "laser")
+    tab(page, "Stage")
+    page.get_by_role("button", name="move by +10 mm").click()
+    shows(page, "stage at 12.0")
+    tab(page, "Scan")
+    page.get_by_label("calibration for the cloud").click()
+    page.get_by_role("option", name="nominal.json").click()
+    press(page, "start")
+    shows(page, f"of {COUNT}")
+    kept(page, "scan")
+    says(page, "wrote scan.h5")
+    assert dark(served)
+    with Capture(desk.folder / "scan.h5") as scan:
+        assert len(scan) == COUNT and scan.laser_on.all()
+    page.get_by_text(re.compile(r"scan\.h5: [1-9]\d\d points")).wait_for()
+    tab(page, "Files")
+    press(page, "reconstruct")
+    says(page, "wrote scan.ply")
+    cloud = uwlts.read_cloud(desk.folder / "scan.ply")
+    page.locator(f'.cloud-view[data-points="{len(cloud)}"]').wait_for()
+    tab(page, "Measure")
+    box = page.locator(".cloud-view canvas").first.bounding_box()
+    assert box
+    # Across the profiles: some of the clicks meet points.
+    for v in np.linspace(0.2, 0.8, 61):
+        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] * float(v))
+    press(page, "length")
+    says(page, "length: distance")
+    press(page, "plane")
+    says(page, "plane: standard deviation")
+    kept(page, "measure")
+    line = page.locator(".log").get_by_text("plane: standard deviation").first.inner_text()
+    found = float(re.search(r"deviation ([\d.]+) mm", line)[1])  # type: ignore[index]
+    # The board's points off their plane, by another way: all of them instead of those about the click.
+    centred = cloud.points_mm - cloud.points_mm.mean(axis=0)
+    assert found == pytest.approx(np.linalg.svd(centred)[1][2] / np.sqrt(len(cloud)), rel=0.5)
+    tab(page, "Connect")
+    press(page, "disconnect")
+    says(page, "disconnected")
+
+
+def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
+    connected(page)
+    tab(page, "Scan")
+    page.get_by_label("positions").fill("24")
+    page.get_by_label("step, mm").fill("0.5")
+    press(page, "start")
+    shows(page, "of 24")
+    press(page, "pause")
+    says(page, "paused, the laser is off")
+    assert dark(served)
+    done = re.search(r"(\d+) of 24", page.locator("header").inner_text())
+    page.wait_for_timeout(1500)
+    assert done and re.search(r"(\d+) of 24", page.locator("header").inner_text())[1] == done[1]  # type: ignore[index]
+    press(page, "go on")
+    page.wait_for_timeout(1000)
+    press(page, "stop")
+    says(page, "stopped")
+    assert dark(served) and part_path(desk.folder / "scan.h5").is_file()
+    press(page, "start")
+    says(page, "scan.h5 was interrupted")
+    press(page, "continue interrupted")
+    says(page, "wrote scan.h5")
+    with Capture(desk.folder / "scan.h5") as scan:
+        assert len(scan) == 24
+        np.testing.assert_allclose(np.diff(scan.stage_mm), 0.5, atol=0.011)
+
+
+@pytest.mark.parametrize("how", ["button", "Escape"])
+def test_laser_off_works_in_a_scan(desk, page, served, how):
+    connected(page)
+    tab(page, "Scan")
+    page.get_by_label("positions").fill("60")
+    page.get_by_label("step, mm").fill("0.2")
+    press(page, "start")
+    shows(page, "of 60")
+    if how == "button":
+        press(page, "Laser off")
+    else:
+        page.keyboard.press("Escape")
+    says(page, "laser switched off by hand")
+    assert dark(served)
+    shows(page, "has to be homed")
+    shows(page, "laser off")
+    with Capture(part_path(desk.folder / "scan.h5")) as left:
+        assert 0 < len(left) < 60
+    tab(page, "Stage")
+    press(page, "unlock")
+    says(page, "unlocking done")
+    tab(page, "Scan")
+    press(page, "continue interrupted")
+    shows(page, "of 60")
+
+
+def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page, served):
+    connected(page)
+    tab(page, "Connect")
+    press(page, "laser")
+    assert within(20.0, lambda: served.controller.state().laser_on)
+    press(page, "Laser off")
+    assert dark(served)
+    says(page, "laser switched off by hand")
+    page.wait_for_timeout(1000)
+    assert not served.controller.state().laser_on
+    shows(page, "has to be homed")
+    tab(page, "Stage")
+    press(page, "unlock")
+    says(page, "unlocking done")
+    # The light is not shown again by itself.
+    page.wait_for_timeout(1000)
+    assert not served.controller.state().laser_on
+
+
+def test_a_camera_whose_cable_is_pulled_ends_the_scan_and_is_connected_again(desk, page, served):
+    connected(page)
+    tab(page, "Scan")
+    page.get_by_label("positions").fill("16")
+    press(page, "start")
+    shows(page, "of 16")
+    served.camera.disconnect()
+    try:
+        says(page, "check power and cable")
+        assert dark(served)
+    finally:
+        served.camera.connect()
+    tab(page, "Connect")
+    press(page, "connect")
+    page.locator(".log").get_by_text("connected: Grbl").nth(1).wait_for()
+    tab(page, "Stage")
+    press(page, "home")
+    page.locator(".log").get_by_text("homing done").nth(1).wait_for()
+    tab(page, "Scan")
+    press(page, "continue interrupted")
+    says(page, "wrote scan.h5")
+    with Capture(desk.folder / "scan.h5") as scan:
+        assert len(scan) == 16
+
+
+def test_a_recorded_capture_is_shown_like_a_camera(desk, page, folder):
+    sensor_file = desk.folder / "sensor.toml"
+    write_scan(desk.folder / "old.h5", sensor_file)
+    page.get_by_label("camera").fill(f"replay:{desk.folder / 'old.h5'}")
+    page.get_by_label("stage").fill("")
+    tab(page, "Connect")
+    press(page, "connect")
+    says(page, "no stage is connected")
+    page.locator('img[src^="picture.jpg"]').wait_for()
+    says(page, "all 3 images of")
+    shows(page, "no laser")
+
+
+def test_viewers_look_and_have_no_control(desk, page, chromium, served):
+    connected(page)
+    with watched(chromium.new_page()) as other:
+        other.set_default_timeout(SLOW_MS)
+        other.goto(desk.address)
+        # Who joins late has a picture within 2 s of the page.
+        other.locator('img[src^="picture.jpg"]').wait_for(timeout=2000)
+        assert other.get_by_role("button", name="Laser off").count() == 0
+        assert [each.inner_text() for each in other.get_by_role("button").all()] == ["FIT"]
+        other.keyboard.press("Escape")
+        tab(page, "Stage")
+        press(page, "move")
+        says(other, "homing done")
+        assert other.locator(".log").get_by_text("by hand").count() == 0
+
+
+def test_mistakes_are_said_and_cost_nothing(desk, page, served):
+    tab(page, "Scan")
+    assert page.get_by_role("button", name="start", exact=True).is_disabled()
+    tab(page, "Connect")
+    page.get_by_label("camera").fill("gige:nowhere")
+    press(page, "connect")
+    says(page, "error: ")
+    shows(page, "not connected")
+    page.get_by_label("camera").fill("")
+    press(page, "connect")
+    says(page, "give the camera's address")
+    page.get_by_label("camera").fill(served.camera.address)
+    (desk.folder / "taken.h5").write_bytes(b"a capture")
+    connected(page)
+    tab(page, "Scan")
+    for name, words in (("taken", "taken.h5 exists"), ("../away", "is no name for a file"), ("", "is no name")):
+        page.get_by_label("name of the capture").fill(name)
+        press(page, "start")
+        says(page, words)
+    assert (desk.folder / "taken.h5").read_bytes() == b"a capture"
+    tab(page, "Measure")
+    press(page, "length")
+    says(page, "click two points")
+
+
+def test_keys_alone_are_enough(desk, page):
+    def focused(text: str) -> None:
+        for _ in range(60):
+            page.keyboard.press("Tab")
+            words, role = page.evaluate("[document.activeElement.innerText, document.activeElement.role]")
+            if words.strip().lower() == text and role != "tab":
+                return
+        raise AssertionError(f"{text} is not reached")
+
+    page.get_by_role("button", name="connect", exact=True).wait_for()
+    focused("connect")
+    page.keyboard.press("Enter")
+    says(page, "connected: Grbl")
+    page.locator(".cloud-view").focus()
+    page.keyboard.press("ArrowLeft")
+
+
+def test_the_page_fits_a_tablet(desk, chromium):
+    with watched(chromium.new_page(viewport={"width": 800, "height": 1180}, has_touch=True)) as page:
+        page.goto(desk.operator_address)
+        page.get_by_role("button", name="connect", exact=True).wait_for()
+        kept(page, "tablet")
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        page.get_by_role("button", name="Laser off").tap()
+        says(page, "no laser is connected")
+
+
+def test_ctrl_c_ends_a_scan_in_the_dark(desk, page, served):
+    connected(page)
+    tab(page, "Scan")
+    page.get_by_label("positions").fill("60")
+    page.get_by_label("step, mm").fill("0.2")
+    press(page, "start")
+    shows(page, "of 60")
+    assert desk.end()[0] == 0
+    assert dark(served) and part_path(desk.folder / "scan.h5").is_file()
+
+
+def test_a_folder_that_is_not_there_is_refused(tmp_path):
+    words = ["desk", str(tmp_path / "nowhere")]
+    done = subprocess.run([sys.executable, "-m", "uwlts.cli", *words], capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and "there is no folder" in done.stderr and "Traceback" not in done.stderr

@@ -1,0 +1,147 @@
+"""The desk's folder: what is listed as what, and names that lead elsewhere."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
+from uwlts.model.errors import DescriptionError
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    place = tmp_path / "tank"
+    place.mkdir()
+    (tmp_path / "outside.h5").write_bytes(b"outside")
+    (place / "scan.h5").write_bytes(b"capture")
+    return place
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("scan.h5", "capture"),
+        ("scan.of.today.h5", "capture"),
+        ("scan.h5.part", "interrupted capture"),
+        ("scan.truth.h5", "truth"),
+        ("wall.cloud.h5", "cloud"),
+        ("wall.ply", "cloud"),
+        ("wall.evaluation.json", "evaluation"),
+        ("calibration.json", "calibration"),
+        ("plan.toml", "description"),
+        ("wall.html", "report"),
+        ("notes.txt", ""),
+        ("scan.part", ""),
+        ("h5", ""),
+        ("", ""),
+        ("scan.h5.bak", ""),
+        ("scan.H5", ""),
+    ],
+)
+def test_files_are_known_by_their_names(name, kind):
+    assert kind_of(name) == kind
+
+
+def test_known_files_are_listed_the_latest_first(folder):
+    for age, name in enumerate(("wall.ply", "plan.toml", "calibration.json")):
+        (folder / name).write_bytes(b"x" * age)
+        os.utime(folder / name, (1e9 - age, 1e9 - age))
+    os.utime(folder / "scan.h5", (2e9, 2e9))
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    (folder / ".hidden.h5").write_bytes(b"")
+    (folder / "sub.h5").mkdir()
+    files = listed(folder)
+    assert [file.name for file in files] == ["scan.h5", "wall.ply", "plan.toml", "calibration.json"]
+    assert [(file.kind, file.size, file.time_s) for file in files[:2]] == [("capture", 7, 2e9), ("cloud", 0, 1e9)]
+
+
+def test_what_cannot_be_opened_is_not_listed(folder):
+    os.mkfifo(folder / "fifo.h5")
+    (folder / "gone.h5").symlink_to(folder / "nothing")
+    (folder / "loop.h5").symlink_to(folder / "loop.h5")
+    (folder / "up.h5").symlink_to(folder.parent)
+    assert [file.name for file in listed(folder)] == ["scan.h5"]
+
+
+def test_a_long_list_is_cut(folder):
+    for number in range(600):
+        (folder / f"{number}.ply").touch()
+        os.utime(folder / f"{number}.ply", (number, number))
+    names = [file.name for file in listed(folder)]
+    assert len(names) == 500 and names[:2] == ["scan.h5", "599.ply"]
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(DescriptionError, match="the folder .*nowhere cannot be read"):
+        listed(tmp_path / "nowhere")
+
+
+def test_a_listed_file_is_found(folder):
+    assert file_in(folder, "scan.h5") == folder / "scan.h5"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../outside.h5",
+        "..",
+        ".",
+        "",
+        "/",
+        "./scan.h5",
+        "scan.h5/",
+        "tank/../scan.h5",
+        "../tank/scan.h5",
+        "{outside}",
+        "//scan.h5",
+        "none.h5",
+        "notes.txt",
+        ".hidden.h5",
+        "..h5",
+        "sub.h5",
+        "up.h5",
+        "fifo.h5",
+        "gone.h5",
+        "loop.h5",
+        "scan.h5\0",
+        "\0.h5",
+        f"{'x' * 300}.h5",
+        "scan.h5\n",
+        "sc*n.h5",
+        "\udcff.h5",
+    ],
+)
+def test_names_that_lead_elsewhere_or_to_no_file_are_refused(folder, name):
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    (folder / ".hidden.h5").write_bytes(b"")
+    (folder / "..h5").write_bytes(b"")
+    (folder / "sub.h5").mkdir()
+    os.mkfifo(folder / "fifo.h5")
+    (folder / "gone.h5").symlink_to(folder / "nothing")
+    (folder / "loop.h5").symlink_to(folder / "loop.h5")
+    (folder / "up.h5").symlink_to(folder.parent)
+    with pytest.raises(DescriptionError, match="is not a file of the folder"):
+        file_in(folder, name.format(outside=folder.parent / "outside.h5"))
+
+
+@pytest.mark.parametrize("name", ["wall", "wall.h5", " wall ", "wall-2_b", "größe", "wall.of.today"])
+def test_a_result_gets_its_ending_once(folder, name):
+    path = new_in(folder, name, suffix=".h5")
+    assert path.parent == folder and path.suffix == ".h5" and not path.name.endswith(".h5.h5")
+    assert path.name == path.name.strip()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["", "  ", ".", "..", "/", "../wall", "a/b", "/tmp/wall", ".wall", " .wall", "wall/", "a\0b", "a\nb", "x" * 300],
+)
+def test_names_for_results_that_lead_elsewhere_are_refused(folder, name):
+    with pytest.raises(DescriptionError, match="no name for a file of the folder"):
+        new_in(folder, name, suffix=".h5")
+
+
+def test_an_interrupted_recording_is_noticed(folder):
+    assert not interrupted(folder / "scan.h5")
+    (folder / "scan.h5.part").touch()
+    assert interrupted(folder / "scan.h5")

@@ -1,0 +1,1 @@
+"""The operator's page: scan, calibrate, look and measure in a browser."""

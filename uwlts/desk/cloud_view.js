@@ -1,0 +1,251 @@
+// A point cloud of bounded size: fitted to the view, turned with the mouse or by touch, coloured by a field, with a
+// scale bar, axes and a legend. A click on a point emits its place. Points come from /cloud as float32 (see
+// ThinnedCloud.packed).
+import { OrbitControls, THREE } from "nicegui-scene";
+
+const COLUMNS = 6;
+// Turbo (Mikhailov 2019), polynomials of degree 5 for red, green, blue.
+const TURBO = [
+  [0.13572138, 4.6153926, -42.66032258, 132.13108234, -152.94239396, 59.28637943],
+  [0.09140261, 2.19418839, 4.84296658, -14.18503333, 4.27729857, 2.82956604],
+  [0.1066733, 12.64194608, -60.58204836, 110.36276771, -89.90310912, 27.34824973],
+];
+const turbo = (x) =>
+  TURBO.map((p) => Math.min(1, Math.max(0, p.reduceRight((sum, factor) => sum * x + factor, 0))));
+
+export default {
+  template: `
+    <div class="cloud-view" tabindex="0" aria-label="point cloud; arrow keys turn it, plus and minus zoom, F fits it">
+      <canvas></canvas>
+      <canvas class="axes" width="90" height="90"></canvas>
+      <div class="scale" v-show="count"><div class="bar"></div><span></span></div>
+      <div class="legend" v-show="count"><span>{{ high }}</span><div class="ramp"></div><span>{{ low }}</span>
+        <b>{{ legend }}</b></div>
+      <div class="empty" v-show="!count">{{ problem }}</div>
+    </div>`,
+  props: { field: String, version: Number, marks: Array, fit: Number },
+  data: () => ({ legend: "", low: "", high: "", count: 0, problem: "no points yet" }),
+  mounted() {
+    try {
+      this.renderer = new THREE.WebGLRenderer({ canvas: this.$el.children[0], antialias: true });
+    } catch {
+      this.problem = "this browser draws no WebGL: the cloud cannot be shown";
+      return;
+    }
+    // Colours are shown as they are given.
+    this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    this.renderer.setClearColor(new THREE.Color().setRGB(0.06, 0.08, 0.11));
+    this.scene = new THREE.Scene();
+    // Orthographic, so that the scale holds at every depth.
+    this.camera = new THREE.OrthographicCamera(-100, 100, 100, -100, -1e5, 1e5);
+    this.controls = new OrbitControls(this.camera, this.renderer.domElement);
+    this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("start", () => (this.touched = true));
+    this.geometry = new THREE.BufferGeometry();
+    this.points = new THREE.Points(
+      this.geometry,
+      new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true }),
+    );
+    this.points.frustumCulled = false;
+    this.scene.add(this.points);
+    this.marked = new THREE.Points(
+      new THREE.BufferGeometry(),
+      new THREE.PointsMaterial({ size: 11, sizeAttenuation: false, color: 0xffffff, depthTest: false }),
+    );
+    this.marked.frustumCulled = false;
+    this.scene.add(this.marked);
+    this.origin = [0, 0, 0];
+    this.table = new Float32Array(0);
+    this.fitted = 0;
+    this.resized = new ResizeObserver(() => this.resize());
+    this.resized.observe(this.$el);
+    let pressed = null;
+    const canvas = this.renderer.domElement;
+    canvas.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
+    canvas.addEventListener("pointerup", (event) => {
+      if (pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 4) this.pick(event);
+      pressed = null;
+    });
+    this.$el.addEventListener("keydown", (event) => this.key(event));
+    this.resize();
+    this.load();
+  },
+  beforeUnmount() {
+    this.resized?.disconnect();
+    this.controls?.dispose();
+    this.renderer?.dispose();
+  },
+  watch: {
+    version() { this.load(); },
+    field() { this.colour(); },
+    marks() { this.mark(); },
+    fit() { this.fitAll(); },
+  },
+  methods: {
+    async load() {
+      if (!this.renderer) return;
+      // One at a time; what came meanwhile is fetched afterwards.
+      if (this.loading) { this.again = true; return; }
+      this.loading = true;
+      try {
+        const answer = await fetch("cloud");
+        this.origin = answer.headers.get("X-Origin").split(",").map(Number);
+        this.table = new Float32Array(await answer.arrayBuffer());
+        this.count = this.table.length / COLUMNS;
+        const places = new Float32Array(3 * this.count);
+        for (let k = 0; k < this.count; k++)
+          for (let c = 0; c < 3; c++) places[3 * k + c] = this.table[COLUMNS * k + c] + this.origin[c];
+        this.geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
+        this.colour();
+        // Follows while it grows, until the user turns or zooms.
+        if (!this.touched && this.count > 1.2 * this.fitted) this.fitAll();
+        this.draw();
+        this.$el.dataset.points = this.count;
+      } finally {
+        setTimeout(() => {
+          this.loading = false;
+          if (this.again) { this.again = false; this.load(); }
+        }, 1000);
+      }
+    },
+    column() { return { depth: 2, intensity: 3, deviation: 4, uncertainty: 5 }[this.field] ?? 2; },
+    colour() {
+      if (!this.renderer) return;
+      const column = this.column();
+      const values = [];
+      for (let k = column; k < this.table.length; k += COLUMNS) if (!Number.isNaN(this.table[k])) values.push(this.table[k]);
+      values.sort((a, b) => a - b);
+      const offset = column < 3 ? this.origin[column] : 0;
+      let low = values[Math.floor(0.01 * (values.length - 1))] ?? 0;
+      let high = values[Math.ceil(0.99 * (values.length - 1))] ?? 1;
+      // Deviations are shown about zero.
+      if (this.field === "deviation") { high = Math.max(Math.abs(low), Math.abs(high)); low = -high; }
+      const span = high - low || 1;
+      const colours = new Float32Array(3 * this.count).fill(0.4);
+      for (let k = 0; k < this.count; k++) {
+        const value = this.table[COLUMNS * k + column];
+        if (!Number.isNaN(value)) colours.set(turbo(0.05 + 0.95 * Math.min(1, Math.max(0, (value - low) / span))), 3 * k);
+      }
+      this.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+      const unit = this.field === "intensity" ? "grey values" : "mm";
+      const digits = Math.max(0, 2 - Math.floor(Math.log10(span)));
+      const text = (value) => (value + offset).toFixed(Math.min(digits, 6));
+      this.legend = values.length ? `${this.field}, ${unit}` : `${this.field}: not known`;
+      this.low = values.length ? text(low) : "";
+      this.high = values.length ? text(high) : "";
+      this.draw();
+    },
+    mark() {
+      if (!this.renderer) return;
+      const places = new Float32Array((this.marks ?? []).flat());
+      this.marked.geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
+      this.draw();
+    },
+    resize() {
+      const { clientWidth: width, clientHeight: height } = this.$el;
+      if (!width || !height) return;
+      this.renderer.setPixelRatio(window.devicePixelRatio);
+      this.renderer.setSize(width, height, false);
+      this.aspect();
+      this.draw();
+    },
+    aspect() {
+      const half = this.camera.top;
+      this.camera.right = (half * this.$el.clientWidth) / Math.max(this.$el.clientHeight, 1);
+      this.camera.left = -this.camera.right;
+      this.camera.updateProjectionMatrix();
+    },
+    fitAll() {
+      if (!this.count) return;
+      this.fitted = this.count;
+      this.geometry.computeBoundingBox();
+      const box = this.geometry.boundingBox;
+      const middle = box.getCenter(new THREE.Vector3());
+      const radius = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 1);
+      // As the sensor sees it, a little from the side: X up, Z away.
+      this.camera.up.set(1, 0, 0);
+      this.camera.position.copy(middle).add(new THREE.Vector3(-0.5, 0.35, -1).multiplyScalar(radius));
+      this.controls.target.copy(middle);
+      this.camera.zoom = 1;
+      const wide = Math.min(1, this.$el.clientWidth / Math.max(this.$el.clientHeight, 1));
+      this.camera.top = (1.05 * radius) / wide;
+      this.camera.bottom = -this.camera.top;
+      this.camera.near = -10 * radius;
+      this.camera.far = 10 * radius;
+      this.aspect();
+      this.controls.update();
+      this.draw();
+    },
+    draw() {
+      if (!this.renderer) return;
+      this.renderer.render(this.scene, this.camera);
+      this.showScale();
+      this.showAxes();
+    },
+    showScale() {
+      const perPixel = (2 * this.camera.top) / this.camera.zoom / Math.max(this.$el.clientHeight, 1);
+      const wanted = 120 * perPixel;
+      const ten = 10 ** Math.floor(Math.log10(wanted));
+      const length = [5, 2, 1].map((n) => n * ten).find((n) => n <= wanted);
+      const scale = this.$el.querySelector(".scale");
+      scale.firstChild.style.width = `${length / perPixel}px`;
+      scale.lastChild.textContent = `${Number(length.toPrecision(3))} mm`;
+    },
+    showAxes() {
+      const pen = this.$el.querySelector(".axes").getContext("2d");
+      pen.clearRect(0, 0, 90, 90);
+      pen.font = "12px sans-serif";
+      pen.lineWidth = 2;
+      [["X", "#ff6b6b"], ["Y", "#69db7c"], ["Z", "#74c0fc"]].forEach(([name, colour], k) => {
+        const way = new THREE.Vector3().setComponent(k, 1).transformDirection(this.camera.matrixWorldInverse);
+        pen.strokeStyle = pen.fillStyle = colour;
+        pen.beginPath();
+        pen.moveTo(45, 45);
+        pen.lineTo(45 + 30 * way.x, 45 - 30 * way.y);
+        pen.stroke();
+        pen.fillText(name, 41 + 39 * way.x, 49 - 39 * way.y);
+      });
+    },
+    pick(event) {
+      const box = this.renderer.domElement.getBoundingClientRect();
+      const [u, v] = [event.clientX - box.left, event.clientY - box.top];
+      const place = this.geometry.getAttribute("position");
+      const matrix = new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
+      const point = new THREE.Vector3();
+      let best = null;
+      let nearest = Infinity;
+      for (let k = 0; k < this.count; k++) {
+        point.fromBufferAttribute(place, k).applyMatrix4(matrix);
+        const off = Math.hypot(((point.x + 1) / 2) * box.width - u, ((1 - point.y) / 2) * box.height - v);
+        // Of those under the finger the one in front.
+        if (off < 8 && point.z + off * 1e-3 < nearest) { nearest = point.z + off * 1e-3; best = k; }
+      }
+      if (best === null) return;
+      const at = [0, 1, 2].map((c) => this.table[COLUMNS * best + c] + this.origin[c]);
+      this.$emit("pick", { at });
+    },
+    key(event) {
+      const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+      if (turn) {
+        const from = new THREE.Spherical();
+        const offset = this.camera.position.clone().sub(this.controls.target);
+        const turned = new THREE.Quaternion().setFromUnitVectors(this.camera.up, new THREE.Vector3(0, 1, 0));
+        from.setFromVector3(offset.applyQuaternion(turned));
+        from.theta += 0.1 * turn[0];
+        from.phi = Math.min(Math.PI - 0.05, Math.max(0.05, from.phi + 0.1 * turn[1]));
+        offset.setFromSpherical(from).applyQuaternion(turned.invert());
+        this.camera.position.copy(this.controls.target).add(offset);
+      } else if (event.key === "+" || event.key === "-") {
+        this.camera.zoom *= event.key === "+" ? 1.2 : 1 / 1.2;
+        this.camera.updateProjectionMatrix();
+      } else if (event.key === "f" || event.key === "F") {
+        this.touched = false;
+        this.fitAll();
+      } else return;
+      event.preventDefault();
+      if (event.key.length > 1 || "+-".includes(event.key)) this.touched = true;
+      this.controls.update();
+      this.draw();
+    },
+  },
+};

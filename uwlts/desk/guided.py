@@ -1,0 +1,195 @@
+"""Guided calibrations on the page."""
+
+import queue
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from nicegui import ui
+
+from uwlts.calibration.guidance.pose_advice import Coverage
+from uwlts.desk.board import Board, picture_of, png_of
+from uwlts.desk.page import BoardView, laser_off_button, timed
+from uwlts.desk.server import DeskServer
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.guided.operator import ANSWERS
+from uwlts.hardware.guided.plan import GuidedPlan, load_guided_plan
+from uwlts.hardware.guided.recording import GuidedRecording, guide
+from uwlts.hardware.rig import LaserStage
+
+_COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)
+_MAP_CELL_PX = 48
+
+
+class Ended(Exception):
+    """The operator has ended what was being recorded."""
+
+
+class BoardScreen:
+    """Shows a guided calibration on a board, whose buttons answer."""
+
+    def __init__(self, board: Board):
+        self._board = board
+        self._given: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._stage: LaserStage | None = None
+        self._ending = False
+
+    def press(self, answer: str) -> None:
+        """A button's answer."""
+        self._given.put(answer)
+
+    def end(self) -> None:
+        """End the recording when an answer is next asked for; what was accepted is kept."""
+        self._ending = True
+
+    def laser_off(self) -> None:
+        """Switch the laser off, whatever is being done; the recording ends, what was accepted is kept."""
+        if isinstance(stage := self._stage, GrblStage):
+            stage.darken()
+            self._board.say("laser switched off by hand; the controller was reset", "warning")
+        else:
+            self._board.say("no laser is connected to this program: switch it off by its own switch", "warning")
+
+    def answer(self) -> str | None:
+        """The answer of a button that was pressed since it was last asked, the first of several; Ended after `end`."""
+        if self._ending:
+            raise Ended
+        return None if self._given.empty() else self._given.get()
+
+    def request(self, text: str) -> None:
+        """Show what the operator is asked to do."""
+        self._board.request, self._board.answers = text, ANSWERS
+
+    def live(
+        self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
+    ) -> None:
+        """Show an image (H, W) with the points (N, 2) of the target and the stripe's pixels (N, 2) found in it."""
+        self._board.show(picture_of(image, full_dn=full_dn, caption=remark, stripe=stripe, points=points))
+        if isinstance(self._stage, GrblStage):
+            self._board.laser = "on" if self._stage.laser_power > 0 else "flashing"
+
+    def recorded(self, coverage: Coverage, pixels: list[np.ndarray]) -> None:
+        """Show the coverage, with the points (N, 2) of every image."""
+        self._board.coverage = png_of(coverage_picture(coverage, pixels))
+
+    def add(self, line: str) -> None:
+        """Add a line to the log."""
+        self._board.say(line)
+
+    def connected(self, stage: LaserStage | None) -> None:
+        """The stage that switches the laser from now on; None once it is closed."""
+        self._stage = stage
+        self._board.laser = "flashing" if isinstance(stage, GrblStage) else "none"
+
+
+def coverage_picture(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray:
+    """Map (h, w, 3) of uint8: covered cells green, the others red, a dot for every point (N, 2) of every image."""
+    cells = np.where(coverage.covered[..., None], _COVERED, _EMPTY).astype(np.uint8)
+    picture = np.kron(cells, np.ones((_MAP_CELL_PX, _MAP_CELL_PX, 1), np.uint8))
+    picture[::_MAP_CELL_PX] = picture[:, ::_MAP_CELL_PX] = 30
+    size = np.array(picture.shape[1::-1])
+    for points in pixels:
+        place = ((points + 0.5) / [coverage.width_px, coverage.height_px] * size).astype(int)
+        place = place[((place >= 0) & (place < size)).all(axis=1)]
+        picture[place[:, 1], place[:, 0]] = _DOT
+    return picture
+
+
+def answer_buttons(board: Board, press: Callable[[str], None]) -> Callable[[], None]:
+    """What the operator is asked to do, with a button for each answer; a function that brings them up to date."""
+    with ui.column().classes("p-3 gap-2") as asked:
+        request = ui.label().classes("text-lg font-bold").props('role="status" aria-live="polite"')
+        with ui.row():
+            for answer in ANSWERS:
+                ui.button(answer, on_click=partial(press, answer))
+        ui.label("take: what stands there now; skip: ask for something else; done: go on with what there is").classes(
+            "text-xs"
+        )
+
+    def refresh() -> None:
+        request.set_text(board.request)
+        asked.set_visibility(bool(board.answers))
+
+    return refresh
+
+
+def record_guided(
+    plan: str | Path | GuidedPlan,
+    out: str | Path,
+    *,
+    camera: str | None = None,
+    stage: str | None = None,
+    port: int = 8080,
+    refractions: Literal[1, 2] = 2,
+    distortion: tuple[str, ...] = ("k1", "k2"),
+    resume: bool = False,
+    overwrite: bool = False,
+    report: Callable[[str], None] = print,
+) -> GuidedRecording:
+    """Lead through the images of a calibration and record the good ones, beside the calibration that they are for.
+
+    Parameters
+    ----------
+    plan : GuidedPlan or path of a TOML file
+    out : str or Path
+        The calibration; captures are called like it, with ``-target.h5`` and ``-step.h5``.
+    camera : str, optional
+        Address of the camera, in place of the plan's.
+    stage : str, optional
+        Serial port of the stage, in place of the plan's.
+    port : int
+        Port of the page for the browser; the next free one is taken if it is in use.
+    refractions, distortion
+        As the calibration is going to be made; see `calibrate`.
+    resume : bool
+        Continue with what is recorded, also with a finished capture of the target that is not enough.
+    overwrite : bool
+        Replace earlier recordings; without effect with ``resume``.
+    report : callable, optional
+        Called with lines of text for the operator, who answers on standard input or on the page.
+
+    Raises
+    ------
+    DescriptionError, RangeError
+        The plan cannot be carried out; nothing has moved.
+    HardwareError
+        Camera, stage or laser fail.
+    CalibrationError
+        The target does not give a calibration by which the step standard could be judged.
+    OutputError
+        A capture exists, or cannot be written.
+    """
+    described = plan if isinstance(plan, GuidedPlan) else load_guided_plan(Path(plan))
+    described = described.connected(camera=camera, port=stage)
+    described.camera_address()
+    board = Board(described.title)
+    board.phase("guided calibration")
+    screen = BoardScreen(board)
+
+    def build(board: Board, operator: bool) -> None:
+        view = BoardView(board)
+        with view.header():
+            if operator:
+                laser_off_button(screen.laser_off)
+        with ui.element("main").classes("desk guided"):
+            view.image()
+            with ui.element("section").classes("cloud"):
+                refresh = answer_buttons(board, screen.press) if operator else lambda: None
+                view.coverage()
+            view.log()
+        timed(lambda: (view.refresh(), refresh()))
+
+    with DeskServer(board, build=build, port=port) as server:
+        report(f"open {server.operator_address}; Ctrl-C ends it, what was accepted is kept")
+        return guide(
+            described,
+            Path(out),
+            screen,
+            refractions=refractions,
+            distortion=distortion,
+            resume=resume,
+            overwrite=overwrite,
+            report=report,
+        )

@@ -1,0 +1,484 @@
+"""Camera, stage and laser behind the page: a thread does one piece of work after another and shows images between.
+
+Buttons put work into a queue; only `laser_off`, `pause`, `resume` and `stop` act at once, whatever is being done.
+"""
+
+import os
+import queue
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.calibration.calibrate import calibrate
+from uwlts.desk.board import Board, picture_of
+from uwlts.desk.guided import BoardScreen, Ended
+from uwlts.desk.recording_view import RecordingView
+from uwlts.hardware.camera import CameraDevice
+from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.guided.plan import GuidedPlan
+from uwlts.hardware.guided.recording import guide
+from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, brightness, stripe_of
+from uwlts.hardware.scan_plan import Light, ScanPlan
+from uwlts.hardware.scanning import check_camera, record_scan
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.errors import DescriptionError, Error, HardwareError
+from uwlts.model.sensor import Sensor
+from uwlts.report.inventory import calibration_lines
+from uwlts.storage.calibration_file import load_calibration, write_calibration
+from uwlts.storage.capture import Capture, Frame, part_path
+from uwlts.storage.files import refuse_unsuitable
+
+_PREVIEW_S = 0.15
+"""Pause between two images that are only shown."""
+_WAITING = 64
+"""Images that wait to be shown while a scan goes on; more are recorded, and not shown."""
+
+
+_MOST_LOST = 2
+"""Images in a row that may be lost without an end of the live image."""
+_EARLIER = 200
+"""Images of an interrupted scan that are shown again when it is continued."""
+
+
+class InstrumentState(StrEnum):
+    """What the instrument does; it decides which buttons make sense."""
+
+    DISCONNECTED = "not connected"
+    BUSY = "busy"
+    READY = "ready"
+    LOCKED = "the stage has to be homed, or unlocked where it stood still"
+    SCANNING = "scanning"
+    PAUSED = "paused"
+
+
+@dataclass(frozen=True, eq=False)
+class _Connected:
+    plan: ScanPlan
+    sensor: Sensor
+    camera: CameraDevice
+    stage: LaserStage
+    closing: ExitStack
+
+
+class Instrument:
+    """Does what the operator asks for and shows it on a board, from construction until `close`."""
+
+    def __init__(self, board: Board):
+        self._board = board
+        self._work: queue.Queue[Callable[[], None]] = queue.Queue()
+        self._connected: _Connected | None = None
+        self._ending, self._paused, self._stop = threading.Event(), threading.Event(), threading.Event()
+        self.state = InstrumentState.DISCONNECTED
+        self.light: Light | None = None
+        self._screen: BoardScreen | None = None
+        self._rig: Rig | None = None
+        self._darkened, self._lost = False, 0
+        self.exposure_ms: dict[Light, float] = {"laser": START_MS, "lamp": START_MS}
+        self._thread = threading.Thread(target=self._run, name="instrument", daemon=True)
+        self._thread.start()
+
+    # What acts at once.
+
+    def laser_off(self) -> None:
+        """Switch the laser off, whatever is being done; a movement or a scan ends with it."""
+        self.light = None
+        if (screen := self._screen) is not None:
+            screen.laser_off()
+            return
+        connected = self._connected
+        if connected is None or not isinstance(connected.stage, GrblStage):
+            self._board.say("laser off: no laser is connected", "warning")
+            return
+        self._stop.set()
+        self._paused.clear()
+        self._darkened = True
+        if connected.stage.darken():
+            self._board.say("laser switched off by hand: unlock the stage if it stood still, else home it", "warning")
+        else:
+            self._board.say("the laser CANNOT be switched off: switch its power off before going near", "error")
+        self._show_laser()
+        self._ask(self._after_darkening)
+
+    @property
+    def laser_in_use(self) -> bool:
+        """Whether the laser is lit now and then, or may be."""
+        return self._board.laser in ("on", "flashing") or self.state in (InstrumentState.SCANNING, InstrumentState.BUSY)
+
+    def pause(self) -> None:
+        """Wait, with the laser off, after the image that is being taken."""
+        if self.state == InstrumentState.SCANNING:
+            self._paused.set()
+
+    def resume(self) -> None:
+        """Go on with a scan that waits."""
+        self._paused.clear()
+
+    def stop(self) -> None:
+        """End a scan or a guided calibration after the image that is being taken; it can be continued later."""
+        self._stop.set()
+        self._paused.clear()
+        if (screen := self._screen) is not None:
+            screen.end()
+
+    # What waits for its turn.
+
+    def connect(self, plan: ScanPlan, *, camera: str, stage: str | None) -> None:
+        """Open the camera and the stage, where addresses are given, of a plan's sensor."""
+        self._ask(lambda: self._connect(plan, camera, stage))
+
+    def disconnect(self) -> None:
+        """Close both."""
+        self._ask(self._disconnect)
+
+    def home(self) -> None:
+        """Find the limit switch."""
+        self._ask(lambda: self._moving("homing", lambda stage: stage.home()))
+
+    def unlock(self) -> None:
+        """Take the stage's position as it is."""
+        self._ask(lambda: self._moving("unlocking", lambda stage: stage.unlock()))
+
+    def move(self, position_mm: float) -> None:
+        """Move the stage to a position."""
+        self._ask(lambda: self._move(position_mm))
+
+    def jog(self, by_mm: float) -> None:
+        """Move the stage by some mm."""
+        self._ask(lambda: self._jog(by_mm))
+
+    def find_exposure(self) -> None:
+        """Settle the exposure of the light that is shown."""
+        self._ask(self._find_exposure)
+
+    def scan(self, plan: ScanPlan, out: Path, *, calibration: Path | None, resume: bool, overwrite: bool) -> None:
+        """Record a scan by a plan."""
+        self._ask(lambda: self._scan(plan, out, calibration, resume, overwrite))
+
+    def calibrate(self, plan: GuidedPlan, out: Path, *, resume: bool, overwrite: bool) -> None:
+        """Lead through a guided calibration and calculate it; camera and stage are opened by it."""
+        refuse_unsuitable(out, overwrite=overwrite)
+        self._ask(lambda: self._calibrate(plan, out, resume, overwrite))
+
+    def answer(self, answer: str) -> None:
+        """The operator's answer in a guided calibration."""
+        if (screen := self._screen) is not None:
+            screen.press(answer)
+
+    def close(self) -> None:
+        """End everything; the laser goes off. Without effect the second time."""
+        self._ending.set()
+        self.stop()
+        self._ask(lambda: None)
+        self._thread.join(30.0)
+
+    # The thread.
+
+    def _ask(self, work: Callable[[], None]) -> None:
+        self._work.put(work)
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            try:
+                # An image is shown whenever there is nothing else to do.
+                work = self._work.get(timeout=_PREVIEW_S)
+            except queue.Empty:
+                work = self._preview
+            self._do(work)
+        self._do(self._disconnect)
+
+    def _do(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Ended:
+            self._board.say("stopped")
+        except Error as error:
+            # What was under way when the laser was switched off by hand fails, as it should.
+            if not self._darkened:
+                self._board.say(str(error), "error")
+            self.light = None
+        except Exception as error:
+            traceback.print_exc(file=sys.stderr)
+            self._board.say(f"a defect of the program: {type(error).__name__}: {error}", "error")
+            self.light = None
+        self._settle_state()
+
+    def _settle_state(self) -> None:
+        connected, board = self._connected, self._board
+        if connected is None:
+            self.state = InstrumentState.DISCONNECTED
+        elif isinstance(connected.stage, GrblStage) and not connected.stage.position_known:
+            self._rig = None
+            self.state = InstrumentState.LOCKED
+        else:
+            self.state = InstrumentState.READY
+        how_it_ended = self.state == InstrumentState.READY and board.progress.phase in ("finished", "stopped")
+        if board.progress.phase != self.state and not how_it_ended:
+            board.phase(self.state, busy=False)
+        self._show_laser()
+
+    def _show_laser(self) -> None:
+        stage = None if self._connected is None else self._connected.stage
+        if not isinstance(stage, GrblStage):
+            self._board.laser = "none"
+        elif stage.laser_unreachable:
+            self._board.laser = "unknown"
+        elif stage.laser_power > 0:
+            self._board.laser = "on"
+        else:
+            self._board.laser = "flashing" if self.light == "laser" or self.state == InstrumentState.SCANNING else "off"
+
+    def _begin(self, phase: str) -> _Connected:
+        if self._connected is None:
+            raise HardwareError("nothing is connected: connect a camera first")
+        self.state = InstrumentState.BUSY
+        self._board.phase(phase)
+        return self._connected
+
+    def _connect(self, plan: ScanPlan, camera: str, port: str | None) -> None:
+        self._disconnect()
+        self.state = InstrumentState.BUSY
+        self._board.phase("connecting")
+        if not camera:
+            raise DescriptionError("give the camera's address, as in gige:NAME or replay:scan.h5")
+        sensor = plan.described_sensor()
+        with ExitStack() as stack:
+            opened = stack.enter_context(open_camera(camera))
+            check_camera(opened, sensor)
+            moved: LaserStage = HandSwitchedLaser(self._board.say)
+            if port is not None:
+                moved = stack.enter_context(GrblStage(port))
+            self._connected = _Connected(plan, sensor, opened, moved, stack.pop_all())
+        self.exposure_ms |= plan.planned_ms()
+        self._board.say(f"connected: {opened.info.name} {opened.info.serial}".strip())
+        if isinstance(moved, GrblStage):
+            low, high = moved.limits_mm
+            self._board.say(f"connected: Grbl {moved.version} on {port}, travel {low:g} to {high:g} mm")
+            self._board.position_mm = moved.position_mm() if moved.position_known else None
+        else:
+            self._board.say("no stage is connected: images are shown, nothing can be scanned")
+        self.light = "lamp"
+
+    def _disconnect(self) -> None:
+        connected, self._connected, self._rig, self.light = self._connected, None, None, None
+        if connected is not None:
+            self._board.position_mm = None
+            try:
+                connected.closing.close()
+            except Error as error:
+                self._board.say(str(error), "warning")
+            self._board.say("disconnected")
+
+    def _stage(self, connected: _Connected) -> GrblStage:
+        if not isinstance(connected.stage, GrblStage):
+            raise HardwareError("no stage is connected")
+        return connected.stage
+
+    def _rig_of(self, connected: _Connected) -> Rig:
+        """What takes images; made anew when something else has used camera or stage."""
+        if self._rig is None:
+            plan, stage = connected.plan, connected.stage
+            self._rig = Rig(plan, plan.stage, connected.sensor, connected.camera, stage, ahead=plan.stage.step_mm)
+        return self._rig
+
+    def _moving(self, phase: str, work: Callable[[GrblStage], float]) -> None:
+        stage, self._rig = self._stage(self._begin(phase)), None
+        self._stop.clear()
+        self._board.position_mm = work(stage)
+        self._board.say(f"{phase} done: the stage is at {self._board.position_mm:.3f} mm")
+
+    def _move(self, position_mm: float) -> None:
+        connected = self._begin(f"moving to {position_mm:.3f} mm")
+        self._stage(connected)
+        self._board.position_mm = self._rig_of(connected).move_to(position_mm)
+
+    def _jog(self, by_mm: float) -> None:
+        stage = self._stage(self._begin("moving"))
+        low, high = stage.limits_mm
+        self._move(float(np.clip(stage.position_mm() + by_mm, low, high)))
+
+    def _after_darkening(self) -> None:
+        connected = self._connected
+        try:
+            if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
+                # Meets the reset, so that what it did is known.
+                connected.stage.position_mm()
+        except HardwareError:
+            pass
+        finally:
+            self._darkened = False
+
+    def _shown_light(self, connected: _Connected) -> Light | None:
+        """The light that is shown; nothing switches a laser without a stage, or with one that is locked."""
+        switched = isinstance(connected.stage, GrblStage) and connected.stage.position_known
+        return self.light if switched else self.light and "lamp"
+
+    def _find_exposure(self) -> None:
+        connected = self._begin("finding the exposure")
+        light = self._shown_light(connected)
+        if light is None:
+            raise HardwareError("choose first which light is shown")
+        found = self._rig_of(connected).settled_exposure(light, start_ms=self.exposure_ms[light])
+        if found is None:
+            self._board.say(f"too dark for a {light} image even at the longest exposure", "warning")
+            return
+        self.exposure_ms[light] = found
+        self._board.say(f"{light}: exposed by {found:.4g} ms")
+
+    def _preview(self) -> None:
+        connected = self._connected
+        if connected is None or connected.stage.faulty or (light := self._shown_light(connected)) is None:
+            return
+        try:
+            image, exposure_ms = self._rig_of(connected).image(light, self.exposure_ms[light])
+        except HardwareError:
+            # A busy computer loses frames now and then.
+            self._lost += 1
+            if self._lost > _MOST_LOST or connected.stage.faulty or not connected.camera.running:
+                raise
+            return
+        self._lost = 0
+        seen = brightness(image, connected.sensor, light)
+        full = connected.sensor.detector.full_scale_dn()
+        pixels, caption = (
+            None,
+            f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of the full scale",
+        )
+        if light == "laser":
+            stripe = stripe_of(image, connected.sensor)
+            line, centre = stripe.lines, stripe.centre_px[stripe.lines]
+            along = connected.sensor.camera.stripe_along
+            pixels = np.stack([line, centre] if along == "width" else [centre, line], axis=1)
+            caption += f"; stripe on {len(line)} of {len(stripe.status)} profile lines"
+        saturated = seen.saturated / max(seen.counted, 1)
+        self._board.show(picture_of(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
+
+    def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
+        known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)
+        connected, board = self._begin("beginning the scan"), self._board
+        stage = self._stage(connected)
+        self._stop.clear()
+        self._paused.clear()
+        header = plan.header(out.stem)
+        view, shown = RecordingView(board, header, known, name=out.name), _Aside()
+        begun: list[int] = []
+        if resume and part_path(out).is_file():
+            with Capture(part_path(out)) as earlier:
+                for number in range(0, len(earlier), -(-len(earlier) // _EARLIER) or 1):
+                    view.see(earlier[number], number)
+
+        def progress(done: int, total: int) -> None:
+            begun[:] = begun or [done - 1]
+            board.count(done, total, before=begun[0])
+            self._show_laser()
+
+        def report(line: str) -> None:
+            board.say(line)
+            if line in ("recording", "finding the exposures", "checking for lost steps"):
+                board.phase(line)
+
+        # The rig knows neither exposure nor place any more.
+        self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
+        self._show_laser()
+        try:
+            with shown:
+                seen = record_scan(
+                    plan,
+                    out,
+                    camera=connected.camera,
+                    stage=stage,
+                    resume=resume,
+                    overwrite=overwrite,
+                    progress=progress,
+                    report=report,
+                    warn=lambda text: board.say(text, "warning"),
+                    between=self._between,
+                    recorded=lambda frame, number: shown.put(view, frame, number),
+                )
+        finally:
+            board.phase("stopped", busy=False)
+            # Never the laser again by itself.
+            self.light = kept_light and "lamp"
+        board.position_mm = stage.position_mm()
+        for warning in seen.warnings():
+            board.say(warning, "warning")
+        board.say(f"wrote {out.name}")
+        board.phase("finished", busy=False)
+
+    def _calibrate(self, plan: GuidedPlan, out: Path, resume: bool, overwrite: bool) -> None:
+        self._disconnect()
+        board = self._board
+        self.state = InstrumentState.BUSY
+        board.phase("guided calibration")
+        screen = self._screen = BoardScreen(board)
+        nobody = os.open(os.devnull, os.O_RDONLY)
+        try:
+            recording = guide(plan, out, screen, resume=resume, overwrite=overwrite, report=board.say, answers=nobody)
+        finally:
+            os.close(nobody)
+            self._screen, board.request, board.answers = None, "", ()
+        for line in recording.missing:
+            board.say(f"still missing: {line}; go on with it for more images", "warning")
+        board.phase("calibrating")
+        found = calibrate(
+            air=recording.air, water=recording.water, step=recording.step, poses=recording.poses, refractions=2
+        )
+        write_calibration(out, found, overwrite=overwrite)
+        for line in calibration_lines(found):
+            board.say(line)
+        for warning in found.origin().warnings:
+            board.say(warning, "warning")
+        board.say(f"wrote {out.name}")
+        board.phase("finished", busy=False)
+
+    def _between(self) -> None:
+        """Between two images of a scan."""
+        if self._paused.is_set():
+            self.state, before = InstrumentState.PAUSED, self._board.progress
+            self._board.say("paused, the laser is off")
+            while self._paused.is_set():
+                time.sleep(0.05)
+            self.state, self._board.progress = InstrumentState.SCANNING, before
+        if self._stop.is_set():
+            raise Ended
+        self._show_laser()
+
+
+class _Aside:
+    """Shows recorded images in a thread of its own, so that recording never waits for it."""
+
+    def __init__(self) -> None:
+        self._waiting: queue.Queue[tuple[RecordingView, Frame, int] | None] = queue.Queue(_WAITING)
+        self._fault: Exception | None = None
+
+    def put(self, view: RecordingView, frame: Frame, number: int) -> None:
+        """Show an image soon; not at all where too many wait."""
+        if not self._waiting.full():
+            self._waiting.put((view, frame, number))
+
+    def _show(self) -> None:
+        while (seen := self._waiting.get()) is not None:
+            view, frame, number = seen
+            try:
+                view.see(frame, number)
+            except Exception as error:
+                self._fault = self._fault or error
+
+    def __enter__(self) -> "_Aside":
+        self._thread = threading.Thread(target=self._show, name="view", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        self._waiting.put(None)
+        self._thread.join()
+        if self._fault is not None and kind is None:
+            raise self._fault

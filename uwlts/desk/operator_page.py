@@ -1,0 +1,506 @@
+"""The desk: the whole work of an operator on one page."""
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import get_args
+from urllib.parse import quote
+
+import numpy as np
+from nicegui import ui
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+
+from uwlts.desk.board import Board
+from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
+from uwlts.desk.guided import answer_buttons
+from uwlts.desk.instrument import Instrument, InstrumentState
+from uwlts.desk.page import BoardView, build_board, laser_off_button, timed
+from uwlts.desk.server import DeskServer
+from uwlts.hardware.guided.plan import load_guided_plan
+from uwlts.hardware.scan_plan import ScanPlan, load_plan
+from uwlts.measurement.inspection import Shape, length_between, point_near, shape_near
+from uwlts.measurement.reconstruction import reconstruct
+from uwlts.model.errors import DescriptionError, Error
+from uwlts.report.inventory import describe
+from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.files import refuse_unsuitable
+
+_LIST_S = 2.0
+_MOST_SHOWN = 300_000
+_JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)
+_FREE = (InstrumentState.READY, InstrumentState.LOCKED)
+_RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
+
+
+@dataclass
+class _Opened:
+    """The cloud that is shown and measured, and the places that were picked in it."""
+
+    cloud: PointCloud | None = None
+    picked: list[np.ndarray] = field(default_factory=list)
+
+
+def serve_desk(
+    folder: str | Path = Path(),
+    *,
+    plan: str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    report: Callable[[str], None] = print,
+) -> None:
+    """Serve the operator's page until Ctrl-C: connect, look, move, scan, reconstruct and measure in a browser.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder with plans, calibrations, captures and clouds; results are written there.
+    plan : str or Path, optional
+        Plan of a scan to begin with, with the addresses of camera and stage.
+    host : str
+        Address at which the page is served; the default can be reached from this machine only.
+    port : int
+        Port of the page; the next free one is taken if it is in use.
+    report : callable, optional
+        Called with lines of text, the first with the operator's address of the page.
+
+    Raises
+    ------
+    DescriptionError
+        There is no such folder, or the plan is not valid.
+    SetupError
+        The page cannot be served.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise DescriptionError(f"there is no folder {place}: give one for captures and results")
+    begun = None if plan is None else load_plan(Path(plan))
+    board = Board(f"desk: {place.resolve().name}")
+    with closing(Instrument(board)) as instrument:
+        work = _Desk(place, board, instrument, None if plan is None else Path(plan), begun)
+        with DeskServer(board, build=work.build, host=host, port=port) as server:
+            try:
+                work.serve_files(server)
+                report(f"open {server.operator_address} to work, {server.address} to look; Ctrl-C ends it")
+                if server.warning:
+                    report(f"warning: {server.warning}")
+                threading.Event().wait()
+            except KeyboardInterrupt:
+                # Before the page, which may take its time.
+                instrument.close()
+                report("closed")
+
+
+class _Desk:
+    """What all browsers share: the folder, the instrument, the chosen plan and the opened cloud."""
+
+    def __init__(
+        self, folder: Path, board: Board, instrument: Instrument, plan_path: Path | None, plan: ScanPlan | None
+    ):
+        self.folder, self.board, self.instrument = folder, board, instrument
+        self.plan_path, self.plan = plan_path, plan
+        self.opened = _Opened()
+
+    def serve_files(self, server: DeskServer) -> None:
+        """Let browsers fetch the folder's reports."""
+
+        @server.app.get("/files/{name}")
+        def file(name: str, request: Request) -> Response:
+            try:
+                path = file_in(self.folder, name)
+            except Error as error:
+                return PlainTextResponse(f"{error}\n", 404)
+            if kind_of(name) != "report" and not server.is_operator(request):
+                return PlainTextResponse("only the operator may fetch this\n", 403)
+            # A report's own scripts must not press the operator's buttons.
+            return FileResponse(path, headers={"Content-Security-Policy": "sandbox allow-scripts allow-popups"})
+
+    def build(self, board: Board, operator: bool) -> None:
+        """Build the page for a browser."""
+        if operator:
+            _OperatorPage(self).build()
+        else:
+            build_board(board, False)
+
+    def plans(self, load: Callable[[Path], object]) -> dict[str, str]:
+        """Names of the valid plans to choose from, as ``load`` reads them, by their paths."""
+        paths = [self.folder / file.name for file in listed(self.folder) if file.kind == "description"]
+        if self.plan_path is not None and self.plan_path not in paths:
+            paths.append(self.plan_path)
+        found = {}
+        for path in paths:
+            with suppress(Error):
+                load(path)
+                found[str(path)] = path.name
+        return found
+
+    def calibrations(self) -> list[str]:
+        """The calibrations to choose from."""
+        return [file.name for file in listed(self.folder) if file.kind == "calibration"]
+
+    def show_cloud(self, name: str, cloud: PointCloud) -> None:
+        """Show a cloud, thinned if it is large, and have it measured."""
+        self.opened = _Opened(cloud)
+        self.board.cloud.clear()
+        self.board.cloud_name = name
+        kept = slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)
+        known = cloud.uncertainty
+        std = None if known is None else np.linalg.norm(known[kept].std_mm(), axis=1)
+        deviation = None if cloud.deviation_mm is None else cloud.deviation_mm[kept]
+        self.board.cloud.add(
+            cloud.points_mm[kept], len(cloud), intensity=cloud.intensity[kept], deviation=deviation, uncertainty=std
+        )
+
+    def measured(self) -> PointCloud:
+        """The cloud to measure: the opened one, else what a scan shows."""
+        if self.opened.cloud is not None:
+            return self.opened.cloud
+        points = self.board.cloud.points()
+        none = np.full(len(points), -1)
+        return PointCloud(points[:, :3], points[:, 3], none, none, metadata={})
+
+
+class _OperatorPage:
+    """The operator's page in one browser."""
+
+    def __init__(self, desk: _Desk):
+        self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
+        self._view = BoardView(desk.board, picked=self._picked)
+        self._only: list[tuple[ui.button, tuple[InstrumentState, ...]]] = []
+        self._files: tuple[object, ...] = ()
+        self._exposed: tuple[object, float] | None = None
+
+    def build(self) -> None:
+        """Build all of it."""
+        view, instrument = self._view, self._instrument
+        with view.header():
+            laser_off_button(instrument.laser_off, in_use=lambda: instrument.laser_in_use)
+        with ui.element("main").classes("desk"):
+            view.image()
+            view.cloud()
+            with ui.element("section").classes("tools").props('aria-label="controls"'):
+                with ui.tabs().props("dense no-caps align=left") as tabs:
+                    names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Measure"]
+                    shown = {name: ui.tab(name) for name in names}
+                with ui.tab_panels(tabs, value=shown["Connect"]).classes("w-full").props("keep-alive"):
+                    for name, part in zip(names, self._parts(), strict=True):
+                        with ui.tab_panel(shown[name]).classes("gap-2"):
+                            part()
+            view.log()
+        timed(self._refresh)
+        ui.timer(_LIST_S, self._list)
+
+    def _parts(self) -> tuple[Callable[[], None], ...]:
+        return (
+            self._connect_part,
+            self._stage_part,
+            self._calibrate_part,
+            self._scan_part,
+            self._files_part,
+            self._measure_part,
+        )
+
+    def _button(
+        self, label: str, press: Callable[[], object], states: tuple[InstrumentState, ...] | None = None
+    ) -> ui.button:
+        """A button whose errors are shown; it can be pressed in some states only."""
+
+        async def pressed() -> None:
+            try:
+                done = press()
+                if isinstance(done, Awaitable):
+                    await done
+            except Error as error:
+                self._board.say(str(error), "error")
+                ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
+
+        button = ui.button(label, on_click=pressed)
+        if states is not None:
+            self._only.append((button, states))
+        return button
+
+    def _refresh(self) -> None:
+        self._view.refresh()
+        self._show_request()
+        light = self._instrument.light
+        self._light.value = light or "none"
+        if (shown := (light, self._instrument.exposure_ms[light or "lamp"])) != self._exposed:
+            # Not while the operator types in it.
+            self._exposed, self._exposure.value = shown, shown[1]
+        for element, states in self._only:
+            element.set_enabled(self._instrument.state in states)
+
+    # Connect
+
+    def _connect_part(self) -> None:
+        plans, begun = self._desk.plans(load_plan), self._desk.plan
+        chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
+        self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
+        self._camera = ui.input("camera", placeholder="gige:NAME, genicam:PRODUCER.cti, replay:FILE").classes("w-full")
+        self._stage = ui.input("stage", placeholder="/dev/ttyACM0; empty: none").classes("w-full")
+        if begun is not None:
+            self._fill(begun)
+        with ui.row():
+            self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
+            self._button("disconnect", self._instrument.disconnect, _FREE).props("outline")
+        ui.separator()
+        ui.label("live image").classes("text-sm")
+        with ui.row().classes("items-center"):
+            self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
+            self._light.on_value_change(lambda event: self._look(event.value))
+            self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
+        self._exposure = ui.number("exposure, ms", min=0.001, step=0.1, format="%.3g")
+        self._exposure.on("change", self._expose)
+        ui.label("With the laser's light the laser is lit only while an image is exposed.").classes("text-xs")
+
+    def _choose(self) -> None:
+        if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
+            return
+        try:
+            plan = load_plan(Path(self._plan.value))
+        except Error as error:
+            self._board.say(str(error), "error")
+            return
+        self._desk.plan_path, self._desk.plan = Path(self._plan.value), plan
+        self._fill(plan)
+        self._fill_scan(plan)
+
+    def _fill(self, plan: ScanPlan) -> None:
+        self._camera.value, self._stage.value = plan.camera or "", plan.stage.port or ""
+
+    def _chosen_plan(self) -> ScanPlan:
+        if self._desk.plan is None:
+            raise DescriptionError("choose a plan first; valid ones of the folder are offered (docs/how-to/scan.md)")
+        return self._desk.plan
+
+    def _connect(self) -> None:
+        self._instrument.connect(self._chosen_plan(), camera=self._camera.value or "", stage=self._stage.value or None)
+
+    def _look(self, light: str) -> None:
+        self._instrument.light = None if light == "none" else "laser" if light == "laser" else "lamp"
+
+    def _expose(self) -> None:
+        light, value = self._instrument.light, self._exposure.value
+        if light is not None and value:
+            self._instrument.exposure_ms[light] = float(value)
+
+    # Stage
+
+    def _stage_part(self) -> None:
+        with ui.row():
+            self._button("home", self._instrument.home, _FREE)
+            self._button("unlock", self._instrument.unlock, _FREE).props("outline")
+        ui.label("Unlock only where nothing moved since the position was known.").classes("text-xs")
+        with ui.row().classes("gap-1"):
+            for by in _JOGS_MM:
+                label = f"{by:+g}".replace("-", "−")
+                self._button(label, partial(self._instrument.jog, by), (InstrumentState.READY,)).props(
+                    f'outline dense aria-label="move by {by:+g} mm"'
+                )
+        with ui.row().classes("items-center"):
+            place = ui.number("position, mm", value=0.0, format="%.3f")
+            self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (InstrumentState.READY,))
+
+    # Calibrate
+
+    def _calibrate_part(self) -> None:
+        self._guided_plan = ui.select(self._desk.plans(load_guided_plan), label="plan of the calibration").classes(
+            "w-full"
+        )
+        self._calibration_name = ui.input("name of the calibration", value="calibration").classes("w-full")
+        self._replace = ui.checkbox("replace an existing one")
+        with ui.row():
+            self._button("begin", lambda: self._calibrate(resume=False), (InstrumentState.DISCONNECTED, *_FREE))
+            self._button(
+                "go on with it", lambda: self._calibrate(resume=True), (InstrumentState.DISCONNECTED, *_FREE)
+            ).props("outline")
+        self._show_request = answer_buttons(self._board, self._instrument.answer)
+        self._button("stop", self._instrument.stop, (InstrumentState.BUSY,)).props("color=warning")
+        self._view.coverage()
+
+    def _calibrate(self, *, resume: bool) -> None:
+        if not self._guided_plan.value:
+            raise DescriptionError("choose a plan of a calibration first (docs/how-to/calibrate-live.md)")
+        plan = load_guided_plan(Path(self._guided_plan.value))
+        plan = plan.connected(camera=self._camera.value or None, port=self._stage.value or None)
+        out = new_in(self._desk.folder, self._calibration_name.value or "", suffix=".json")
+        self._instrument.calibrate(plan, out, resume=resume, overwrite=bool(self._replace.value))
+
+    # Scan
+
+    def _scan_part(self) -> None:
+        with ui.row():
+            self._start = ui.number("first position, mm", format="%.3f")
+            self._step = ui.number("step, mm", format="%.4f")
+            self._number = ui.number("positions", min=1, precision=0)
+        self._extent = ui.label().classes("text-sm")
+        for each in (self._start, self._step, self._number):
+            each.on_value_change(self._show_extent)
+        self._calibration = ui.select([], label="calibration for the cloud", clearable=True).classes("w-full")
+        self._out = ui.input("name of the capture", value="scan").classes("w-full")
+        self._overwrite = ui.checkbox("replace an existing capture")
+        with ui.row():
+            self._button("start", lambda: self._record(resume=False), (InstrumentState.READY,))
+            self._button("continue interrupted", lambda: self._record(resume=True), (InstrumentState.READY,)).props(
+                "outline"
+            )
+        with ui.row():
+            self._button("pause", self._instrument.pause, (InstrumentState.SCANNING,))
+            self._button("go on", self._instrument.resume, (InstrumentState.PAUSED,))
+            self._button("stop", self._instrument.stop, _RUNNING).props("color=warning")
+        if self._desk.plan is not None:
+            self._fill_scan(self._desk.plan)
+
+    def _fill_scan(self, plan: ScanPlan) -> None:
+        stage = plan.stage
+        self._start.value, self._step.value, self._number.value = stage.start_mm, stage.step_mm, stage.count
+
+    def _show_extent(self) -> None:
+        start, step, count = self._start.value, self._step.value, self._number.value
+        if start is not None and step is not None and count is not None:
+            self._extent.set_text(f"{start:g} to {start + step * (count - 1):g} mm")
+
+    def _record(self, *, resume: bool) -> None:
+        plan = self._chosen_plan()
+        start, step, count = self._start.value, self._step.value, self._number.value
+        if start is None or step is None or count is None:
+            raise DescriptionError("give the first position, the step and the number of positions")
+        moved = {"start_mm": start, "step_mm": step, "count": int(count)}
+        stage = type(plan.stage).model_validate(plan.stage.model_dump() | moved)
+        out = new_in(self._desk.folder, self._out.value or "", suffix=".h5")
+        overwrite = bool(self._overwrite.value)
+        if out.exists() and not overwrite and not resume:
+            raise DescriptionError(f"{out.name} exists: give another name, or tick 'replace'")
+        if interrupted(out) and not resume and not overwrite:
+            raise DescriptionError(f"{out.name} was interrupted: continue it, give another name, or tick 'replace'")
+        known = self._calibration.value
+        self._desk.opened = _Opened()
+        self._instrument.scan(
+            plan.model_copy(update={"stage": stage}),
+            out,
+            calibration=self._desk.folder / known if known else None,
+            resume=resume,
+            overwrite=overwrite and not resume,
+        )
+
+    # Files
+
+    def _files_part(self) -> None:
+        self._rows = ui.column().classes("w-full gap-1")
+        self._list()
+
+    def _list(self) -> None:
+        """Bring the list of files and the choices up to date where the folder has changed."""
+        try:
+            files = listed(self._desk.folder)
+        except Error as error:
+            self._board.say(str(error), "error")
+            return
+        # A recording that grows is no other file.
+        known = tuple((file.name, None if file.kind == "interrupted capture" else file.time_s) for file in files)
+        if known == self._files:
+            return
+        self._files = known
+        self._calibration.set_options(self._desk.calibrations(), value=self._calibration.value)
+        for choice, load in ((self._plan, load_plan), (self._guided_plan, load_guided_plan)):
+            choice.set_options(self._desk.plans(load), value=choice.value)
+        self._rows.clear()
+        with self._rows:
+            for file in files:
+                with ui.row().classes("w-full items-center no-wrap gap-2 text-sm"):
+                    ui.label(file.name).classes("grow break-all font-mono")
+                    ui.label(f"{file.kind}, {_size_text(file.size)}").classes("text-xs text-slate-500")
+                    name = file.name
+                    if file.kind == "report":
+                        ui.link("open", f"files/{quote(name)}", new_tab=True)
+                        continue
+                    if file.kind == "cloud":
+                        self._button("show", partial(self._show, name)).props("flat dense")
+                    if file.kind == "capture":
+                        self._button("reconstruct", partial(self._reconstruct, name)).props("flat dense")
+                    self._button("about", partial(self._about, name)).props("flat dense")
+
+    async def _show(self, name: str) -> None:
+        path = file_in(self._desk.folder, name)
+        self._desk.show_cloud(name, await asyncio.to_thread(read_cloud, path))
+        self._view.mark([])
+
+    async def _about(self, name: str) -> None:
+        text = await asyncio.to_thread(describe, file_in(self._desk.folder, name))
+        with ui.dialog() as dialog, ui.card().classes("max-w-none"):
+            ui.label(name).classes("font-bold")
+            ui.label(text).classes("whitespace-pre-wrap font-mono text-sm")
+            ui.button("close", on_click=dialog.close)
+        dialog.open()
+
+    async def _reconstruct(self, name: str) -> None:
+        known = self._calibration.value
+        if not known:
+            raise DescriptionError("choose the calibration first, under Scan")
+        folder, board = self._desk.folder, self._board
+        capture, calibration = file_in(folder, name), file_in(folder, known)
+        out = new_in(folder, Path(name).stem, suffix=".ply")
+        refuse_unsuitable(out, overwrite=False)
+        board.say(f"reconstructing {name} with {known}")
+        cloud = await asyncio.to_thread(reconstruct, capture, calibration)
+        await asyncio.to_thread(write_cloud, out, cloud, overwrite=False)
+        for warning in cloud.warnings:
+            board.say(warning, "warning")
+        board.say(f"wrote {out.name}, {len(cloud):,} points")
+        self._desk.show_cloud(out.name, cloud)
+
+    # Measure
+
+    def _measure_part(self) -> None:
+        ui.label("Click points in the cloud: the last two give a length, the last one the middle of a shape.").classes(
+            "text-sm"
+        )
+        self._places = ui.label("no point is picked").classes("text-sm font-mono whitespace-pre-wrap")
+        with ui.row():
+            self._button("length", self._length)
+            self._button("forget points", self._forget).props("flat")
+        with ui.row().classes("items-center"):
+            self._radius = ui.number("radius about the point, mm", value=15.0, min=0.01)
+            for shape in get_args(Shape):
+                self._button(shape, partial(self._shape, shape)).props("outline dense")
+        self._results = ui.column().classes("w-full gap-1 text-sm font-mono")
+
+    def _picked(self, place: np.ndarray) -> None:
+        picked = self._desk.opened.picked
+        if picked and np.array_equal(picked[-1], place):
+            return
+        picked.append(place)
+        del picked[:-2]
+        self._view.mark(picked)
+        self._places.set_text("\n".join(f"X {x:.3f}  Y {y:.3f}  Z {z:.3f} mm" for x, y, z in picked))
+
+    def _forget(self) -> None:
+        self._desk.opened.picked.clear()
+        self._view.mark([])
+        self._places.set_text("no point is picked")
+
+    def _length(self) -> None:
+        picked, cloud = self._desk.opened.picked, self._desk.measured()
+        if len(picked) < 2:
+            raise DescriptionError("click two points in the cloud first")
+        self._result(length_between(cloud, *(point_near(cloud, place) for place in picked)).text())
+
+    async def _shape(self, shape: Shape) -> None:
+        picked, cloud = self._desk.opened.picked, self._desk.measured()
+        if not picked:
+            raise DescriptionError("click a point in the cloud first")
+        radius = float(self._radius.value or 0.0)
+        self._result((await asyncio.to_thread(shape_near, cloud, picked[-1], radius, shape)).text())
+
+    def _result(self, text: str) -> None:
+        self._board.say(text)
+        with self._results:
+            ui.label(text).move(target_index=0)
+
+
+def _size_text(size: int) -> str:
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"

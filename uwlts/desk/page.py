@@ -1,0 +1,207 @@
+"""The page of the board: state, live image, cloud and log; the desk's controls come beside them."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+
+import numpy as np
+from nicegui import ui
+from nicegui.events import KeyEventArguments
+
+from uwlts.desk.board import KEPT_LINES, Board, LaserState, Line, Picture
+from uwlts.desk.cloud_view import CloudView
+from uwlts.desk.thinned_cloud import FIELDS
+
+_REFRESH_S = 0.2
+_LASER: dict[LaserState, tuple[str, str]] = {
+    "none": ("no laser", "bg-slate-600"),
+    "off": ("laser off", "bg-green-700"),
+    "flashing": ("laser ON for images", "bg-red-600"),
+    "on": ("laser ON", "bg-red-600"),
+    "unknown": ("laser may be ON: switch its power off", "bg-red-600"),
+}
+_STYLE = """
+.desk { display: grid; gap: 10px; grid-template-columns: minmax(300px, 1fr) minmax(340px, 1.5fr) minmax(370px, 1fr);
+  grid-template-rows: minmax(0, 1fr) 170px; grid-template-areas: "image cloud tools" "log log tools";
+  height: calc(100vh - 84px); width: 100%; }
+.desk.looking { grid-template-columns: 1fr 1.6fr; grid-template-areas: "image cloud" "log log"; }
+.desk > * { min-width: 0; min-height: 0; border: 1px solid #d5dae1; border-radius: 6px; background: white; }
+.desk.guided { grid-template-columns: 1fr 1fr; grid-template-areas: "image cloud" "log log"; }
+@media (max-width: 1000px) {
+  .desk, .desk.looking, .desk.guided { display: flex; flex-direction: column; height: auto; }
+  .cloud-view { min-height: 50vh; }
+  .image img { max-height: 45vh; }
+  .desk .log { height: 200px; }
+}
+.image { grid-area: image; overflow: hidden; padding: 8px; display: flex; flex-direction: column; }
+.image img { width: 100%; min-height: 0; object-fit: contain; object-position: top; }
+.tools .q-tab { padding: 0 6px; min-height: 40px; }
+.cloud { grid-area: cloud; display: flex; flex-direction: column; }
+.tools { grid-area: tools; overflow: auto; }
+.log { grid-area: log; overflow: auto; padding: 6px 10px; font-family: monospace; font-size: 13px; }
+.log .warning { color: #9a5b00; } .log .error { color: #b00020; font-weight: bold; }
+.cloud-view { position: relative; flex: 1; min-height: 200px; outline-offset: -2px; overflow: hidden; }
+.cloud-view > canvas:first-child { position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; }
+.cloud-view .axes { position: absolute; left: 4px; bottom: 4px; pointer-events: none; }
+.cloud-view .scale { position: absolute; right: 12px; bottom: 10px; color: white; text-align: right; font-size: 13px;
+  pointer-events: none; }
+.cloud-view .bar { border: 2px solid white; border-top: none; height: 6px; margin-left: auto; }
+.cloud-view .legend { position: absolute; right: 12px; top: 10px; color: white; font-size: 12px; display: flex;
+  flex-direction: column; align-items: flex-end; pointer-events: none; }
+.cloud-view .ramp { width: 14px; height: 110px; margin: 3px 0; background: linear-gradient(to top, #23171b, #4860e6,
+  #2aabee, #2ee5ae, #6afd6a, #c0ee3d, #feb927, #fe6e1a, #c2270a, #900c00); }
+.cloud-view .empty { position: absolute; inset: 0; display: flex; align-items: center; justify-content: center;
+  color: #8a94a3; pointer-events: none; }
+"""
+
+
+class BoardView:
+    """The parts of the page that show a board; `refresh` brings them up to date. Made for every browser anew."""
+
+    def __init__(self, board: Board, *, picked: Callable[[np.ndarray], None] | None = None):
+        self._board, self._picked = board, picked
+        self._pictures, self._coverage, self._line = -1, b"", -1
+        # The parts that not every page has.
+        self._cloud: CloudView | None = None
+        self._map: ui.element | None = None
+
+    def header(self) -> AbstractContextManager[object]:
+        """The bar on top, to which controls may be added."""
+        ui.add_css(_STYLE)
+        ui.query(".nicegui-content").classes("p-2")
+        bar = ui.header().classes("items-center py-2 gap-4 bg-slate-800")
+        with bar:
+            ui.label(self._board.title).classes("text-lg font-bold")
+            self._laser = ui.label().props('role="status"').classes("px-3 py-1 rounded font-bold")
+            with ui.column().classes("grow gap-0"):
+                self._phase = ui.label().props('role="status" aria-live="polite"')
+                self._bar = ui.linear_progress(0, show_value=False, size="6px").props("instant-feedback")
+        return bar
+
+    def image(self) -> None:
+        """The latest image, its histogram and what is known of it."""
+        with ui.element("section").classes("image").props('aria-label="latest image"'):
+            self._image = ui.element("img").props('alt="latest image"')
+            self._image.set_visibility(False)
+            self._caption = ui.label("no image yet").classes("text-sm")
+            self._histogram = ui.html("", sanitize=False)
+
+    def coverage(self) -> None:
+        """What a guided calibration has seen of the image."""
+        with ui.column().classes("p-3") as self._seen:
+            ui.label("parts of the image that the target was seen in")
+            self._map = ui.element("img").props('alt="coverage of the image"').style("max-height: 40vh")
+        self._seen.set_visibility(False)
+
+    def cloud(self) -> None:
+        """The cloud, and how it is coloured."""
+        with ui.element("section").classes("cloud").props('aria-label="cloud"'):
+            shown = self._cloud = CloudView(self._picked)
+            with ui.row().classes("items-center px-2 py-1 gap-3"):
+                colours = ui.select(["depth", *FIELDS], value="depth", label="colour").props("dense")
+                colours.classes("w-32").on_value_change(lambda event: shown.colour_by(event.value))
+                ui.button("fit", on_click=shown.fit).props("flat dense")
+                self._count = ui.label().classes("text-sm")
+
+    def log(self) -> None:
+        """All that was said, the latest first."""
+        self._log = ui.element("section").classes("log").props('aria-label="log" role="log" tabindex="0"')
+
+    def mark(self, places_mm: Sequence[np.ndarray]) -> None:
+        """Mark places (3,) in the cloud."""
+        if self._cloud is not None:
+            self._cloud.mark_places(places_mm)
+
+    def refresh(self) -> None:
+        """Show what has changed."""
+        board = self._board
+        text, colour = _LASER[board.laser]
+        self._laser.set_text(text)
+        self._laser.classes(remove=" ".join(each for _, each in _LASER.values()), add=colour)
+        self._phase.set_text(_progress_text(board))
+        progress = board.progress
+        self._bar.set_value(progress.done / progress.total if progress.total else 0.0)
+        waiting = progress.busy and not progress.total
+        self._bar.props(add="indeterminate" if waiting else None, remove=None if waiting else "indeterminate")
+        if board.pictures != self._pictures and (picture := board.picture) is not None:
+            self._pictures = board.pictures
+            self._image.props(f'src="picture.jpg?{self._pictures}"').set_visibility(True)
+            self._caption.set_text(picture.caption)
+            self._histogram.set_content(_histogram(picture))
+        if board.coverage is not None and board.coverage is not self._coverage:
+            self._coverage = board.coverage
+            if self._map is not None:
+                self._map.props(f'src="coverage.png?{time.monotonic_ns()}"')
+                self._seen.set_visibility(True)
+        if self._cloud is not None:
+            self._cloud.show_version(board.cloud.version)
+            name = f"{board.cloud_name}: " if board.cloud_name else ""
+            self._count.set_text(f"{name}{board.cloud.total:,} points")
+        for line in board.lines(self._line):
+            self._line = line.number
+            with self._log:
+                shown = ui.label(_line_text(line)).classes(line.kind)
+            shown.move(target_index=0)
+            if len(self._log.default_slot.children) > KEPT_LINES:
+                self._log.remove(-1)
+
+
+def _progress_text(board: Board) -> str:
+    progress, place = board.progress, board.position_mm
+    text = progress.phase
+    if progress.total is not None:
+        text += f", {progress.done} of {progress.total}"
+    if progress.left_s is not None:
+        text += f", {math.ceil(progress.left_s) // 60} min {math.ceil(progress.left_s) % 60} s left"
+    return text if place is None else f"{text} · stage at {place:.3f} mm"
+
+
+def _line_text(line: Line) -> str:
+    kind = "" if line.kind == "note" else f"{line.kind}: "
+    return f"{time.strftime('%H:%M:%S', time.localtime(line.time_s))}  {kind}{line.text}"
+
+
+def _histogram(picture: Picture) -> str:
+    """Bars of the grey values, on a logarithmic scale from a hundred-thousandth of all pixels."""
+    heights = np.clip(1 + np.log10(np.maximum(picture.histogram, 1e-5)) / 5, 0.0, 1.0)
+    bars = "".join(
+        f'<rect x="{4 * k}" y="{40 - 40 * height:.1f}" width="3.4" height="{40 * height:.1f}"/>'
+        for k, height in enumerate(heights.tolist())
+    )
+    saturated = "" if picture.saturated is None else f"{100 * picture.saturated:.1f} % of the lit lines saturated"
+    return (
+        f'<svg viewBox="0 0 {4 * len(heights)} 40" style="width:100%;height:60px" role="img" '
+        f'aria-label="histogram of grey values"><g fill="#456">{bars}</g></svg>'
+        f'<div style="display:flex;justify-content:space-between;font-size:12px"><span>grey value 0</span>'
+        f"<span>{saturated}</span><span>full scale</span></div>"
+    )
+
+
+def build_board(board: Board, operator: bool) -> None:
+    """The page of those who only look."""
+    view = BoardView(board)
+    view.header()
+    with ui.element("main").classes("desk looking"):
+        view.image()
+        view.cloud()
+        view.log()
+    timed(view.refresh)
+
+
+def timed(refresh: Callable[[], object]) -> None:
+    """Bring a browser's page up to date several times a second, and at once."""
+    refresh()
+    ui.timer(_REFRESH_S, refresh)
+
+
+def laser_off_button(switch_off: Callable[[], None], *, in_use: Callable[[], bool] = lambda: True) -> None:
+    """A button that works in every state; so does the key Escape while the laser is ``in_use``."""
+
+    def pressed(event: KeyEventArguments) -> None:
+        # It also closes menus, which must not reset a controller at rest.
+        if event.action.keydown and event.key.escape and in_use():
+            switch_off()
+
+    ui.button("Laser off", on_click=switch_off, icon="flash_off", color="red").props('size="lg"')
+    ui.keyboard(pressed, ignore=[])

@@ -1,0 +1,175 @@
+"""A recording on the page while it grows: its latest image with the stripe, warnings, and the cloud so far."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.desk.board import Board, picture_of
+from uwlts.desk.server import DeskServer
+from uwlts.measurement.reconstruction import reconstruct_stripes
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.errors import CaptureError
+from uwlts.storage.calibration_file import loaded_calibration
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path
+from uwlts.stripe import FoundStripes, extract_stripe
+
+_LOOK_S = 0.25
+_FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
+"""A laser image is faint below this part of the full scale, saturated with more than this part of its lines there; it
+shows hardly any stripe below this part of its lines."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Profile:
+    """The stripe of one laser image: pixels (N, 2), points (N, 3) in mm, their grey values, warnings."""
+
+    pixels: np.ndarray
+    points_mm: np.ndarray
+    intensity: np.ndarray
+    lines: int
+    saturated: float
+    remarks: tuple[str, ...]
+
+
+class RecordingView:
+    """Shows the images of one recording after another on a board; ``calibration`` is for the cloud.
+
+    CalibrationError, from `see`, where the calibration does not fit the recording.
+    """
+
+    def __init__(self, board: Board, header: CaptureHeader, calibration: AnyCalibration | None, *, name: str = ""):
+        self._board, self._header, self._calibration = board, header, calibration
+        self._found = self._lines = 0
+        self._said: set[str] = set()
+        board.cloud.clear()
+        board.cloud_name = name or header.name
+
+    def see(self, frame: Frame, number: int) -> None:
+        """Show an image, and its profile in the cloud."""
+        board, full = self._board, self._header.saturation_dn
+        light = "laser" if frame.laser_on else "lamp"
+        caption = f"image {number + 1}, {light}, stage at {frame.stage_mm:.3f} mm, exposure {frame.exposure_ms:.3g} ms"
+        board.position_mm = frame.stage_mm
+        if not frame.laser_on:
+            board.show(picture_of(frame.image, full_dn=full, caption=caption))
+            return
+        profile = _profile(frame, self._header, self._calibration)
+        self._found, self._lines = self._found + len(profile.pixels), self._lines + profile.lines
+        caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
+        board.show(
+            picture_of(frame.image, full_dn=full, caption=caption, stripe=profile.pixels, saturated=profile.saturated)
+        )
+        if len(profile.points_mm):
+            board.cloud.add(profile.points_mm, intensity=profile.intensity)
+        for remark in profile.remarks:
+            # Once each: they stay in the log.
+            if remark not in self._said:
+                self._said.add(remark)
+                board.say(f"image {number + 1}: {remark}", "warning")
+
+
+def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
+    along, full = header.sensor.camera.stripe_along, header.saturation_dn
+    stripe = extract_stripe(frame.image, stripe_along=along, saturation=full)
+    line, points, intensity = stripe.lines, np.empty((0, 3)), np.empty(0)
+    centre = stripe.centre_px[line]
+    if calibration is not None and len(line):
+        own = np.zeros(len(line), dtype=int)
+        stripes = FoundStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
+        cloud = reconstruct_stripes(FrameTable.of(header, [frame]), stripes, calibration)
+        points, intensity = cloud.points_mm, cloud.intensity
+    brightest = frame.image.max(axis=0 if along == "width" else 1)
+    saturated, remarks = float((brightest >= full).mean()), []
+    if saturated > _MANY:
+        remarks.append("saturated on many lines: shorten the exposure")
+    elif np.quantile(brightest, 0.98) < _FAINT * full:
+        remarks.append("faint: lengthen the exposure, or is the laser lit?")
+    if len(line) < _FEW * len(stripe.status):
+        remarks.append("hardly any stripe: is the object in the volume?")
+    pixels = np.stack([line, centre] if along == "width" else [centre, line], axis=1)
+    return _Profile(pixels, points, intensity, len(stripe.status), saturated, tuple(remarks))
+
+
+def frames_of(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:
+    """Every image of a recording as it is written, with its number; None whenever there is nothing new.
+
+    Ends after the finished file's. CaptureError where the finished file is damaged.
+    """
+    shown = 0
+    while True:
+        finished = path.is_file() and not part_path(path).exists()
+        current = path if finished else part_path(path)
+        try:
+            with Capture(current) as capture:
+                for number in range(shown, len(capture)):
+                    yield capture.header, number, capture[number]
+                    shown = number + 1
+        except CaptureError:
+            # Not there yet, or just being renamed.
+            if finished:
+                raise
+        if finished:
+            return
+        yield None
+
+
+def watch(
+    capture: str | Path,
+    *,
+    calibration: AnyCalibration | str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    report: Callable[[str], None] = print,
+) -> None:
+    """Show a recording while it grows, in a browser, until Ctrl-C.
+
+    Parameters
+    ----------
+    capture : str or Path
+        Capture that is being recorded, or is to be.
+    calibration : Calibration, PolynomialCalibration or path, optional
+        Calibration of the sensor, for the cloud.
+    host : str
+        Address at which the page is served; the default can be reached from this machine only.
+    port : int
+        Port of the page; the next free one is taken if it is in use.
+    report : callable, optional
+        Called with lines of text, the first with the address of the page.
+
+    Raises
+    ------
+    CaptureError, CalibrationError
+        The finished capture is damaged; the calibration cannot be read, or does not fit the capture.
+    """
+    path, count = Path(capture), 0
+    known = None if calibration is None else loaded_calibration(calibration)
+    board = Board(path.name)
+    board.phase("waiting for the first image")
+    with DeskServer(board, host=host, port=port) as server:
+        try:
+            report(f"open {server.address}; Ctrl-C ends it")
+            if server.warning:
+                report(f"warning: {server.warning}")
+            view, begun = None, 0
+            for seen in frames_of(path):
+                if seen is None:
+                    time.sleep(_LOOK_S)
+                    continue
+                header, number, frame = seen
+                if view is None:
+                    board.phase("recording")
+                    view, begun = RecordingView(board, header, known, name=path.name), number
+                view.see(frame, number)
+                planned = header.provenance.get("images")
+                count = number + 1
+                if isinstance(planned, int) and planned >= count:
+                    board.count(count, planned, before=begun)
+            board.progress = replace(board.progress, phase="finished", left_s=None, busy=False)
+            report(f"{path} is finished with {count} images; the page stays until Ctrl-C")
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            report("closed")

@@ -1,0 +1,175 @@
+"""Serves the page, in a thread of its own, at the wanted port or the next free one."""
+
+import errno
+import logging
+import socket
+import threading
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Self
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import Client, ui
+from starlette.requests import Request
+from starlette.responses import Response
+
+from uwlts.desk.access import GuardedApp, PageAccess, is_local
+from uwlts.desk.board import Board
+from uwlts.model.errors import SetupError
+
+_START_S, _END_S = 30.0, 5.0
+_PORTS = 100
+"""Ports that are tried after the wanted one."""
+_LATEST = {"Cache-Control": "no-store"}
+_ALONE = threading.Lock()
+"""Held by the page that is served."""
+
+
+def _application(**settings: Any) -> FastAPI:
+    return FastAPI(openapi_url=None, docs_url=None, redoc_url=None, **settings)
+
+
+@cache
+def _nicegui() -> FastAPI:
+    """NiceGUI, of which a process has one; it shows what its ``state.show`` builds, of one page after another."""
+    app = _application()
+
+    def root(request: Request) -> None:
+        app.state.show(request)
+
+    ui.run_with(app, root=root, show_welcome_message=False, reconnect_timeout=10.0, language="en-US")
+    return app
+
+
+class DeskServer:
+    """A page that shows a board; served from construction on, until the ``with`` ends. One at a time.
+
+    A browser finds it at its ``address``. Everybody who opens it there may look; controls are shown, and obeyed, at the
+    ``operator_address``, which has a token. ``warning`` is what to say where the page can be seen from other machines.
+    ``build`` adds what the page has besides the board, and is told whether for the operator. SetupError where no port
+    is free, the address is not one of this machine, or this process serves a page already.
+    """
+
+    def __init__(
+        self,
+        board: Board,
+        *,
+        build: Callable[[Board, bool], None] | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ):
+        from uwlts.desk.page import build_board
+
+        self._access, nicegui = PageAccess(host), _nicegui()
+        self._app = _application(lifespan=nicegui.router.lifespan_context)
+        self._add_content(board)
+        # What nothing else answers, whenever that is added.
+        self._app.router.default = nicegui
+
+        def show(request: Request) -> None:
+            ui.page_title(board.title)
+            (build or build_board)(board, self.is_operator(request))
+
+        if not _ALONE.acquire(blocking=False):
+            raise SetupError("this program serves a page already: close that one first")
+        try:
+            self._socket = _bound(host, port)
+            named = f"[{host}]" if ":" in host else host
+            self.address = f"http://{named}:{self._socket.getsockname()[1]}"
+            self.operator_address = f"{self.address}/?token={self._access.token}"
+            self.warning = None
+            if not is_local(host):
+                self.warning = (
+                    f"everybody who reaches {host} in the network can see the page, and what is sent is not encrypted: "
+                    "safer is the default host with `ssh -L`"
+                )
+            self._open = True
+            nicegui.state.show = show
+            # Only errors: a browser that goes away in the middle of an answer is none.
+            config = uvicorn.Config(GuardedApp(self._app, self._access), log_level=logging.CRITICAL, ws_max_size=2**20)
+            self._server = uvicorn.Server(config)
+            self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="page", daemon=True)
+            self._thread.start()
+            self._await_start()
+        except BaseException:
+            _ALONE.release()
+            raise
+
+    def _await_start(self) -> None:
+        started = threading.Event()
+        deadline = _START_S
+        while not self._server.started:
+            if deadline <= 0 or not self._thread.is_alive():
+                raise SetupError("the page's server did not start")
+            started.wait(0.02)
+            deadline -= 0.02
+
+    def _add_content(self, board: Board) -> None:
+        """What browsers fetch apart from the page itself."""
+
+        @self._app.get("/picture.jpg")
+        def picture() -> Response:
+            shown = board.picture
+            return Response(shown.jpeg if shown else b"", 200 if shown else 204, _LATEST, "image/jpeg")
+
+        @self._app.get("/coverage.png")
+        def coverage() -> Response:
+            shown = board.coverage
+            return Response(shown or b"", 200 if shown else 204, _LATEST, "image/png")
+
+        @self._app.get("/cloud")
+        def cloud() -> Response:
+            origin, data = board.cloud.packed()
+            headers = _LATEST | {"X-Origin": ",".join(map(str, origin.tolist()))}
+            return Response(data, 200, headers, "application/octet-stream")
+
+    @property
+    def app(self) -> FastAPI:
+        """The application, to serve more than the board."""
+        return self._app
+
+    def is_operator(self, request: Request) -> bool:
+        """Whether a request is the operator's."""
+        return self._access.is_operator(request.headers)
+
+    def close(self) -> None:
+        """End the page."""
+        if not self._open:
+            return
+        self._open = False
+        self._server.should_exit = self._server.force_exit = True
+        self._thread.join(_END_S)
+        self._socket.close()
+        # A browser that still shows this page must not reach it through the next one.
+        for client in list(Client.instances.values()):
+            client.delete()
+        _ALONE.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """A socket at the port, or the next free one."""
+    try:
+        family, *_, place = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+    except OSError as error:
+        raise SetupError(f"'{host}' is no address to serve a page at: {error.strerror}") from error
+    for wanted in range(port, min(port + _PORTS, 65536)) if port else (0,):
+        found = socket.socket(family, socket.SOCK_STREAM)
+        # A port that was just closed can be used again.
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            found.bind((place[0], wanted, *place[2:]))
+            found.listen()
+        except OSError as error:
+            found.close()
+            if error.errno != errno.EADDRINUSE:
+                raise SetupError(f"cannot serve a page at {host}, port {wanted}: {error.strerror}") from error
+            continue
+        return found
+    raise SetupError(f"no free port from {port} on at {host}")

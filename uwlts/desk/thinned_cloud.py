@@ -1,0 +1,67 @@
+"""A cloud of bounded size for the view: every n-th of all points, with n doubled whenever they become too many."""
+
+import threading
+
+import numpy as np
+
+FIELDS = ("intensity", "deviation", "uncertainty")
+"""What points may be coloured by, besides their coordinates: grey values, mm, mm."""
+_COLUMNS = 3 + len(FIELDS)
+
+
+class ThinnedCloud:
+    """Points in mm with their fields, NaN where unknown; at most ``at_most`` of them are kept. Safe between threads.
+
+    ``version`` grows with every change, ``total`` counts all points that were added.
+    """
+
+    def __init__(self, at_most: int = 300_000):
+        self._lock, self._at_most = threading.Lock(), at_most
+        self._clear()
+        self.version = 0
+
+    def _clear(self) -> None:
+        self._table = np.empty((self._at_most, _COLUMNS))
+        self._count, self._added, self._stride, self.total = 0, 0, 1, 0
+
+    def clear(self) -> None:
+        """Begin anew without points."""
+        with self._lock:
+            self._clear()
+            self.version += 1
+
+    def add(self, points_mm: np.ndarray, of: int | None = None, **fields: np.ndarray | None) -> None:
+        """Add points (N, 3), a part ``of`` so many, with fields (N,), by the names in `FIELDS`."""
+        with self._lock:
+            first = -self._added % self._stride
+            self._added += len(points_mm)
+            self.total += len(points_mm) if of is None else of
+            kept = slice(first, None, self._stride)
+            table = np.full((len(points_mm[kept]), _COLUMNS), np.nan)
+            table[:, :3] = points_mm[kept]
+            for column, name in enumerate(FIELDS, 3):
+                if (values := fields.get(name)) is not None:
+                    table[:, column] = values[kept]
+            while len(table):
+                fitting, table = np.split(table, [self._at_most - self._count])
+                self._table[self._count : self._count + len(fitting)] = fitting
+                self._count += len(fitting)
+                if self._count == self._at_most:
+                    # As the points that are kept lie a stride apart, every other one of both.
+                    self._stride *= 2
+                    halved = self._table[::2].copy()
+                    self._table[: len(halved)], self._count = halved, len(halved)
+                    table = table[self._at_most % 2 :: 2]
+            self.version += 1
+
+    def points(self) -> np.ndarray:
+        """The points (N, 6) that are kept: coordinates in mm, then the fields."""
+        with self._lock:
+            return self._table[: self._count].copy()
+
+    def packed(self) -> tuple[np.ndarray, bytes]:
+        """Origin (3,) in mm, and the points from it with their fields as float32, row by row, for the browser."""
+        table = self.points()
+        origin = np.round(np.median(table[:, :3], axis=0)) if len(table) else np.zeros(3)
+        table[:, :3] -= origin
+        return origin, table.astype("<f4").tobytes()
