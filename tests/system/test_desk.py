@@ -213,6 +213,7 @@ def test_the_whole_way_of_a_first_time_operator(desk, page, served):
     says(page, "disconnected")
 
 
+@pytest.mark.slow
 def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     connected(page)
     tab(page, "Scan")
@@ -240,7 +241,7 @@ def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
         np.testing.assert_allclose(np.diff(scan.stage_mm), 0.5, atol=0.011)
 
 
-@pytest.mark.parametrize("how", ["button", "Escape"])
+@pytest.mark.parametrize("how", ["button", pytest.param("Escape", marks=pytest.mark.slow)])
 def test_laser_off_works_in_a_scan(desk, page, served, how):
     connected(page)
     tab(page, "Scan")
@@ -285,6 +286,7 @@ def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page,
     assert not served.controller.state().laser_on
 
 
+@pytest.mark.slow
 def test_a_camera_whose_cable_is_pulled_ends_the_scan_and_is_connected_again(desk, page, served):
     connected(page)
     tab(page, "Scan")
@@ -310,6 +312,7 @@ def test_a_camera_whose_cable_is_pulled_ends_the_scan_and_is_connected_again(des
         assert len(scan) == 16
 
 
+@pytest.mark.slow
 def test_a_recorded_capture_is_shown_like_a_camera(desk, page, folder):
     sensor_file = desk.folder / "sensor.toml"
     write_scan(desk.folder / "old.h5", sensor_file)
@@ -364,6 +367,7 @@ def test_mistakes_are_said_and_cost_nothing(desk, page, served):
     says(page, "click two points")
 
 
+@pytest.mark.slow
 def test_keys_alone_are_enough(desk, page):
     def focused(text: str) -> None:
         for _ in range(60):
@@ -381,6 +385,7 @@ def test_keys_alone_are_enough(desk, page):
     page.keyboard.press("ArrowLeft")
 
 
+@pytest.mark.slow
 def test_the_page_fits_a_tablet(desk, chromium):
     with watched(chromium.new_page(viewport={"width": 800, "height": 1180}, has_touch=True)) as page:
         page.goto(desk.operator_address)
@@ -391,6 +396,7 @@ def test_the_page_fits_a_tablet(desk, chromium):
         says(page, "no laser is connected")
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_scan_in_the_dark(desk, page, served):
     connected(page)
     tab(page, "Scan")

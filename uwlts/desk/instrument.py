@@ -41,8 +41,6 @@ _PREVIEW_S = 0.15
 """Pause between two images that are only shown."""
 _WAITING = 64
 """Images that wait to be shown while a scan goes on; more are recorded, and not shown."""
-
-
 _MOST_LOST = 2
 """Images in a row that may be lost without an end of the live image."""
 _EARLIER = 200
@@ -348,10 +346,7 @@ class Instrument:
         self._lost = 0
         seen = brightness(image, connected.sensor, light)
         full = connected.sensor.detector.full_scale_dn()
-        pixels, caption = (
-            None,
-            f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of the full scale",
-        )
+        caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of full scale", None
         if light == "laser":
             stripe = stripe_of(image, connected.sensor)
             line, centre = stripe.lines, stripe.centre_px[stripe.lines]

@@ -281,7 +281,10 @@ class _OperatorPage:
         self._instrument.connect(self._chosen_plan(), camera=self._camera.value or "", stage=self._stage.value or None)
 
     def _look(self, light: str) -> None:
-        self._instrument.light = None if light == "none" else "laser" if light == "laser" else "lamp"
+        wanted = None if light == "none" else "laser" if light == "laser" else "lamp"
+        # The toggle follows the instrument, too.
+        if wanted != self._instrument.light:
+            self._instrument.light = wanted
 
     def _expose(self) -> None:
         light, value = self._instrument.light, self._exposure.value
