@@ -19,7 +19,7 @@ import twin.cli
 import uwlts
 import uwlts.cli
 from tests.system.in_process import run_program
-from uwlts.model.command_files import OUTPUTS
+from uwlts.model.command_files import OUTPUTS, command_files, note_input, own_files
 from uwlts.model.errors import OutputError
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.files import refuse_unsuitable, written_aside
@@ -265,3 +265,33 @@ def test_a_locked_hdf5_output_can_be_written(tmp_path):
     with written_aside(tmp_path / "a.h5") as aside, h5py.File(aside, "w") as file:
         file["a"] = 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_the_works_of_a_program_that_goes_on_are_apart(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("old", encoding="utf-8")
+    with command_files({"folder": tmp_path}):
+        with own_files():
+            note_input(path)
+            with pytest.raises(OutputError, match="it is an input of this command"):
+                refuse_unsuitable(path, overwrite=True)
+        # What one work has read another may replace, and it holds what it writes until its own end only.
+        with own_files():
+            refuse_unsuitable(path, overwrite=True)
+            with written_aside(path, overwrite=True) as aside:
+                aside.write_text("new", encoding="utf-8")
+            assert writer_elsewhere(path) == "another"
+        assert writer_elsewhere(path) == "none"
+    assert path.read_text(encoding="utf-8") == "new"
+
+
+def writer_elsewhere(path: Path) -> str:
+    """What another process finds that wants to write a path."""
+    program = (
+        "import sys\nfrom pathlib import Path\nfrom uwlts.model.errors import OutputError\n"
+        "from uwlts.storage.one_writer import one_writer\n"
+        "try:\n    with one_writer(Path(sys.argv[1])):\n        print('none')\n"
+        "except OutputError:\n    print('another')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True)
+    return done.stdout.strip()

@@ -3,13 +3,21 @@
 import os
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
-from uwlts.model.errors import DescriptionError
+from uwlts.measurement.evaluation import FORMAT as EVALUATION_FORMAT
+from uwlts.model.errors import DescriptionError, Error
 from uwlts.model.input_file import is_regular_file
+from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
+from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.capture import part_path
+from uwlts.storage.cloud import is_cloud
+from uwlts.storage.files import read_json
 
 _SHOWN = 500
+_REMEMBERED = 4 * _SHOWN
+_FORMATS = {CALIBRATION_FORMAT: "calibration", POLYNOMIAL_FORMAT: "calibration", EVALUATION_FORMAT: "evaluation"}
 _LONGEST_NAME = 200
 """Of a new file, in bytes: file systems take 255, with all that is appended."""
 
@@ -32,28 +40,26 @@ def listed(folder: Path) -> list[ListedFile]:
     except OSError as error:
         raise DescriptionError(f"the folder {folder} cannot be read: {error.strerror}") from error
     for entry in entries:
-        kind = kind_of(entry.name)
         # What was renamed or removed meanwhile, and links in a circle, are none.
         with suppress(OSError):
-            if kind and not entry.name.startswith(".") and entry.is_file():
+            if kind_of(entry.name) and not entry.name.startswith(".") and entry.is_file():
                 about = entry.stat()
-                found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
+                if kind := _kind_by_content(entry.path, about.st_mtime_ns):
+                    found.append(ListedFile(entry.name, kind, about.st_size, about.st_mtime))
     return sorted(found, key=lambda file: file.time_s, reverse=True)[:_SHOWN]
 
 
 def kind_of(name: str) -> str:
-    """What a file is by its name; empty where the program makes no such files."""
+    """What a file may be by its name; empty where the program makes no such files."""
     match name.split("."):
         case [_, *_, "h5", "part"]:
             return "interrupted capture"
         case [_, *_, "truth", "h5"]:
             return "truth"
-        case [_, *_, "cloud", "h5"] | [_, *_, "ply"]:
+        case [_, *_, "ply"]:
             return "cloud"
         case [_, *_, "h5"]:
             return "capture"
-        case [_, *_, "evaluation", "json"]:
-            return "evaluation"
         case [_, *_, "json"]:
             return "calibration"
         case [_, *_, "toml"]:
@@ -62,6 +68,20 @@ def kind_of(name: str) -> str:
             return "report"
         case _:
             return ""
+
+
+@lru_cache(_REMEMBERED)
+def _kind_by_content(path: str, changed_ns: int) -> str:
+    """What a file is by the label in it, where its name does not tell; empty for those of other programs."""
+    kind = kind_of(os.path.basename(path))
+    try:
+        if kind == "capture" and is_cloud(path):
+            return "cloud"
+        if kind == "calibration":
+            return _FORMATS.get(str(read_json(path, called="file of this program").get("format")), "")
+    except Error:
+        return "damaged file"
+    return kind
 
 
 def file_in(folder: Path, name: str) -> Path:

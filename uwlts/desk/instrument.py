@@ -30,6 +30,7 @@ from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, bri
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.command_files import own_files
 from uwlts.model.errors import DescriptionError, Error, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
@@ -195,7 +196,8 @@ class Instrument:
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
-            work()
+            with own_files():
+                work()
         except Ended:
             self._board.say("stopped")
         except Error as error:

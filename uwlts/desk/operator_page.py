@@ -25,6 +25,7 @@ from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.measurement.inspection import Shape, length_between, point_near, shape_near
 from uwlts.measurement.reconstruction import reconstruct
+from uwlts.model.command_files import own_files
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
@@ -133,7 +134,7 @@ class _Desk:
             paths.append(self.plan_path)
         found = {}
         for path in paths:
-            with suppress(Error):
+            with suppress(Error), own_files():
                 load(path)
                 found[str(path)] = path.name
         return found
@@ -211,9 +212,10 @@ class _OperatorPage:
 
         async def pressed() -> None:
             try:
-                done = press()
-                if isinstance(done, Awaitable):
-                    await done
+                with own_files():
+                    done = press()
+                    if isinstance(done, Awaitable):
+                        await done
             except Error as error:
                 self._board.say(str(error), "error")
                 ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
@@ -261,7 +263,8 @@ class _OperatorPage:
         if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
             return
         try:
-            plan = load_plan(Path(self._plan.value))
+            with own_files():
+                plan = load_plan(Path(self._plan.value))
         except Error as error:
             self._board.say(str(error), "error")
             return
@@ -399,7 +402,8 @@ class _OperatorPage:
     def _list(self) -> None:
         """Bring the list of files and the choices up to date where the folder has changed."""
         try:
-            files = listed(self._desk.folder)
+            with own_files():
+                files = listed(self._desk.folder)
         except Error as error:
             self._board.say(str(error), "error")
             return

@@ -11,6 +11,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
@@ -39,6 +40,26 @@ class _CommandFiles:
 
 # Not a context variable: threads that a command starts read for it.
 _scopes: list[_CommandFiles] = []
+_own: ContextVar[_CommandFiles | None] = ContextVar("own_files", default=None)
+
+
+def _current() -> _CommandFiles | None:
+    return _own.get() or (_scopes[-1] if _scopes else None)
+
+
+@contextmanager
+def own_files() -> Iterator[None]:
+    """Scope apart from the running command's, for one piece of work of a program that goes on.
+
+    It holds in this thread and in the tasks that are begun in it.
+    """
+    scope = _CommandFiles()
+    token = _own.set(scope)
+    try:
+        with scope.held:
+            yield
+    finally:
+        _own.reset(token)
 
 
 @contextmanager
@@ -47,7 +68,7 @@ def command_files(arguments: Mapping[str, object]) -> Iterator[None]:
 
     OutputError where an output is the same file as an input, under whatever name.
     """
-    outer = _scopes[-1] if _scopes else None
+    outer = _current()
     scope = outer or _CommandFiles()
     with ExitStack() as stack:
         if outer is None:
@@ -78,9 +99,8 @@ def keeps_inputs(function: Callable[_Parameters, _Result]) -> Callable[_Paramete
 
 def note_input(path: str | os.PathLike[str]) -> None:
     """Note a file that is about to be read; OutputError where the running command is to write it."""
-    if not _scopes or (identity := _identity(path)) is None:
+    if (scope := _current()) is None or (identity := _identity(path)) is None:
         return
-    scope = _scopes[-1]
     if identity in scope.made:
         return
     if (output := scope.written.get(identity)) is not None:
@@ -90,9 +110,9 @@ def note_input(path: str | os.PathLike[str]) -> None:
 
 def refuse_input(target: str | os.PathLike[str]) -> None:
     """Note a file that is to be written; OutputError where the running command reads it."""
-    if not _scopes or (identity := _identity(target)) is None:
+    if (scope := _current()) is None or (identity := _identity(target)) is None:
         return
-    scope, target = _scopes[-1], Path(target)
+    target = Path(target)
     # An input that is gone has left its inode to others.
     if (read := scope.read.get(identity)) is not None and _identity(read) == identity:
         raise _same(target, read)
@@ -102,13 +122,13 @@ def refuse_input(target: str | os.PathLike[str]) -> None:
 
 def note_made(path: str | os.PathLike[str]) -> None:
     """Note a file that the running command has written: it may read it, and write it again."""
-    if _scopes and (identity := _identity(path)) is not None:
-        _scopes[-1].made.add(identity)
+    if (scope := _current()) is not None and (identity := _identity(path)) is not None:
+        scope.made.add(identity)
 
 
 def hold_until_end(target: Path, claim: Callable[[Path], AbstractContextManager[None]]) -> None:
     """Enter the claim on a file, once, until the running command ends; without a command nothing is claimed."""
-    if _scopes and target not in (scope := _scopes[-1]).claims:
+    if (scope := _current()) is not None and target not in scope.claims:
         scope.claims[target] = claim(target)
         scope.held.enter_context(scope.claims[target])
 

@@ -3,10 +3,14 @@
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
 from uwlts.model.errors import DescriptionError
+from uwlts.optics.nominal import nominal
+from uwlts.storage.calibration_file import write_calibration
+from uwlts.storage.cloud import PointCloud, write_cloud
 
 
 @pytest.fixture
@@ -25,9 +29,7 @@ def folder(tmp_path: Path) -> Path:
         ("scan.of.today.h5", "capture"),
         ("scan.h5.part", "interrupted capture"),
         ("scan.truth.h5", "truth"),
-        ("wall.cloud.h5", "cloud"),
         ("wall.ply", "cloud"),
-        ("wall.evaluation.json", "evaluation"),
         ("calibration.json", "calibration"),
         ("plan.toml", "description"),
         ("wall.html", "report"),
@@ -54,6 +56,30 @@ def test_known_files_are_listed_the_latest_first(folder):
     files = listed(folder)
     assert [file.name for file in files] == ["scan.h5", "wall.ply", "plan.toml", "calibration.json"]
     assert [(file.kind, file.size, file.time_s) for file in files[:2]] == [("capture", 7, 2e9), ("cloud", 0, 1e9)]
+
+
+def test_labels_tell_what_names_do_not(folder):
+    none = np.full(2, -1)
+    write_cloud(folder / "wall.h5", PointCloud(np.zeros((2, 3)), np.ones(2), none, none, metadata={}))
+    write_calibration(folder / "polished.json", nominal("thesis", medium="air"))
+    for name, text in (
+        ("damaged", "{"),
+        ("other", '{"format": "mine"}'),
+        ("figures", '{"format": "uwlts-evaluation"}'),
+    ):
+        (folder / f"{name}.json").write_text(text, encoding="utf-8")
+    kinds = {file.name: file.kind for file in listed(folder)}
+    assert kinds.pop("scan.h5") in ("capture", "damaged file")
+    assert kinds == {
+        "wall.h5": "cloud",
+        "polished.json": "calibration",
+        "damaged.json": "damaged file",
+        "figures.json": "evaluation",
+    }
+    # A file of the same name that is written anew is another one.
+    (folder / "other.json").write_text('{"format": "uwlts-evaluation", "more": 1}', encoding="utf-8")
+    os.utime(folder / "other.json", (1e9, 1e9))
+    assert {file.name: file.kind for file in listed(folder)}["other.json"] == "evaluation"
 
 
 def test_what_cannot_be_opened_is_not_listed(folder):
