@@ -28,7 +28,8 @@ from twin.design.description import Study
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.runtime.workers import Lost, Workers
-from uwlts.storage.files import another, read_json, written_aside
+from uwlts.storage.files import written_aside
+from uwlts.storage.json_files import another, read_json
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:

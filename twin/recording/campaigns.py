@@ -14,7 +14,8 @@ from uwlts.model.errors import CaptureError, DescriptionError, Error, OutputErro
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
-from uwlts.storage.files import another, read_json, written_aside
+from uwlts.storage.files import written_aside
+from uwlts.storage.json_files import another, read_json
 from uwlts.storage.one_writer import one_writer
 from uwlts.storage.truth import truth_path
 

@@ -13,7 +13,7 @@ from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.capture import part_path
 from uwlts.storage.cloud import is_cloud
-from uwlts.storage.files import read_json
+from uwlts.storage.json_files import read_json
 
 _SHOWN = 500
 _REMEMBERED = 4 * _SHOWN

@@ -14,7 +14,7 @@ from uwlts.metrology.truth_comparison import TruthComparison, best_fit_motion, c
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.errors import EvaluationError, problems_of
 from uwlts.storage.cloud import PointCloud, read_cloud
-from uwlts.storage.files import read_model, write_model
+from uwlts.storage.json_files import read_model, write_model
 from uwlts.storage.truth import Truth, read_truth
 
 # What points from perfect images by true parameters have to keep (tests/system/test_campaign.py).

@@ -15,12 +15,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import JsonValue
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwlts.model.command_files import note_input
 from uwlts.model.errors import CaptureError, Error
+
+if TYPE_CHECKING:
+    from pydantic import JsonValue
 
 Content = TypeVar("Content")
 
@@ -151,7 +152,7 @@ def with_article(called: str) -> str:
     return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
 
 
-def parsed_json(text: str) -> JsonValue:
+def parsed_json(text: str) -> "JsonValue":
     """Content of JSON; ValueError where it is no JSON, too large, or as from `require_plain`.
 
     Also refused are keys that occur twice in a table, of which every reader takes another one.
@@ -165,7 +166,7 @@ def parsed_json(text: str) -> JsonValue:
     return require_plain(content)
 
 
-def parsed_toml(text: str) -> dict[str, JsonValue]:
+def parsed_toml(text: str) -> "dict[str, JsonValue]":
     """Content of TOML; ValueError where it is no TOML, has a key of too many parts, or as from `require_plain`.
 
     Numbers that are not finite are left to the descriptions, which name all wrong keys at once.
@@ -218,7 +219,7 @@ def _place_of(wanted: object, content: object) -> str:
     return "it"
 
 
-def _unique(pairs: list[tuple[str, JsonValue]]) -> dict[str, JsonValue]:
+def _unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":
     table = dict(pairs)
     if len(table) < len(pairs):
         counts = Counter(key for key, _ in pairs)

@@ -21,7 +21,8 @@ from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_
 from uwlts.model.sensor import Medium
 from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
 from uwlts.report.numbers import numbers_in
-from uwlts.storage.files import read_json, sha256_of
+from uwlts.storage.files import sha256_of
+from uwlts.storage.json_files import read_json
 
 FORMAT = "uwlts-certificate"
 VERSION = 1

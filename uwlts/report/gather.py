@@ -19,7 +19,7 @@ from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
-from uwlts.storage.files import read_json
+from uwlts.storage.json_files import read_json
 from uwlts.storage.truth import read_truth
 
 _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"

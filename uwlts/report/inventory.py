@@ -24,7 +24,7 @@ from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORM
 from uwlts.storage.calibration_file import read_calibration, read_polynomials
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
-from uwlts.storage.files import read_json
+from uwlts.storage.json_files import read_json
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 

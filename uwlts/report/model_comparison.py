@@ -29,7 +29,7 @@ from uwlts.calibration.model_comparison.held_out import (
 )
 from uwlts.report.numbers import fixed, small_length
 from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
-from uwlts.storage.files import json_text
+from uwlts.storage.json_files import json_text
 
 _WAYS = (INSIDE, OUTSIDE)
 

@@ -27,7 +27,7 @@ from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import CaptureHeader, Table
-from uwlts.storage.files import differences, refuse_unsuitable, sha256_of
+from uwlts.storage.files import refuse_unsuitable, sha256_of
 from uwlts.storage.hdf5_file import (
     UnfinishedFile,
     find_dataset,
@@ -39,6 +39,7 @@ from uwlts.storage.hdf5_file import (
     write_label,
     write_plan,
 )
+from uwlts.storage.json_files import differences
 from uwlts.storage.one_writer import one_writer
 
 FORMAT = "uwlts-capture"

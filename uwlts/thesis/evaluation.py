@@ -19,7 +19,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.reconstruction import reconstruct_by_polynomials
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture
-from uwlts.storage.files import read_json
+from uwlts.storage.json_files import read_json
 from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, THESIS, TWO, calibrations, measure_scan
 from uwlts.thesis.monte_carlo import propagate

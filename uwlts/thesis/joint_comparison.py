@@ -33,7 +33,8 @@ from uwlts.report.page_toolkit import COLOURS, legend_below, new_figure, render_
 from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.files import json_text, written_aside
+from uwlts.storage.files import written_aside
+from uwlts.storage.json_files import json_text
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date

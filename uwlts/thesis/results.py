@@ -7,7 +7,8 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict
 
 from uwlts.model.errors import CaptureError
-from uwlts.storage.files import json_text, read_json, validated_content, written_aside
+from uwlts.storage.files import written_aside
+from uwlts.storage.json_files import json_text, read_json, validated_content
 
 Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""

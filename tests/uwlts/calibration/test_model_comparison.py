@@ -25,7 +25,7 @@ from uwlts.calibration.model_comparison.held_out import (
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.model.errors import CalibrationError
 from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
-from uwlts.storage.files import json_text
+from uwlts.storage.json_files import json_text
 
 pytestmark = pytest.mark.slow
 
