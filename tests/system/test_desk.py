@@ -217,18 +217,18 @@ def test_the_whole_way_of_a_first_time_operator(desk, page, served):
 def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     connected(page)
     tab(page, "Scan")
-    page.get_by_label("positions").fill("24")
-    page.get_by_label("step, mm").fill("0.5")
+    page.get_by_label("positions").fill("60")
+    page.get_by_label("step, mm").fill("0.2")
     press(page, "start")
-    shows(page, "of 24")
+    shows(page, "of 60")
     press(page, "pause")
     says(page, "paused, the laser is off")
     assert dark(served)
-    done = re.search(r"(\d+) of 24", page.locator("header").inner_text())
+    done = re.search(r"(\d+) of 60", page.locator("header").inner_text())
     page.wait_for_timeout(1500)
-    assert done and re.search(r"(\d+) of 24", page.locator("header").inner_text())[1] == done[1]  # type: ignore[index]
+    assert done and re.search(r"(\d+) of 60", page.locator("header").inner_text())[1] == done[1]  # type: ignore[index]
     press(page, "go on")
-    page.wait_for_timeout(1000)
+    page.wait_for_timeout(500)
     press(page, "stop")
     says(page, "stopped")
     assert dark(served) and part_path(desk.folder / "scan.h5").is_file()
@@ -237,8 +237,8 @@ def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     press(page, "continue interrupted")
     says(page, "wrote scan.h5")
     with Capture(desk.folder / "scan.h5") as scan:
-        assert len(scan) == 24
-        np.testing.assert_allclose(np.diff(scan.stage_mm), 0.5, atol=0.011)
+        assert len(scan) == 60
+        np.testing.assert_allclose(np.diff(scan.stage_mm), 0.2, atol=0.011)
 
 
 @pytest.mark.parametrize("how", ["button", pytest.param("Escape", marks=pytest.mark.slow)])
@@ -338,7 +338,9 @@ def test_what_was_looked_at_is_replaced_when_asked(desk, page):
         press(page, "start")
         page.locator(".log").get_by_text("wrote scan.h5").nth(number - 1).wait_for()
         tab(page, "Files")
-        page.locator("div.row", has_text="scan.h5").get_by_role("button", name="about").last.click()
+        # The latest file comes first.
+        page.get_by_text("scan.h5", exact=True).wait_for()
+        page.get_by_role("button", name="about").first.click()
         page.get_by_text("3 frames of 96 x 512 pixels").wait_for()
         press(page, "close")
         tab(page, "Scan")

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import uuid
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import parse_qs, urlencode, urlsplit
@@ -99,8 +100,8 @@ def asked(page: Place, path: str = "/", *, method: str = "GET", **headers: str) 
     return Answer(answer.status, answer.headers, body)
 
 
-def opened(page: Place, *, client: str = "", **headers: str) -> ClientConnection:
-    """The connection by which a browser's page sends its clicks, that of a ``client`` if given."""
+def opened(page: Place, *, client: str = "", **headers: str) -> AbstractContextManager[ClientConnection]:
+    """The connection, opened by a with, by which a browser's page sends its clicks, that of a ``client`` if given."""
     place, origin = urlsplit(page.address), headers.pop("Origin", None)
     query = {"EIO": 4, "transport": "websocket"}
     if client:
@@ -134,7 +135,7 @@ class Browser:
         self.client = re.search(r"'client_id': '([0-9a-f-]{36})'", text)[1]
         elements = re.search(r"parseElements\(String\.raw`(.*?)`\)", text, re.DOTALL)[1]
         self.elements: dict[str, dict] = json.loads(html.unescape(elements))
-        self.place, self._headers = page, headers
+        self.place, self._headers, self._closing = page, headers, ExitStack()
 
     def buttons(self) -> dict[str, tuple[int, str]]:
         """Buttons by their labels: number and listener."""
@@ -146,7 +147,10 @@ class Browser:
 
     def open(self) -> str:
         """Connect; the server's answer, which begins with 40 where it knows the page."""
-        self.connection = opened(self.place, client=self.client, Origin=self.place.address, **self._headers)
+        place = self.place
+        self._closing.close()
+        connecting = opened(place, client=self.client, Origin=place.address, **self._headers)
+        self.connection = self._closing.enter_context(connecting)
         assert self.connection.recv(timeout=20).startswith("0{")
         self.connection.send("40")
         return self.connection.recv(timeout=20)
@@ -156,7 +160,7 @@ class Browser:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.connection.close()
+        self._closing.close()
 
     def click(self, button: tuple[int, str], *, client: str = "") -> None:
         """Send a click on a button, of this browser's page or, forged, of another client's."""
@@ -194,8 +198,9 @@ def test_the_page_itself_is_shown_to_this_machine(page):
 def test_another_host_is_refused(page, host):
     for path in ("/", "/picture.jpg", "/cloud", f"{SOCKET}?EIO=4&transport=polling"):
         assert asked(page, path, Host=f"{host}:{port(page)}").status == 403
-    with pytest.raises(InvalidStatus, match="403"):
-        opened(page, Host=f"{host or 'x'}:{port(page)}".replace("@", "."))
+    elsewhere = f"{host or 'x'}:{port(page)}".replace("@", ".")
+    with pytest.raises(InvalidStatus, match="403"), opened(page, Host=elsewhere):
+        pass
 
 
 def test_a_request_with_no_host_or_two_is_refused(page):
@@ -213,8 +218,8 @@ def test_another_origin_is_refused(page, origin):
         for method in ("GET", "POST"):
             polling = f"{SOCKET}?EIO=4&transport=polling"
             assert asked(page, polling, method=method, Origin=origin, **headers).status == 403
-        with pytest.raises(InvalidStatus, match="403"):
-            opened(page, Origin=origin, **headers)
+        with pytest.raises(InvalidStatus, match="403"), opened(page, Origin=origin, **headers):
+            pass
 
 
 def test_another_site_can_link_to_the_page_but_not_load_it(page):
@@ -441,7 +446,7 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
         assert desk.returncode == 0 and said == ""
     finally:
         desk.kill()
-        desk.wait()
+        desk.communicate()
 
 
 @pytest.mark.parametrize(

@@ -216,7 +216,6 @@ class Instrument:
         if connected is None:
             self.state = InstrumentState.DISCONNECTED
         elif isinstance(connected.stage, GrblStage) and not connected.stage.position_known:
-            self._rig = None
             self.state = InstrumentState.LOCKED
         else:
             self.state = InstrumentState.READY
@@ -335,7 +334,11 @@ class Instrument:
 
     def _preview(self) -> None:
         connected = self._connected
-        if connected is None or connected.stage.faulty or (light := self._shown_light(connected)) is None:
+        if connected is None or (light := self._shown_light(connected)) is None:
+            return
+        if connected.stage.faulty:
+            # Until it is homed or unlocked; then all is set up anew.
+            self._rig = None
             return
         try:
             image, exposure_ms = self._rig_of(connected).image(light, self.exposure_ms[light])
