@@ -68,7 +68,7 @@ def pulls(result):
     """Errors of lens and window distance over their stated uncertainties."""
     lens = CameraModel.described(BUILT.camera).parameters()
     names = (LensParameter.F, LensParameter.CX, LensParameter.CY, LensParameter.K1, LensParameter.K2)
-    true = {name: lens[name] for name in names} | {WindowParameter.DISTANCE: BUILT.camera.window.distance_mm}
+    true = {name: lens[name.text] for name in names} | {WindowParameter.DISTANCE: BUILT.camera.window.distance_mm}
     found = dict(zip(result.estimate.parameters.keys, result.estimate.values.tolist(), strict=True))
     return np.array([(found[key] - value) / result.estimate.std()[key] for key, value in true.items()])
 
