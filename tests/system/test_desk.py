@@ -345,7 +345,7 @@ def test_what_was_looked_at_is_replaced_when_asked(desk, page):
         press(page, "close")
         tab(page, "Scan")
         if number == 1:
-            page.get_by_label("replace an existing capture").check()
+            page.get_by_role("checkbox", name="replace an existing capture").click()
     # Another program may write what the desk has written.
     words = ["nominal", "thesis", "--medium", "air", "--out", str(desk.folder / "nominal.json"), "--overwrite"]
     assert subprocess.run([sys.executable, "-m", "uwlts.cli", *words], timeout=60).returncode == 0

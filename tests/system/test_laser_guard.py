@@ -218,7 +218,8 @@ def test_a_frame_that_does_not_come_leaves_no_laser_on(start):
     """The scan waits for 3 s beyond the exposure, as the camera may begin late, and its guard with it."""
     scan = start(hangs="lost")
     scan.lit()
-    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.0):.3f} s")
+    # Half a second for the exchanges with a controller on a busy machine.
+    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.5):.3f} s")
     scan.lit()
     scan.lit()
     scan.program.stdout.read()

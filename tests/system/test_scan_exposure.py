@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene, load_scene
 from uwlts.storage.capture import Capture, part_path
@@ -158,7 +159,7 @@ def test_a_killed_scan_takes_its_page_with_it_and_leaves_the_laser_off(folder, s
             assert scanning.wait(10) < 0
         assert refused(address)
         # The guard process has seen the program end, and sent the reset.
-        assert not served.controller.state().laser_on
+        assert within(1.0, lambda: not served.controller.state().laser_on)
         with Capture(part_path(tmp_path / "scan.h5")) as part:
             assert 1 <= len(part) < 21
 
