@@ -338,7 +338,8 @@ def test_what_was_looked_at_is_replaced_when_asked(desk, page):
         press(page, "start")
         page.locator(".log").get_by_text("wrote scan.h5").nth(number - 1).wait_for()
         tab(page, "Files")
-        # The latest file comes first.
+        # The latest file comes first, once the list knows that it is finished.
+        page.get_by_text("scan.h5.part", exact=True).wait_for(state="hidden")
         page.get_by_text("scan.h5", exact=True).wait_for()
         page.get_by_role("button", name="about").first.click()
         page.get_by_text("3 frames of 96 x 512 pixels").wait_for()
