@@ -326,32 +326,6 @@ def test_a_recorded_capture_is_shown_like_a_camera(desk, page, folder):
     shows(page, "no laser")
 
 
-@pytest.mark.slow
-def test_what_was_looked_at_is_replaced_when_asked(desk, page):
-    """An output never replaces an input of the same work; the desk's works are many."""
-    connected(page)
-    for number in (1, 2):
-        tab(page, "Scan")
-        page.get_by_label("positions").fill("3")
-        page.get_by_label("calibration for the cloud").click()
-        page.get_by_role("option", name="nominal.json").click()
-        press(page, "start")
-        page.locator(".log").get_by_text("wrote scan.h5").nth(number - 1).wait_for()
-        tab(page, "Files")
-        # The latest file comes first, once the list knows that it is finished.
-        page.get_by_text("scan.h5.part", exact=True).wait_for(state="hidden")
-        page.get_by_text("scan.h5", exact=True).wait_for()
-        page.get_by_role("button", name="about").first.click()
-        page.get_by_text("3 frames of 96 x 512 pixels").wait_for()
-        press(page, "close")
-        tab(page, "Scan")
-        if number == 1:
-            page.get_by_role("checkbox", name="replace an existing capture").click()
-    # Another program may write what the desk has written.
-    words = ["nominal", "thesis", "--medium", "air", "--out", str(desk.folder / "nominal.json"), "--overwrite"]
-    assert subprocess.run([sys.executable, "-m", "uwlts.cli", *words], timeout=60).returncode == 0
-
-
 def test_viewers_look_and_have_no_control(desk, page, chromium, served):
     connected(page)
     with watched(chromium.new_page()) as other:
