@@ -11,7 +11,6 @@ import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -150,15 +149,5 @@ def open_chromium(path: Path) -> Iterator[Browser]:
         playwright.stop()
 
 
-def main() -> int:
-    """Command line of this module; returns the exit status."""
-    try:
-        print(f"Chromium: {install_chromium(partial(print, flush=True))}")
-    except SetupError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(packages.obtain_by_command("Chromium", install_chromium))

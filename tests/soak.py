@@ -1,4 +1,4 @@
-"""A long scan by the operator's page: ``python -m tests.soak [images]`` records 100,000 images unless told otherwise.
+"""Soak test, a long scan from the operator's page: ``python -m tests.soak [images]``, 100,000 images by default.
 
 Camera and controller speak their real protocols; the camera sends drawn stripes, since rendering would take days. A
 headless browser looks on all the time. Every tenth of the way a line states the rate and the memory of desk and
@@ -44,7 +44,7 @@ def memory_mib(process: int) -> float:
     """Memory in use by a process and its children, MiB."""
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
     status = Path(f"/proc/{process}/status").read_text()
-    own = int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024  # type: ignore[index]
+    own = int(re.findall(r"VmRSS:\s+(\d+)", status)[0]) / 1024
     return own + sum(memory_mib(int(child)) for child in children)
 
 

@@ -170,6 +170,16 @@ def first_offered(names: Sequence[str], options: Sequence[str]) -> str:
     raise SetupError(f"apt-get: there is none of {', '.join(names)}")
 
 
+def obtain_by_command(what: str, install: Callable[[Report], object]) -> int:
+    """Command line of a module that installs something; exit status 0, or 2 with the reason."""
+    try:
+        print(f"{what}: {install(partial(print, flush=True))}")
+    except SetupError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 def run_command(
     command: Sequence[str], *, folder: Path | None = None, seconds: float = COMMAND_SECONDS, shown: str = ""
 ) -> str:

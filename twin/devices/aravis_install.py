@@ -6,10 +6,8 @@ there is none.
 """
 
 import sys
-from functools import partial
 
-from twin.backend.packages import Report, obtain
-from uwlts.model.errors import SetupError
+from twin.backend.packages import Report, obtain, obtain_by_command
 from uwlts.runtime.shared_library import ARAVIS_VARIABLE, load_aravis, own_folders
 
 DEBIAN_PACKAGE = "libaravis-0.8-0"
@@ -34,15 +32,5 @@ def install_aravis(report: Report = lambda line: None) -> str:
     )
 
 
-def main() -> int:
-    """Command line of this module; returns the exit status."""
-    try:
-        print(f"Aravis: {install_aravis(partial(print, flush=True))}")
-    except SetupError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(obtain_by_command("Aravis", install_aravis))

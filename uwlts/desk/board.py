@@ -1,4 +1,4 @@
-"""What the page shows: written by the threads that work, read by the page of every browser."""
+"""State shown on the page: written by worker threads, read by the page of every browser."""
 
 import threading
 import time

@@ -13,6 +13,9 @@ const TURBO = [
 const turbo = (x) =>
   TURBO.map((p) => Math.min(1, Math.max(0, p.reduceRight((sum, factor) => sum * x + factor, 0))));
 
+// Without its darkest end, which does not show on a dark ground.
+const shade = (share) => turbo(0.05 + 0.95 * Math.min(1, Math.max(0, share)));
+
 export default {
   template: `
     <div class="cloud-view" tabindex="0" aria-label="point cloud; arrow keys turn it, plus and minus zoom, F fits it">
@@ -34,6 +37,8 @@ export default {
     }
     // Colours are shown as they are given.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
+    const steps = Array.from({ length: 11 }, (_, k) => `rgb(${shade(k / 10).map((c) => 255 * c)})`);
+    this.$el.querySelector(".ramp").style.background = `linear-gradient(to top, ${steps})`;
     this.renderer.setClearColor(new THREE.Color().setRGB(0.06, 0.08, 0.11));
     this.scene = new THREE.Scene();
     // Orthographic, so that the scale holds at every depth.
@@ -124,7 +129,7 @@ export default {
       const colours = new Float32Array(3 * this.count).fill(0.4);
       for (let k = 0; k < this.count; k++) {
         const value = this.table[COLUMNS * k + column];
-        if (!Number.isNaN(value)) colours.set(turbo(0.05 + 0.95 * Math.min(1, Math.max(0, (value - low) / span))), 3 * k);
+        if (!Number.isNaN(value)) colours.set(shade((value - low) / span), 3 * k);
       }
       this.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       const unit = this.field === "intensity" ? "grey values" : "mm";

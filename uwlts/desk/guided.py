@@ -47,8 +47,7 @@ class BoardScreen:
     def laser_off(self) -> None:
         """Switch the laser off, whatever is being done; the recording ends, what was accepted is kept."""
         if isinstance(stage := self._stage, GrblStage):
-            stage.darken()
-            self._board.say("laser switched off by hand; the controller was reset", "warning")
+            darken(stage, self._board)
         else:
             self._board.say("no laser is connected to this program: switch it off by its own switch", "warning")
 
@@ -82,6 +81,14 @@ class BoardScreen:
         """The stage that switches the laser from now on; None once it is closed."""
         self._stage = stage
         self._board.laser = "flashing" if isinstance(stage, GrblStage) else "none"
+
+
+def darken(stage: GrblStage, board: Board) -> None:
+    """Switch the laser off at once, whatever the stage does, and say so."""
+    if stage.darken():
+        board.say("laser switched off by hand: unlock the stage if it stood still, else home it", "warning")
+    else:
+        board.say("the laser CANNOT be switched off: switch its power off before going near", "error")
 
 
 def coverage_picture(coverage: Coverage, pixels: list[np.ndarray]) -> np.ndarray:

@@ -10,7 +10,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, picture_of
-from uwlts.desk.guided import BoardScreen, Ended
+from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.recording_view import RecordingView
 from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
@@ -100,10 +100,7 @@ class Instrument:
         self._stop.set()
         self._paused.clear()
         self._darkened = True
-        if connected.stage.darken():
-            self._board.say("laser switched off by hand: unlock the stage if it stood still, else home it", "warning")
-        else:
-            self._board.say("the laser CANNOT be switched off: switch its power off before going near", "error")
+        darken(connected.stage, self._board)
         self._show_laser()
         self._ask(self._after_darkening)
 
@@ -306,14 +303,11 @@ class Instrument:
 
     def _after_darkening(self) -> None:
         connected = self._connected
-        try:
-            if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
-                # Meets the reset, so that what it did is known.
+        if connected is not None and isinstance(connected.stage, GrblStage) and not connected.stage.faulty:
+            # Meets the reset, so that what it did is known.
+            with suppress(HardwareError):
                 connected.stage.position_mm()
-        except HardwareError:
-            pass
-        finally:
-            self._darkened = False
+        self._darkened = False
 
     def _shown_light(self, connected: _Connected) -> Light | None:
         """The light that is shown; nothing switches a laser without a stage, or with one that is locked."""
@@ -354,10 +348,8 @@ class Instrument:
         caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of full scale", None
         if light == "laser":
             stripe = stripe_of(image, connected.sensor)
-            line, centre = stripe.lines, stripe.centre_px[stripe.lines]
-            along = connected.sensor.camera.stripe_along
-            pixels = np.stack([line, centre] if along == "width" else [centre, line], axis=1)
-            caption += f"; stripe on {len(line)} of {len(stripe.status)} profile lines"
+            pixels = stripe.pixels()
+            caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)
         self._board.show(picture_of(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
 
@@ -368,7 +360,7 @@ class Instrument:
         self._stop.clear()
         self._paused.clear()
         header = plan.header(out.stem)
-        view, shown = RecordingView(board, header, known, name=out.name), _Aside()
+        view = RecordingView(board, header, known, name=out.name)
         begun: list[int] = []
         if resume and part_path(out).is_file():
             with Capture(part_path(out)) as earlier:
@@ -389,7 +381,7 @@ class Instrument:
         self.state, self._rig, kept_light = InstrumentState.SCANNING, None, self.light
         self._show_laser()
         try:
-            with shown:
+            with _Aside(view) as shown:
                 seen = record_scan(
                     plan,
                     out,
@@ -401,7 +393,7 @@ class Instrument:
                     report=report,
                     warn=lambda text: board.say(text, "warning"),
                     between=self._between,
-                    recorded=lambda frame, number: shown.put(view, frame, number),
+                    recorded=shown.put,
                 )
         finally:
             board.phase("stopped", busy=False)
@@ -455,20 +447,20 @@ class Instrument:
 class _Aside:
     """Shows recorded images in a thread of its own, so that recording never waits for it."""
 
-    def __init__(self) -> None:
-        self._waiting: queue.Queue[tuple[RecordingView, Frame, int] | None] = queue.Queue(_WAITING)
+    def __init__(self, view: RecordingView):
+        self._view = view
+        self._waiting: queue.Queue[tuple[Frame, int] | None] = queue.Queue(_WAITING)
         self._fault: Exception | None = None
 
-    def put(self, view: RecordingView, frame: Frame, number: int) -> None:
+    def put(self, frame: Frame, number: int) -> None:
         """Show an image soon; not at all where too many wait."""
         if not self._waiting.full():
-            self._waiting.put((view, frame, number))
+            self._waiting.put((frame, number))
 
     def _show(self) -> None:
         while (seen := self._waiting.get()) is not None:
-            view, frame, number = seen
             try:
-                view.see(frame, number)
+                self._view.see(*seen)
             except Exception as error:
                 self._fault = self._fault or error
 

@@ -49,8 +49,7 @@ _STYLE = """
 .cloud-view .bar { border: 2px solid white; border-top: none; height: 6px; margin-left: auto; }
 .cloud-view .legend { position: absolute; right: 12px; top: 10px; color: white; font-size: 12px; display: flex;
   flex-direction: column; align-items: flex-end; pointer-events: none; }
-.cloud-view .ramp { width: 14px; height: 110px; margin: 3px 0; background: linear-gradient(to top, #23171b, #4860e6,
-  #2aabee, #2ee5ae, #6afd6a, #c0ee3d, #feb927, #fe6e1a, #c2270a, #900c00); }
+.cloud-view .ramp { width: 14px; height: 110px; margin: 3px 0; }
 .cloud-view .empty { position: absolute; inset: 0; display: flex; align-items: center; justify-content: center;
   color: #8a94a3; pointer-events: none; }
 """

@@ -90,8 +90,7 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
         remarks.append("faint: lengthen the exposure, or is the laser lit?")
     if len(line) < _FEW * len(stripe.status):
         remarks.append("hardly any stripe: is the object in the volume?")
-    pixels = np.stack([line, centre] if along == "width" else [centre, line], axis=1)
-    return _Profile(pixels, points, intensity, len(stripe.status), saturated, tuple(remarks))
+    return _Profile(stripe.pixels(), points, intensity, len(stripe.status), saturated, tuple(remarks))
 
 
 def frames_of(path: Path) -> Iterator[tuple[CaptureHeader, int, Frame] | None]:

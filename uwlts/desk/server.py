@@ -4,6 +4,7 @@ import errno
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable
 from functools import cache
 from typing import Any, Self
@@ -16,6 +17,7 @@ from starlette.responses import Response
 
 from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board import Board
+from uwlts.desk.page import build_board
 from uwlts.model.errors import SetupError
 
 _START_S, _END_S = 30.0, 5.0
@@ -47,8 +49,8 @@ class DeskServer:
 
     A browser finds it at its ``address``. Everybody who opens it there may look; controls are shown, and obeyed, at the
     ``operator_address``, which has a token. ``warning`` is what to say where the page can be seen from other machines.
-    ``build`` adds what the page has besides the board, and is told whether for the operator. SetupError where no port
-    is free, the address is not one of this machine, or this process serves a page already.
+    ``build(board, operator)`` builds the page for the operator or for a viewer. SetupError where no port is free, the
+    address is not one of this machine, or this process serves a page already.
     """
 
     def __init__(
@@ -59,8 +61,6 @@ class DeskServer:
         host: str = "127.0.0.1",
         port: int = 8080,
     ):
-        from uwlts.desk.page import build_board
-
         self._access, nicegui = PageAccess(host), _nicegui()
         self._app = _application(lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
@@ -97,13 +97,11 @@ class DeskServer:
             raise
 
     def _await_start(self) -> None:
-        started = threading.Event()
-        deadline = _START_S
+        deadline = time.monotonic() + _START_S
         while not self._server.started:
-            if deadline <= 0 or not self._thread.is_alive():
+            if time.monotonic() > deadline or not self._thread.is_alive():
                 raise SetupError("the page's server did not start")
-            started.wait(0.02)
-            deadline -= 0.02
+            time.sleep(0.02)
 
     def _add_content(self, board: Board) -> None:
         """What browsers fetch apart from the page itself."""

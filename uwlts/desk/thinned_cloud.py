@@ -5,7 +5,7 @@ import threading
 import numpy as np
 
 FIELDS = ("intensity", "deviation", "uncertainty")
-"""What points may be coloured by, besides their coordinates: grey values, mm, mm."""
+"""Fields by which points can be coloured besides depth: in grey values, mm and mm."""
 _COLUMNS = 3 + len(FIELDS)
 
 

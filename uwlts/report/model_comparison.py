@@ -190,7 +190,7 @@ _PARTS = {
 
 
 _OF_THE_WINDOW = {"refractions", "window_tilt"}
-"""What bends rays in a medium and hardly in air: only images in a medium show that it is not needed."""
+"""Effects that bend rays in a medium and hardly in air: only images in a medium can show that one is not needed."""
 
 
 def adds(

@@ -1,4 +1,4 @@
-"""What is unpacked and how it gets into an own folder; `test_llvm.py` tests the ways to it."""
+"""Unpacking of packages into a folder of the user's; `test_llvm.py` tests how packages are obtained."""
 
 import pytest
 

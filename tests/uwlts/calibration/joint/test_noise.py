@@ -1,4 +1,4 @@
-"""How much residuals that err together say: residuals drawn by hand, of which that is known."""
+"""Number of independent residuals among correlated ones, on drawn residuals for which it is known."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a lens has besides the usual is estimated where that explains the evidence better: on little evidence, fast."""
+"""Further lens coefficients are estimated where they explain the evidence better; on small evidence, fast."""
 
 from dataclasses import replace
 
