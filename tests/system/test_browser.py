@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests import browser
+from twin.backend import packages
 from uwlts.model.errors import SetupError
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def test_the_command_says_what_is_missing(
     monkeypatch.delenv(browser.VARIABLE, raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(browser, "own_folders", lambda name: [tmp_path / name])
-    assert browser.main() == 2
+    assert packages.obtain_by_command("Chromium", browser.install_chromium) == 2
     message = capsys.readouterr().err
     expected = ("there is no Chromium", "Found: none", "apt-get install: ", "apt-get download: ", browser.VARIABLE)
     assert [part for part in expected if part not in message] == []

@@ -75,6 +75,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibratio
     return folder, result
 
 
+@pytest.mark.slow
 def test_calibration_finds_the_sensor_as_built(campaign: tuple[Path, CalibrationResult]):
     calibration, built = campaign[1].calibration, load_sensor("thesis-as-built")
     camera = calibration.camera
@@ -89,9 +90,8 @@ def test_calibration_finds_the_sensor_as_built(campaign: tuple[Path, Calibration
     assert calibration.residuals["sheet"]["rms_mm"] < 0.08
 
 
-@pytest.mark.parametrize(
-    "placement", [p if p == "standoff" else pytest.param(p, marks=pytest.mark.slow) for p in PLACEMENTS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("placement", PLACEMENTS)
 def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationResult], placement: str):
     folder, result = campaign
     path = record(

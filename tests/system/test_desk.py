@@ -267,6 +267,7 @@ def test_laser_off_works_in_a_scan(desk, page, served, how):
     shows(page, "of 60")
 
 
+@pytest.mark.slow
 def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page, served):
     connected(page)
     tab(page, "Connect")
@@ -342,6 +343,7 @@ def test_viewers_look_and_have_no_control(desk, page, chromium, served):
         assert other.locator(".log").get_by_text("by hand").count() == 0
 
 
+@pytest.mark.slow
 def test_mistakes_are_said_and_cost_nothing(desk, page, served):
     tab(page, "Scan")
     assert page.get_by_role("button", name="start", exact=True).is_disabled()
@@ -403,6 +405,7 @@ def test_ctrl_c_ends_a_scan_in_the_dark(desk, page, served):
     assert dark(served) and part_path(desk.folder / "scan.h5").is_file()
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
     words = ["desk", str(tmp_path / "nowhere")]
     done = subprocess.run([sys.executable, "-m", "uwlts.cli", *words], capture_output=True, text=True, timeout=60)

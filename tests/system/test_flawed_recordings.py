@@ -67,6 +67,7 @@ def photographed(sensor: Sensor, folder: Path, *effects: str) -> Sensor:
     return studio.sensor
 
 
+@pytest.mark.slow
 def test_pixels_and_tangential_distortion_are_found_in_flawed_photographs(thesis_as_built, tmp_path):
     size = {"width_px": 640, "height_px": 512, "pixel_size_um": 10.6, "principal_point_px": (323.6, 252.5)}
     sensor = altered(thesis_as_built, {"camera": size, "exposure": {"lamp_ms": 0.6}})

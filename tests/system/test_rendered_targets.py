@@ -24,6 +24,7 @@ def seen(points, pose, matrix, distortion):
     return np.stack([((a + np.roll(a, -1, 1)) * cross).sum(1) for a in (x, y)], 1) / (3 * cross.sum(1))[:, None]
 
 
+@pytest.mark.slow
 def test_circles_out_of_focus_are_found_where_they_are():
     sensor = load_sensor("thesis-as-built")
     recording = twin.render("target", sensor=sensor, frames=[*FRAMES])

@@ -79,6 +79,7 @@ def centres(image: np.ndarray) -> np.ndarray:
 # What a frame shows
 
 
+@pytest.mark.slow
 def test_a_scan_shows_what_simulate_shows(served, stage, camera, board, sensor, tmp_path):
     """Same places, errors of the stage included: same stripe, but for the noise."""
     record_scene(board, sensor, tmp_path / "board.h5", options=Options(spp=4))
@@ -232,6 +233,7 @@ def lamp_lit(folder: Path) -> Scene:
     return board.model_copy(update={"motion": board.motion.model_copy(update={"lights": ("lamp", "laser")})})
 
 
+@pytest.mark.slow
 def test_the_lamp_is_on_while_the_laser_is_off_and_frames_are_dropped_and_late(lamp_lit, sensor, served):
     """One camera only can be served: the module's one is away meanwhile."""
     served.camera.disconnect()

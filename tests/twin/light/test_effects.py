@@ -50,6 +50,7 @@ def image(sensor: Sensor, effects: Effects) -> np.ndarray:
     return studio.image(next(iter(studio.scene.motion.shots())), 0).astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_each_effect_alone_changes_the_image(sensor, name):
     plain, changed = image(sensor, NONE), image(sensor, replace(NONE, **{name: True}))

@@ -64,6 +64,7 @@ def test_light_by_way_of_a_mirror_twice_goes_with_its_share_squared(thesis):
     assert whole / half == pytest.approx(4.0, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(thesis):
     """The exposure is the mean of still ones at places along the way, the outermost with half the weight."""
     renderer = Renderer(thesis, clear(), hidden(SHARE), effects=replace(EFFECTS, motion=True))

@@ -232,6 +232,7 @@ BLOCKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BLOCKS)
 def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     sensor, medium, z = coarse(thesis), clear(), 20.0

@@ -46,11 +46,12 @@ def lens(images, *, distortion="auto", pixels="auto", **options):
         ({"distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)}, {"k1", "k2"}),
         ({"distortion": (-0.2, 0.3, 0.0, -0.008, 0.0)}, {"k1", "k2", "p1", "p2"}),
         ({"fy": 1.002 * F, "distortion": (-0.2, 0.3, 0.0, 0.0, 0.0)}, {"fx", "fy", "k1", "k2"}),
-        ({"distortion": (-0.35, 0.5, 0.0, 0.0, -5.0)}, {"k1", "k2", "k3"}),
+        pytest.param({"distortion": (-0.35, 0.5, 0.0, 0.0, -5.0)}, {"k1", "k2", "k3"}, marks=pytest.mark.slow),
         # Nearly f times the angle, as wide lenses see: Pade's approximation of the arctangent.
-        (
+        pytest.param(
             {"fx": 500.0, "fy": 500.0, "near": 0.4, "distortion": (7 / 9, 64 / 945, 0, 0, 0, 10 / 9, 5 / 21, 0)},
             {"k1", "k2", "k4", "k5"},
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -79,6 +80,7 @@ def test_what_is_given_is_not_chosen():
     assert found.candidates == [] and found.solution.parameters == ("fx", "fy", "cx", "cy", "k1")
 
 
+@pytest.mark.slow
 def test_tangential_distortion_that_is_not_needed_is_known_to_be_small():
     images = views(3, count=8, distortion=(-0.2, 0.3, 2e-4, -1e-4, 0.0))
 
@@ -109,6 +111,7 @@ def test_an_image_of_another_board_is_left_out_and_named():
     assert abs(found.solution.model.fx_px - F) < 5 * found.std()["f"]
 
 
+@pytest.mark.slow
 def test_an_image_that_alone_decides_is_left_out_and_named():
     """The only image of a tilted board, and that board 0.6 % wider: in ten of ten draws it was left out."""
     reasons = []
@@ -121,6 +124,7 @@ def test_an_image_that_alone_decides_is_left_out_and_named():
     assert len(reasons) >= 4
 
 
+@pytest.mark.slow
 def test_halves_of_the_images_by_another_focal_length_are_noticed():
     """A lens that was zoomed from image to image: leaving out single ones states a sixth of the halves' difference."""
     same, zoomed = views(8, count=18), views(9, count=18, fx=1.02 * F, fy=1.02 * F)
@@ -145,6 +149,7 @@ def test_misplaced_points_are_left_out():
     assert abs(found.solution.model.fx_px - F) < 5 * found.std()["f"]
 
 
+@pytest.mark.slow
 def test_stated_uncertainties_hold_where_the_misses_of_an_image_go_together():
     """Boards that bow by another amount in every image: points err together, which one by one they do not show."""
     errors, stated, independent = [], [], []

@@ -248,6 +248,7 @@ def test_what_the_calibration_does_to_a_shape_is_that_of_drawn_patterns(shape, p
             assert agree(variance / measured.uncertainty[name].systematic_mm ** 2, draws - 1), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", get_args(Shape))
 def test_what_noise_does_to_a_shape_is_that_of_drawn_noise(shape):
     """It is stated from 8 draws, right to 27 %: what is stated of ten clouds is compared together."""

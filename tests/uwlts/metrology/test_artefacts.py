@@ -87,6 +87,7 @@ def test_two_spheres_before_a_wall_with_outliers(wall_z):
     assert np.count_nonzero(np.isfinite(result.deviation_mm)) == result.points_used
 
 
+@pytest.mark.slow
 def test_the_spacing_error_scatters_as_stated_and_has_no_bias():
     scaled = []
     for seed in range(24):
@@ -276,6 +277,7 @@ def test_profiles_are_labelled_and_measured(shape):
     assert 0.45 < np.sqrt(np.mean(np.square(scaled))) < 1.66
 
 
+@pytest.mark.slow
 def test_the_height_of_many_profiles_has_no_bias_and_the_stated_scatter():
     heights, stated = [], []
     for seed in range(49):

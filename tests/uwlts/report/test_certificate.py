@@ -141,6 +141,7 @@ def points(calibration, known, values, pixels):
     ).points_mm
 
 
+@pytest.mark.slow
 def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
     """By drawing parameters and reconstructing with them: a standard deviation of 300 draws is right to 4 % (1 sigma).
 
