@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import tomli_w
 from scipy.spatial.transform import Rotation
 

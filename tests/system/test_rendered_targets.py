@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 import twin
 from uwlts.model.library import load_sensor
