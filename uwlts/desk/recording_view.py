@@ -15,7 +15,7 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.errors import CaptureError
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path
-from uwlts.stripe import FoundStripes, extract_stripe
+from uwlts.stripe import FoundStripes, extract_stripe, warm_up
 
 _LOOK_S = 0.25
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
@@ -45,6 +45,7 @@ class RecordingView:
         self._board, self._header, self._calibration = board, header, calibration
         self._found = self._lines = 0
         self._said: set[str] = set()
+        warm_up()
         board.cloud.clear()
         board.cloud_name = name or header.name
 

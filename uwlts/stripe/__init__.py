@@ -1,12 +1,12 @@
 """The laser stripe's sub-pixel centre, one per profile line.
 
 A profile line is an image row when the stripe runs along the image height, an image column when it runs along the
-width. The steps: `candidates` finds where on each line a stripe may be, `peak_window` measures what stands there,
-`methods` place the centre, `extract` applies the rules about several peaks and gives the statuses. `recording` does so
-for all laser images and says why there is no stripe.
+width. The steps: `candidates` finds where on each line a stripe may be, `search` looks at these places by the rules
+about several peaks, `peak_window` measures what stands there, `methods` place the centre, `extract` does all this and
+gives the statuses. `recording` does so for all laser images and says why there is no stripe.
 """
 
-from uwlts.stripe.extract import extract_stripe
+from uwlts.stripe.extract import extract_stripe, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
 from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeSettings, StripeStatus
@@ -21,5 +21,6 @@ __all__ = [
     "extract_stripe",
     "find_stripes",
     "method_names",
+    "warm_up",
     "why_no_stripe",
 ]

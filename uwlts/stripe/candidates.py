@@ -9,7 +9,6 @@ hot pixels or a second stripe in the surroundings do no harm.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from statistics import NormalDist
 
 import cv2
@@ -71,26 +70,3 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
         median += (0.5 * sample.size - below) / equal - 0.5
     # Median contrast of a block of unit Gaussian noise: the largest of n minus the surroundings.
     return max(median, 0.0) / (NormalDist().inv_cdf(0.5 ** (1.0 / block)) - MEDIAN_SURROUNDINGS)
-
-
-def first_true(mask: np.ndarray) -> np.ndarray:
-    """(M,) int: row of the first True in each column of an (R, M) mask; R where there is none."""
-    # A product and a maximum run over adjacent memory, several times as fast as argmax along the first axis.
-    size = mask.shape[0]
-    return size - (mask.view(np.uint8) * _row_numbers(size)[::-1]).max(axis=0).astype(np.intp)
-
-
-def last_true(mask: np.ndarray) -> np.ndarray:
-    """(M,) int: row of the last True in each column of an (R, M) mask; -1 where there is none."""
-    return (mask.view(np.uint8) * _row_numbers(mask.shape[0])).max(axis=0).astype(np.intp) - 1
-
-
-def count_true(mask: np.ndarray) -> np.ndarray:
-    """(M,) uint: number of True in each column of an (R, M) mask."""
-    return mask.view(np.uint8).sum(axis=0, dtype=_row_numbers(mask.shape[0]).dtype)
-
-
-@lru_cache(maxsize=16)
-def _row_numbers(size: int) -> np.ndarray:
-    """(size, 1): 1 ... size in the smallest type that holds them."""
-    return np.arange(1, size + 1, dtype=np.uint8 if size < 256 else np.uint16)[:, None]

@@ -1,15 +1,16 @@
-"""Windows about the peaks of profile lines: height, width and background of what stands in each."""
+"""A window about a peak of a profile line: height, width and background of what stands in it."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from uwlts.stripe.candidates import count_true, first_true, last_true
+from uwlts.stripe.compiled import compiled
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian over its standard deviation."""
@@ -21,144 +22,196 @@ would err by 0.015 px with the pixel phase instead of 0.005."""
 FLANK = 5
 """Pixels of background taken on either side of a peak."""
 
-_ONE = np.ones(1, np.float32)
-_INWARD = np.array([[1], [-1]])
-_INWARD_F = _INWARD.astype(np.float32)
-_FLANK_FROM = np.array([[1 - FLANK], [-1]], np.float32)
-"""First pixel of the flank on either side, counted from `reach` outside the middle."""
+
+class SearchRules(NamedTuple):
+    """Options of the search: lengths in px, heights in grey levels.
+
+    A window is ``block`` pixels and ``half`` pixels on either side, ``smoothing`` the sigma of the low-pass. A second
+    peak of ``share`` of the first one's height makes a window crowded; it is looked for in the ``whole`` window, else
+    only as far as the pixels used reach. ``order`` says which of several stripes counts: the first, the strongest or
+    the last for -1, 0, 1. A stripe's sigma lies between ``narrowest`` and ``widest``. Blocks lower than ``coarse`` and
+    peaks lower than ``fine`` are noise; what is too wide is noticed from ``bright`` on.
+    """
+
+    half: int
+    block: int
+    smoothing: float
+    share: float
+    whole: bool
+    order: int
+    narrowest: float
+    widest: float
+    coarse: float
+    fine: float
+    bright: float
+
+
+class Peak(NamedTuple):
+    """What stands in a window; positions in px from the window's first pixel, heights in grey levels.
+
+    ``top`` is the highest pixel after the low-pass; ``middle`` lies between the half-height crossings; ``sigma`` is the
+    half-height width over 2.355 with the low-pass taken out (variances add); ``reach`` the whole number of pixels from
+    ``middle`` to the first background pixel; ``base`` the background at ``middle`` and ``slope`` its rise per px, from
+    the flanks beyond ``reach``; ``height`` that of the top above ``base``, or above the lowest surroundings where not
+    ``closed``: both half-height crossings lie in the window; ``crowded`` where something outside the crossings reaches
+    the given share of the peak again.
+    """
+
+    top: int
+    middle: np.floating
+    sigma: float
+    reach: int
+    base: np.floating
+    slope: np.floating
+    height: np.floating
+    closed: bool
+    crowded: np.bool_
 
 
 @dataclass(frozen=True)
 class PeakWindow:
-    """Peaks in M windows of W pixels. Positions count from the window's first pixel; px and grey levels.
+    """Peaks in M windows of W pixels.
 
-    ``start`` (M,) int is the first pixel's position on its line, ``window`` (W, M) the pixels in the image's type, with
-    the border pixel repeated beyond the border, ``smooth`` (W, M) float32 the window after the low-pass. All others are
-    (M,): ``middle`` of the half-height crossings; ``sigma``, the half-height width over 2.355 with the low-pass taken
-    out (variances add); ``reach``, the whole number of pixels from ``middle`` to the first background pixel; background
-    ``base`` at ``middle`` and its ``slope`` per px, from the flanks beyond ``reach``; ``height`` of the peak of
-    ``smooth`` above ``base``, or above the lowest surroundings where not ``closed``: both half-height crossings lie in
-    the window; ``crowded`` where something outside the crossings reaches the given share of the peak again.
+    ``start`` (M,) int is the first pixel's position on its line, ``window`` (M, W) float32 the pixels, with the border
+    pixel repeated beyond the border, ``smoothing`` the sigma of the low-pass, px. All others are (M,) float32; see
+    `Peak`.
     """
 
     start: np.ndarray
     window: np.ndarray
-    smooth: np.ndarray
     middle: np.ndarray
     sigma: np.ndarray
     reach: np.ndarray
     base: np.ndarray
     slope: np.ndarray
     height: np.ndarray
-    closed: np.ndarray
-    crowded: np.ndarray
+    smoothing: float
 
     def keep(self, which: np.ndarray) -> PeakWindow:
-        """The windows chosen by a boolean mask."""
-        return PeakWindow(*(value[..., which] for value in vars(self).values()))
+        """The windows chosen by a boolean mask or by their numbers."""
+        *values, smoothing = vars(self).values()
+        return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
 
-    def replaced(self, which: np.ndarray, by: PeakWindow) -> PeakWindow:
-        """These windows with those chosen by a boolean mask taken from another `PeakWindow`."""
-        values = []
-        for own, other in zip(vars(self).values(), vars(by).values(), strict=True):
-            value = own.copy()
-            value[..., which] = other
-            values.append(value)
-        return PeakWindow(*values)
+    def smooth(self) -> np.ndarray:
+        """(M, W) float32: the windows after the low-pass."""
+        kernel = low_pass(self.smoothing)
+        return cv2.sepFilter2D(self.window, cv2.CV_32F, kernel, np.ones(1, np.float32), borderType=cv2.BORDER_REPLICATE)
+
+    def kernel_sigma(self) -> np.ndarray:
+        """(M,) float32: sigma of the Gaussian weight for each peak."""
+        return np.maximum(self.sigma, np.float32(LEAST_KERNEL))
 
 
-def measure_windows(
-    profiles: np.ndarray,
-    lines: np.ndarray,
-    place: np.ndarray,
-    *,
-    half: int,
-    block: int,
-    smoothing: float,
-    share: float,
-    whole: bool,
-) -> PeakWindow:
-    """Measure what stands at or near the `block` pixels that begin at `place` (M,) on `lines` (M,) of profiles (N, L).
+@compiled
+def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
+    """Pixels of one of the profiles (N, L) from `start` on, the border pixel repeated beyond the border."""
+    count, size = profiles.shape[0], out.size
+    if start >= 0 and start + size <= count:
+        pixels = profiles[start : start + size, line]
+        for k in range(size):
+            out[k] = pixels[k]
+    else:
+        for k in range(size):
+            out[k] = profiles[min(max(start + k, 0), count - 1), line]
 
-    The window is the block and `half` pixels on either side; it may run over the image border. The peak is sought in
-    the block and half a block on either side. `smoothing` is the sigma of the low-pass, px. A second peak of `share` of
-    the first one's height makes the window crowded; it is looked for in the `whole` window, else only as far as the
-    pixels used reach.
+
+@compiled
+def filtered(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Low-pass of a window with a symmetric kernel of 2 R + 1 weights.
+
+    ``pixels`` reach R further than the window on either side; what they hold there is replaced by its border pixels.
     """
-    size = 2 * half + block
-    start = place - half
-    window = _cut(profiles, lines, start, size)
-    smooth = cv2.sepFilter2D(window, cv2.CV_32F, _ONE, _kernel(smoothing), borderType=cv2.BORDER_REPLICATE)
-    columns, row = np.arange(lines.size), np.arange(size)[:, None]
+    size, reach = out.size, kernel.size // 2
+    middle = pixels[reach : reach + size]
+    for k in range(reach):
+        pixels[k], pixels[reach + size + k] = middle[0], middle[size - 1]
+    for k in range(size):
+        out[k] = kernel[reach] * middle[k]
+    for j in range(reach):
+        before, after = pixels[j : j + size], pixels[2 * reach - j : 2 * reach - j + size]
+        for k in range(size):
+            out[k] += kernel[j] * (before[k] + after[k])
 
-    peak = smooth[_sought(half, block)].max(axis=0)
-    before, after = smooth[:block].min(axis=0), smooth[-block:].min(axis=0)
+
+@compiled
+def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
+    """What stands in the window `smooth`, which begins at pixel `start` of `count` and may run over the image border.
+
+    The peak is sought in the block in the middle and half a block on either side.
+    """
+    half, block = rules.half, rules.block
+    size, first = smooth.size, half - block // 2
+    highest = greatest(smooth[first : first + 2 * block])
+    top = first
+    while smooth[top] != highest:
+        top += 1
     # Repeated border pixels may belong to the stripe itself, so that only the other side shows the background.
-    if start.min() < 0:
-        before[start < 0] = -np.inf
-    if start.max() + size > profiles.shape[0]:
-        after[start + size > profiles.shape[0]] = -np.inf
-    ground = np.maximum(before, after)
-    level = 0.5 * (peak + ground)
+    ground = np.float32(-np.inf)
+    if start >= 0:
+        ground = _least(smooth[:block])
+    if start + size <= count:
+        ground = max(ground, _least(smooth[size - block :]))
+    rise = highest - ground
+    level = ground + np.float32(0.5) * rise
 
-    high = smooth >= level
-    edges = np.array([first_true(high) - 1, last_true(high) + 1])
-    crowded = count_true(high) != edges[1] - edges[0] - 1
-    several = np.flatnonzero(crowded)
-    crowd = smooth.take(several, axis=1)
-    if several.size:
-        below, at = ~high.take(several, axis=1), peak_row(crowd, half=half, block=block)
-        edges[:, several] = last_true(below & (row < at)), first_true(below & (row > at))
-    closed = (edges[0] >= 0) & (edges[1] < size)
-    x_left, x_right = _crossings(smooth, columns, edges, level)
-    middle = 0.5 * (x_left + x_right)
-    smooth_sigma = (x_right - x_left) * (1.0 / FWHM_PER_SIGMA)
-    sigma = np.sqrt(np.maximum(smooth_sigma * smooth_sigma - np.float32(smoothing * smoothing), 0.0))
+    left, right = top, top
+    while left >= 0 and smooth[left] >= level:
+        left -= 1
+    while right < size and smooth[right] >= level:
+        right += 1
+    closed = left >= 0 and right < size
+    x_left = np.float32(left) + _part(smooth[max(left, 0)], smooth[left + 1], level)
+    x_right = np.float32(right) - _part(smooth[min(right, size - 1)], smooth[right - 1], level)
+    middle = np.float32(0.5) * (x_left + x_right)
+    smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
+    sigma = math.sqrt(max(smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing), np.float32(0.0)))
 
-    reach = np.minimum(np.ceil(3.0 * smooth_sigma), np.float32(half - FLANK))
-    near = np.rint(middle)
-    # The lower of two low-passed values three pixels apart, so that a hot pixel in the flank does not raise it.
-    first = np.minimum(np.maximum(near - _INWARD_F * reach + _FLANK_FROM, 0.0), size - FLANK)
-    index = first.astype(np.intp) * lines.size + columns
-    ends = (smooth.take(index + pixel * lines.size, mode="clip") for pixel in (1, FLANK - 1))
-    before, after = np.minimum(*ends)
-    if several.size:
-        extent = size if whole else (reach + (FLANK - 1))[several]
-        outside = (row <= edges[0, several]) | (row >= edges[1, several])
-        again = crowd >= (ground + share * (peak - ground))[several]
-        crowded[several] = (again & outside & (np.abs(row - near[several]) <= extent)).any(axis=0)
-    slope = (after - before) / (2.0 * reach + (FLANK - 2))
-    base = 0.5 * (before + after) + slope * (middle - near)
-    height = peak - np.where(closed, base, ground)
-    return PeakWindow(start, window, smooth, middle, sigma, reach, base, slope, height, closed, crowded)
+    reach = min(math.ceil(np.float32(3.0) * smooth_sigma), half - FLANK)
+    near = math.floor(middle + np.float32(0.5))
+    before = _flank(smooth, near - reach - FLANK + 1)
+    after = _flank(smooth, near + reach - 1)
+    slope = (after - before) / np.float32(2 * reach + FLANK - 2)
+    base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
+    extent = size if rules.whole else reach + FLANK - 1
+    beside = max(
+        greatest(smooth[max(near - extent, 0) : left + 1]), greatest(smooth[right : min(near + extent + 1, size)])
+    )
+    crowded = beside >= ground + np.float32(rules.share) * rise
+    return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
 
 
-def peak_row(smooth: np.ndarray, *, half: int, block: int) -> np.ndarray:
-    """(M,) int: row of the highest pixel of `PeakWindow.smooth`, sought where `measure_windows` seeks it."""
-    rows = _sought(half, block)
-    sought = smooth[rows]
-    return rows.start + first_true(sought == sought.max(axis=0))
+@compiled
+def greatest(values: np.ndarray) -> np.float32:
+    """The greatest of some numbers; less than any where there are none."""
+    result = np.float32(-np.inf)
+    for k in range(values.size):
+        result = max(result, values[k])
+    return result
 
 
-def _sought(half: int, block: int) -> slice:
-    """Rows of a window in which the peak is sought."""
-    first = half - block // 2
-    return slice(first, first + 2 * block)
+@compiled
+def _least(values: np.ndarray) -> np.float32:
+    result = np.float32(np.inf)
+    for k in range(values.size):
+        result = min(result, values[k])
+    return result
 
 
-def _cut(profiles: np.ndarray, lines: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
-    """(size, M) array of the profiles' type: windows from them, the border pixel repeated beyond the border."""
-    # Relative maps: row r of the window is r pixels after its start, column m is line m plus the difference.
-    down = np.repeat(start.astype(np.float32)[None], size, axis=0)
-    right = np.zeros(down.shape, np.float32)
-    if lines.size < profiles.shape[1]:
-        right += (lines - np.arange(lines.size)).astype(np.float32)
-    nearest = cv2.INTER_NEAREST | cv2.WARP_RELATIVE_MAP
-    return cv2.remap(profiles, right, down, nearest, borderMode=cv2.BORDER_REPLICATE)
+@compiled
+def _part(low: np.floating, high: np.floating, level: np.floating) -> np.float32:
+    """Share of the way from one pixel to the next at which the straight line between them meets a level."""
+    return np.float32(min(max((level - low) / max(high - low, np.float32(1e-6)), np.float32(0.0)), np.float32(1.0)))
+
+
+@compiled
+def _flank(smooth: np.ndarray, first: int) -> np.float32:
+    """Background in a flank: the lower of two low-passed values three pixels apart, which no hot pixel raises."""
+    first = min(max(first, 0), smooth.size - FLANK)
+    return min(smooth[first + 1], smooth[first + FLANK - 1])
 
 
 @lru_cache(maxsize=16)
-def _kernel(sigma: float) -> np.ndarray:
+def low_pass(sigma: float) -> np.ndarray:
     """Gaussian weights to 3.5 sigma, sum 1."""
     reach = math.ceil(3.5 * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -168,47 +221,35 @@ def _kernel(sigma: float) -> np.ndarray:
 @lru_cache(maxsize=16)
 def noise_gain(sigma: float) -> float:
     """Standard deviation of white unit noise after the low-pass."""
-    return float(np.sqrt(np.sum(_kernel(sigma) ** 2)))
+    return float(np.sqrt(np.sum(low_pass(sigma) ** 2)))
 
 
-def _crossings(smooth: np.ndarray, columns: np.ndarray, rows: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """(2, M) float32: where the straight lines from two rows below `level` to their inner neighbours meet it.
-
-    A row just outside the window stands for no crossing and gives a place less than a pixel further in.
-    """
-    width = smooth.shape[1]
-    index = rows * width + columns
-    low = smooth.take(index, mode="clip")
-    rise = smooth.take(index + width * _INWARD, mode="clip") - low
-    part = (level - low) / np.maximum(rise, 1e-6)
-    part = np.minimum(np.maximum(part, 0.0), 1.0)
-    return rows.astype(np.float32) + _INWARD_F * part
-
-
-def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, highest: int) -> list[np.ndarray]:
-    """M0 ... Mk of the profile above `peak.base` under the Gaussian weight at `centre`; see `zero_crossing`."""
-    # Rows beyond the weight of every window, less than 0.003 there, are left out.
-    size = peak.window.shape[0]
-    reach = 3.5 * float(sigma.max())
-    rows = slice(max(0, math.floor(float(centre.min()) - reach)), min(size, math.ceil(float(centre.max()) + reach) + 1))
-    t = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None] - centre
-    t *= 1.0 / sigma
-    # OpenCV's exponential is several times as fast as NumPy's.
-    weighted = cv2.exp(cv2.multiply(t, t, scale=-0.5))
-    weighted *= peak.window[rows] - peak.base
-    moments = [cv2.reduce(weighted, 0, cv2.REDUCE_SUM)[0]]
-    for _ in range(highest):
-        weighted *= t
-        moments.append(cv2.reduce(weighted, 0, cv2.REDUCE_SUM)[0])
-    return moments
+@compiled
+def gaussian_moments(
+    window: np.ndarray, base: np.ndarray, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray
+) -> None:
+    """M0, M1 and M2 (M, 3) of windows (M, W) above `base` under a Gaussian weight at `centre`; see `zero_crossing`."""
+    size = window.shape[1]
+    for m in range(window.shape[0]):
+        pixels, ground, middle, width = window[m], base[m], float(centre[m]), float(sigma[m])
+        near, reach, sharpness = math.floor(middle + 0.5), math.ceil(4.0 * width), 1.0 / (width * width)
+        # A Gaussian by recurrence: the ratio of neighbouring values falls by the same factor from pixel to pixel.
+        falling = math.exp(-sharpness)
+        highest = math.exp(-0.5 * sharpness * (near - middle) ** 2)
+        total, first, second = 0.0, 0.0, 0.0
+        for side in (1, -1):
+            weight, ratio = highest, math.exp(-sharpness * (side * (near - middle) + 0.5))
+            pixel, last = near, min(near + reach, size - 1) if side > 0 else max(near - reach, 0)
+            if side < 0:
+                weight, ratio, pixel = weight * ratio, ratio * falling, near - 1
+            while (last - pixel) * side >= 0:
+                t, value = (pixel - middle) / width, weight * (pixels[pixel] - ground)
+                total, first, second = total + value, first + value * t, second + value * t * t
+                weight, ratio, pixel = weight * ratio, ratio * falling, pixel + side
+        moments[m, 0], moments[m, 1], moments[m, 2] = total, first, second
 
 
-def above_background(peak: PeakWindow, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(W, 1) row numbers and (W, M) values above the line through the two flanks."""
-    x = np.arange(values.shape[0], dtype=np.float32)[:, None]
-    return x, values - (peak.base + peak.slope * (x - peak.middle))
-
-
-def part_inside(u: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Share of each pixel, u from the centre, that lies within `half` of it."""
-    return np.clip(half + 0.5 - np.abs(u), 0.0, 1.0)
+@compiled
+def part_inside(u: float, half: float) -> float | np.floating:
+    """Share of a pixel, u from the centre, that lies within `half` of it."""
+    return min(max(half + np.float32(0.5) - abs(u), np.float32(0.0)), np.float32(1.0))

@@ -2,25 +2,45 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from uwlts.stripe.peak_window import LEAST_KERNEL, PeakWindow, above_background, part_inside
+from uwlts.stripe.compiled import compiled
+from uwlts.stripe.peak_window import PeakWindow, part_inside
 
 _ITERATIONS = 6
 
 
-def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def centres(peak: PeakWindow) -> np.ndarray:
     """Centre of mass in a window symmetric about itself.
 
     The window reaches 2.25 sigma to either side, pixels cut by its ends count in part, and it follows the centre until
     both agree, so that nothing is cut off more on one side than on the other. A wider window would collect noise.
     """
-    x, signal = above_background(peak, peak.window)
-    half = 2.25 * np.maximum(peak.sigma, LEAST_KERNEL)
-    centre = peak.middle
-    for _ in range(_ITERATIONS):
-        u = x - centre
-        share = signal * part_inside(u, half)
-        step = (share * u).sum(axis=0) / np.maximum(share.sum(axis=0), 0.1 * peak.height)
-        centre = centre + np.clip(step, -half, half)
-    return centre, None
+    half = np.float32(2.25) * peak.kernel_sigma()
+    centre = peak.middle.copy()
+    _follow(peak.window, half, peak.base, peak.slope, peak.middle, peak.height, centre)
+    return centre
+
+
+@compiled
+def _follow(
+    window: np.ndarray,
+    half: np.ndarray,
+    base: np.ndarray,
+    slope: np.ndarray,
+    middle: np.ndarray,
+    height: np.ndarray,
+    centre: np.ndarray,
+) -> None:
+    for m in range(centre.size):
+        for _ in range(_ITERATIONS):
+            total, moment = 0.0, 0.0
+            first, last = math.ceil(centre[m] - half[m] - 0.5), math.floor(centre[m] + half[m] + 0.5)
+            for x in range(max(first, 0), min(last + 1, window.shape[1])):
+                u = x - centre[m]
+                share = part_inside(u, half[m]) * (window[m, x] - (base[m] + slope[m] * (x - middle[m])))
+                total, moment = total + share, moment + share * u
+            step = moment / max(total, 0.1 * height[m])
+            centre[m] += min(max(step, -half[m]), half[m])

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
-from uwlts.stripe.candidates import count_true
+from uwlts.stripe.compiled import compiled
 from uwlts.stripe.methods import quadratic
 from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
 
@@ -38,118 +37,202 @@ middle."""
 _SAMPLED = 256
 """Lines from which noise and contrast are taken; more would not make the fit better."""
 
+_LANES = 16
+"""Lines fitted side by side, as many as fill the processor's vector units."""
+
+_KNOWN = 8
+_CENTRE, _HEIGHT, _SIGMA, _FIRST, _LAST, _WIDEST, _FLOOR, _REACH = (row * _LANES for row in range(_KNOWN))
+"""Places of what is known of the lines fitted side by side: the fit, its limits, floor of the variance and reach."""
+
+_TINY = np.finfo(np.float32).tiny
+
 _MEDIAN_MEAN_SQUARE = 0.934
 """Median of the mean square of 2 x 5 unit Gaussian numbers (chi-square of 10 degrees)."""
 
 
-def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def centres(peak: PeakWindow) -> np.ndarray:
     """Centre (M,) float32 of the best-fitting Gaussian profile, px from the window's first pixel.
 
     The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. A pixel's variance
     is v = r^2 + (C f)^2: r is the floor of detector and surroundings, C the contrast of speckle, which stands for shot
     noise too. Both are measured on all lines together, r beside the stripes, C on what a first fit leaves.
 
-    Each step solves sum (y - f) df/dp / v = 0, linearised in p = (ln A, c / s^2, ln s / s^2), with v of the step
-    before: Fisher scoring of the quasi-likelihood, which needs no more of the noise than its variance (McCullagh and
-    Nelder, Generalized Linear Models, Ch. 9). As df/dp = f (1, d, d^2) with d = x - c, the equations hold moments of
-    f^2 / v up to d^4.
+    Each step solves sum (y - f) df/dp / v = 0, linearised in p = (ln A, c / s, ln s), with v of the step before: Fisher
+    scoring of the quasi-likelihood, which needs no more of the noise than its variance (McCullagh and Nelder,
+    Generalized Linear Models, Ch. 9). As df/dp = f (1, u, u^2), the equations hold moments of f^2 / v up to u^4.
 
     Saturated pixels get no special care: the contrast gives the top so little weight that it would change little. But
     where they are most of the stripe, in a halo that has speckle too, the flanks are no Gaussian's: there the parabola
     of `quadratic` scatters less.
     """
-    near = np.rint(peak.middle)
-    # About each peak's own pixel the powers of x stay small, and one matrix product sums them for all peaks.
-    most = int(peak.reach.max())
-    x = np.arange(-most, most + 1, dtype=np.float32)
-    powers = x ** np.arange(5, dtype=np.float32)[:, None]
-    pixels = _pixels(near, x[:, None])
-    middle = peak.middle - near
-    signal = peak.window.take(pixels, mode="clip") - (peak.base + peak.slope * (x[:, None] - middle))
-    sampled = slice(None, None, max(1, near.size // _SAMPLED))
-    noise = _floor(peak, near, sampled)
-    floor = np.where(np.abs(x)[:, None] > peak.reach, np.inf, noise**2 + np.square(_UNMODELLED * peak.height))
-
-    half_width = (0.5 * FWHM_PER_SIGMA) * peak.sigma
-    first, last = middle - half_width, middle + half_width
-    centre, contrast = middle, _USUAL_CONTRAST
-    log_height = np.log(np.maximum(peak.height, np.finfo(np.float32).tiny))
-    log_sigma = np.log(np.maximum(peak.sigma, _NARROWEST))
-    widest = log_sigma + math.log(_WIDENING)
-    for step in range(_STEPS):
-        variance = np.exp(2.0 * log_sigma)
-        # The logarithm of the Gaussian is a parabola in x.
-        slope = centre / variance
-        model = cv2.exp(powers[:3].T @ np.stack([log_height - 0.5 * slope * centre, slope, -0.5 / variance]))
-        left = signal - model
-        squared = model * model
-        if step == _FIRST_STEPS:
-            core = squared[:, sampled] > 0.25 * np.exp(2.0 * log_height[sampled])
-            contrast = _contrast(left[:, sampled][core], squared[:, sampled][core], floor=noise)
-        weight = model / (squared * contrast**2 + floor)
-        matrix, right = _about(centre, powers @ (weight * model)), _about(centre, powers[:3] @ (weight * left))
-        change = _solved(matrix, right, variance)
-        log_height = log_height + change[0]
-        centre = np.minimum(np.maximum(centre + np.sqrt(variance) * change[1], first), last)
-        log_sigma = np.minimum(np.maximum(log_sigma + change[2], math.log(_NARROWEST)), widest)
-    centre = near + centre
-    haloed = np.flatnonzero((noise > _SPECKLED_HALO * peak.height) & (2.0 * half_width > _PLATEAU))
+    sampled = np.arange(0, peak.start.size, max(1, peak.start.size // _SAMPLED))
+    flanks = np.zeros(sampled.size, np.float32)
+    _flank_noise(peak.window, peak.base, peak.slope, peak.middle, peak.reach, sampled, flanks)
+    # The floor: that of the usual line.
+    noise = max(_LEAST_NOISE, math.sqrt(np.median(flanks) / _MEDIAN_MEAN_SQUARE))
+    groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
+    # Flat rows, of which the compiler knows that their parts do not overlap.
+    signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
+    known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(8 * _LANES, np.float32)
+    _set_side_by_side(
+        peak.window, peak.middle, peak.sigma, peak.reach, peak.base, peak.slope, peak.height, noise, signal, known
+    )
+    _improve(known, signal, sums, _USUAL_CONTRAST, _FIRST_STEPS)
+    _improve(known, signal, sums, _contrast(known, signal, sampled, noise), _STEPS - _FIRST_STEPS)
+    centre = np.floor(peak.middle + np.float32(0.5)) + known[:, _CENTRE : _CENTRE + _LANES].ravel()[: peak.start.size]
+    width = np.float32(FWHM_PER_SIGMA) * peak.sigma
+    haloed = np.flatnonzero((noise > _SPECKLED_HALO * peak.height) & (width > _PLATEAU))
     if haloed.size:
-        window = peak.window.take(haloed, axis=1)
-        plateau = count_true(window == window.max(axis=0))
-        flat = haloed[plateau > np.maximum(2.0 * _MOSTLY * half_width[haloed], _PLATEAU)]
-        centre[flat] = quadratic.centres(peak.keep(flat), kernel[flat])[0]
-    return centre, None
+        window = peak.window[haloed]
+        plateau = np.count_nonzero(window == window.max(axis=1, keepdims=True), axis=1)
+        flat = haloed[plateau > np.maximum(_MOSTLY * width[haloed], _PLATEAU)]
+        centre[flat] = quadratic.centres(peak.keep(flat))
+    return centre
 
 
-def _pixels(near: np.ndarray, x: np.ndarray, lines: slice = slice(None)) -> np.ndarray:
-    """(X, S) int: places in the flat window of the pixels x, (X, 1) or (X, S), away from ``near`` (M,) on S lines."""
-    width = near.size
-    return x.astype(np.intp) * width + (near.astype(np.intp) * width + np.arange(width))[lines]
+@compiled
+def _flank_noise(
+    window: np.ndarray,
+    base: np.ndarray,
+    slope: np.ndarray,
+    middle: np.ndarray,
+    reach: np.ndarray,
+    sampled: np.ndarray,
+    result: np.ndarray,
+) -> None:
+    """Mean square (S,) of the pixels of both flanks about the line through them, of sampled lines."""
+    for number in range(sampled.size):
+        m = sampled[number]
+        near = math.floor(middle[m] + np.float32(0.5))
+        for away in range(-FLANK, FLANK):
+            x = near + away + (int(reach[m]) if away >= 0 else 1 - int(reach[m]))
+            x = min(max(x, 0), window.shape[1] - 1)
+            left = window[m, x] - (base[m] + slope[m] * (np.float32(x) - middle[m]))
+            result[number] += left * left / np.float32(2 * FLANK)
 
 
-def _floor(peak: PeakWindow, near: np.ndarray, sampled: slice) -> float:
-    """Standard deviation of the pixels of both flanks about the line through them, grey levels: the usual line's."""
-    away = peak.reach[sampled] + np.arange(FLANK, dtype=np.float32)[:, None]
-    away = np.vstack([-away, away])
-    values = peak.window.take(_pixels(near, away, sampled), mode="clip")
-    left = values - (peak.base + peak.slope * (near - peak.middle))[sampled] - peak.slope[sampled] * away
-    return max(_LEAST_NOISE, math.sqrt(np.median(np.square(left).mean(axis=0)) / _MEDIAN_MEAN_SQUARE))
+@compiled
+def _set_side_by_side(
+    window: np.ndarray,
+    middle: np.ndarray,
+    sigma: np.ndarray,
+    reach: np.ndarray,
+    base: np.ndarray,
+    slope: np.ndarray,
+    height: np.ndarray,
+    noise: float,
+    signal: np.ndarray,
+    known: np.ndarray,
+) -> None:
+    """Signal above the background (G, (2 R + 1) lanes) and what is known (G, 8 lanes) of G groups of lines.
+
+    Positions count from the pixel nearest to each peak's middle. The last group is filled up with the last line.
+    """
+    count, size = window.shape
+    most = signal.shape[1] // (2 * _LANES)
+    for group in range(known.shape[0]):
+        for k in range(_LANES):
+            m = min(group * _LANES + k, count - 1)
+            near = math.floor(middle[m] + np.float32(0.5))
+            centre, offset = middle[m] - np.float32(near), base[m] + slope[m] * (np.float32(near) - middle[m])
+            for x in range(-most, most + 1):
+                pixel = window[m, min(max(near + x, 0), size - 1)]
+                signal[group, (most + x) * _LANES + k] = pixel - (offset + slope[m] * np.float32(x))
+            half_width = np.float32(0.5 * FWHM_PER_SIGMA) * sigma[m]
+            broad = max(sigma[m], np.float32(_NARROWEST))
+            known[group, _CENTRE + k], known[group, _HEIGHT + k] = centre, max(height[m], _TINY)
+            known[group, _SIGMA + k], known[group, _WIDEST + k] = broad, broad * np.float32(_WIDENING)
+            known[group, _FIRST + k], known[group, _LAST + k] = centre - half_width, centre + half_width
+            known[group, _FLOOR + k] = np.float32(noise * noise) + (np.float32(_UNMODELLED) * height[m]) ** 2
+            known[group, _REACH + k] = reach[m]
 
 
-def _contrast(left: np.ndarray, squared: np.ndarray, *, floor: float) -> float:
+@compiled
+def _contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise: float) -> float:
     """Contrast of the pixels above half height: what the fit leaves of them over the model, less the floor's share.
 
-    ``squared`` is the model's square. The degrees of freedom of the fit are not accounted for.
+    The degrees of freedom of the fit are not accounted for.
     """
-    total = float(((left * left - floor**2) / squared).sum(dtype=float)) + _PRIOR_PIXELS * _USUAL_CONTRAST**2
-    return math.sqrt(max(total, 0.0) / (squared.size + _PRIOR_PIXELS))
+    most = signal.shape[1] // (2 * _LANES)
+    total, count = _PRIOR_PIXELS * _USUAL_CONTRAST**2, _PRIOR_PIXELS
+    for m in sampled:
+        fit, k = known[m // _LANES], m % _LANES
+        centre, height, sigma = fit[_CENTRE + k], fit[_HEIGHT + k], fit[_SIGMA + k]
+        half = 0.5 * FWHM_PER_SIGMA * sigma
+        for x in range(max(math.ceil(centre - half), -most), min(math.floor(centre + half), most) + 1):
+            model = height * math.exp(-0.5 * ((x - centre) / sigma) ** 2)
+            left = signal[m // _LANES, (most + x) * _LANES + k] - model
+            total += (left * left - noise * noise) / (model * model)
+            count += 1.0
+    return math.sqrt(max(total, 0.0) / count)
 
 
-def _about(centre: np.ndarray, sums: np.ndarray) -> list[np.ndarray]:
-    """Moments of x - c from the sums over x^0, x^1 ... (K, M), by the binomial theorem in Horner's form."""
-    moments = [sums[0]]
-    for k in range(1, len(sums)):
-        moment = sums[0]
-        for j in range(1, k + 1):
-            moment = math.comb(k, j) * sums[j] - centre * moment
-        moments.append(moment)
-    return moments
+@compiled
+def _improve(known: np.ndarray, signal: np.ndarray, sums: np.ndarray, contrast: float, steps: int) -> None:
+    """Some steps of the fit; centre, height and sigma are replaced in `known`."""
+    for group in range(known.shape[0]):
+        for _ in range(steps):
+            _sum_moments(known[group], signal[group], np.float32(contrast * contrast), sums)
+            _step(known[group], sums)
 
 
-def _solved(m: list[np.ndarray], b: list[np.ndarray], variance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Changes (M,) of ln A, c / s and ln s from the normal equations, by Cramer's rule; none above the limit.
+@compiled
+def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.float32, sums: np.ndarray) -> None:
+    """Moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2."""
+    for k in range(sums.size):
+        sums[k] = np.float32(0.0)
+    most = signal.size // (2 * _LANES)
+    for row in range(2 * most + 1):
+        y, x = signal[row * _LANES :][:_LANES], np.float32(row - most)
+        for k in range(_LANES):
+            u = (x - known[_CENTRE + k]) / known[_SIGMA + k]
+            square = u * u
+            f = known[_HEIGHT + k] * _exp(np.float32(-0.5) * square)
+            weight = f / (f * f * squared_contrast + known[_FLOOR + k])
+            if abs(x) > known[_REACH + k]:
+                weight = np.float32(0.0)
+            left, weight = weight * (y[k] - f), weight * f
+            sums[k] += weight
+            sums[_LANES + k] += weight * u
+            sums[2 * _LANES + k] += weight * square
+            sums[3 * _LANES + k] += weight * square * u
+            sums[4 * _LANES + k] += weight * square * square
+            sums[5 * _LANES + k] += left
+            sums[6 * _LANES + k] += left * u
+            sums[7 * _LANES + k] += left * square
+
+
+@compiled
+def _exp(x: np.float32) -> np.float32:
+    """e^x as (e^(x / 16))^16, which vector units can do: to 2e-5 of it above -5, and never above e^-12 beyond that."""
+    y = max(x, np.float32(-12.0)) * np.float32(1.0 / 16.0)
+    rest = np.float32(1 / 6) + y * (np.float32(1 / 24) + y * np.float32(1 / 120))
+    power = np.float32(1.0) + y * (np.float32(1.0) + y * (np.float32(0.5) + y * rest))
+    power *= power
+    power *= power
+    power *= power
+    return power * power
+
+
+@compiled
+def _step(known: np.ndarray, sums: np.ndarray) -> None:
+    """One step of the fit from the normal equations, by Cramer's rule; no change is above the limit.
 
     The matrix is m[i + j]. A thousandth more on its diagonal keeps it regular where two pixels carry all weight.
     """
-    m0, m2, m4 = (m[k] * np.float32(1.001) for k in (0, 2, 4))
-    _, m1, mid, m3, _ = m
-    c00, c01, c02 = m2 * m4 - m3 * m3, mid * m3 - m1 * m4, m1 * m3 - m2 * mid
-    c11, c12, c22 = m0 * m4 - mid * mid, m1 * mid - m0 * m3, m0 * m2 - m1 * m1
-    scale = 1.0 / np.maximum(m0 * c00 + m1 * c01 + mid * c02, np.finfo(np.float32).tiny)
-    changes = (
-        scale * (c00 * b[0] + c01 * b[1] + c02 * b[2]),
-        scale * np.sqrt(variance) * (c01 * b[0] + c11 * b[1] + c12 * b[2]),
-        scale * variance * (c02 * b[0] + c12 * b[1] + c22 * b[2]),
-    )
-    return tuple(np.minimum(np.maximum(change, -_LONGEST_STEP), _LONGEST_STEP) for change in changes)
+    regular, longest = np.float32(1.001), np.float32(_LONGEST_STEP)
+    for k in range(_LANES):
+        m1, mid, m3 = sums[_LANES + k], sums[2 * _LANES + k], sums[3 * _LANES + k]
+        m0, m2, m4 = sums[k] * regular, mid * regular, sums[4 * _LANES + k] * regular
+        b0, b1, b2 = sums[5 * _LANES + k], sums[6 * _LANES + k], sums[7 * _LANES + k]
+        c00, c01, c02 = m2 * m4 - m3 * m3, mid * m3 - m1 * m4, m1 * m3 - m2 * mid
+        c11, c12, c22 = m0 * m4 - mid * mid, m1 * mid - m0 * m3, m0 * m2 - m1 * m1
+        scale = np.float32(1.0) / max(m0 * c00 + m1 * c01 + mid * c02, _TINY)
+        higher = min(max(scale * (c00 * b0 + c01 * b1 + c02 * b2), -longest), longest)
+        further = min(max(scale * (c01 * b0 + c11 * b1 + c12 * b2), -longest), longest)
+        wider = min(max(scale * (c02 * b0 + c12 * b1 + c22 * b2), -longest), longest)
+        known[_HEIGHT + k] *= _exp(higher)
+        moved = known[_CENTRE + k] + known[_SIGMA + k] * further
+        known[_CENTRE + k] = min(max(moved, known[_FIRST + k]), known[_LAST + k])
+        broad = min(known[_SIGMA + k] * _exp(wider), known[_WIDEST + k])
+        known[_SIGMA + k] = max(broad, np.float32(_NARROWEST))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from uwlts.stripe.peak_window import FWHM_PER_SIGMA, LEAST_KERNEL, PeakWindow, above_background, part_inside
+from uwlts.stripe.compiled import compiled
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA, PeakWindow, part_inside
 
 _ITERATIONS = 6
 
 
-def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def centres(peak: PeakWindow) -> np.ndarray:
     """Vertex of the parabola fitted by least squares to the low-passed profile around its peak.
 
     The fit takes the pixels within the half-height width, those cut by its ends in part, and is repeated about its own
@@ -17,17 +20,30 @@ def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarra
     Tk = sum w f u^k, the normal equations of f = a0 + a1 u + a2 u^2 are solved for a1 and a2; the vertex is
     -a1 / (2 a2).
     """
-    x, signal = above_background(peak, peak.smooth)
-    half = 0.5 * FWHM_PER_SIGMA * np.maximum(peak.sigma, LEAST_KERNEL)
-    centre = peak.middle
-    for _ in range(_ITERATIONS):
-        u = x - centre
-        w = part_inside(u, half)
-        s0, s1, s2, s3, s4 = ((w * u**k).sum(axis=0) for k in range(5))
-        t0, t1, t2 = ((w * signal * u**k).sum(axis=0) for k in range(3))
-        # Cramer's rule for a1 and a2; their common denominator drops out of the vertex.
-        a1 = t1 * (s0 * s4 - s2 * s2) - t0 * (s1 * s4 - s2 * s3) - t2 * (s0 * s3 - s1 * s2)
-        a2 = t2 * (s0 * s2 - s1 * s1) - t1 * (s0 * s3 - s1 * s2) + t0 * (s1 * s3 - s2 * s2)
-        step = -a1 / np.minimum(2.0 * a2, -1e-6 * np.abs(a1) - 1e-20)
-        centre = centre + np.clip(step, -half, half)
-    return centre, None
+    half = np.float32(0.5 * FWHM_PER_SIGMA) * peak.kernel_sigma()
+    centre = peak.middle.copy()
+    if centre.size:
+        _fit(peak.smooth(), half, peak.base, peak.slope, peak.middle, centre)
+    return centre
+
+
+@compiled
+def _fit(
+    smooth: np.ndarray, half: np.ndarray, base: np.ndarray, slope: np.ndarray, middle: np.ndarray, centre: np.ndarray
+) -> None:
+    for m in range(centre.size):
+        for _ in range(_ITERATIONS):
+            s0 = s1 = s2 = s3 = s4 = t0 = t1 = t2 = 0.0
+            first, last = math.ceil(centre[m] - half[m] - 0.5), math.floor(centre[m] + half[m] + 0.5)
+            for x in range(max(first, 0), min(last + 1, smooth.shape[1])):
+                u = x - centre[m]
+                w = part_inside(u, half[m])
+                f = w * (smooth[m, x] - (base[m] + slope[m] * (x - middle[m])))
+                s0, s1, s2 = s0 + w, s1 + w * u, s2 + w * u * u
+                s3, s4 = s3 + w * u**3, s4 + w * u**4
+                t0, t1, t2 = t0 + f, t1 + f * u, t2 + f * u * u
+            # Cramer's rule for a1 and a2; their common denominator drops out of the vertex.
+            a1 = t1 * (s0 * s4 - s2 * s2) - t0 * (s1 * s4 - s2 * s3) - t2 * (s0 * s3 - s1 * s2)
+            a2 = t2 * (s0 * s2 - s1 * s1) - t1 * (s0 * s3 - s1 * s2) + t0 * (s1 * s3 - s2 * s2)
+            step = -a1 / min(2.0 * a2, -1e-6 * abs(a1) - 1e-20)
+            centre[m] += min(max(step, -half[m]), half[m])

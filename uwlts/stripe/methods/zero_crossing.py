@@ -9,8 +9,8 @@ import numpy as np
 from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
 
 
-def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe, and M0 there.
+def centres(peak: PeakWindow) -> np.ndarray:
+    """Zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe.
 
     With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative, at c, of the
     profile f smoothed with g. As wide as the stripe, the kernel is the matched filter: the zero is the least-squares
@@ -21,11 +21,10 @@ def centres(peak: PeakWindow, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
     A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
     """
-    zeroth, first, second = gaussian_moments(peak, peak.middle, kernel, 2)
-    first -= peak.slope * math.sqrt(2.0 * math.pi) * kernel * kernel
+    kernel, moments = peak.kernel_sigma(), np.empty((peak.start.size, 3), np.float32)
+    gaussian_moments(peak.window, peak.base, peak.middle, kernel, moments)
+    zeroth, first, second = moments.T
+    first = first - peak.slope * math.sqrt(2.0 * math.pi) * kernel * kernel
     step = first / np.maximum(zeroth - second, 0.1 * np.abs(zeroth))
     step = np.minimum(np.maximum(step, -0.5), 0.5)
-    step -= 0.5 * step * step * step
-    # The sum under the Gaussian at its top, from its value a step away.
-    top = zeroth * (1.0 + 0.25 * step**2)
-    return peak.middle + kernel * step, top
+    return peak.middle + kernel * (step - 0.5 * step * step * step)

@@ -1,0 +1,225 @@
+"""Search of each profile line for its stripe: blocks that stick out are looked at closely, one after another."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from uwlts.stripe.compiled import compiled
+from uwlts.stripe.peak_window import (
+    FLANK,
+    FWHM_PER_SIGMA,
+    Peak,
+    PeakWindow,
+    SearchRules,
+    cut,
+    filtered,
+    low_pass,
+    measured,
+)
+from uwlts.stripe.result import PeakRule, StripeOptions, StripeStatus
+
+_LOOKS = 4
+"""Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
+
+_COARSE_SLACK = 0.75
+"""Block contrasts of equal stripes differ by this factor through where the pixels fall on them (sigma 0.7 px)."""
+
+_CLEAR = 3.0
+"""From this multiple of the least height a block is no mere noise."""
+
+_SPIKE = 0.85
+"""Share of the least height below which three pixels' mean is noise; noise may lower that of a stripe a little."""
+
+_BRIGHT = 0.25
+"""Height over saturation from which something wide is a stripe rather than haze."""
+
+MARGIN = 2
+"""Blocks on either side of a block's own that one window covers."""
+
+_OK, _NO_STRIPE = int(StripeStatus.OK), int(StripeStatus.NO_STRIPE)
+_AMBIGUOUS, _BORDER = int(StripeStatus.AMBIGUOUS), int(StripeStatus.BORDER)
+_FIRST, _STRONGEST, _LAST = -1, 0, 1
+_ORDER = {PeakRule.FIRST: _FIRST, PeakRule.STRONGEST: _STRONGEST, PeakRule.LAST: _LAST}
+
+
+class _Found(NamedTuple):
+    """Results (L,) of the search, `window` (L, W): those of lines without a stripe are undefined but for `status`."""
+
+    status: np.ndarray
+    wide: np.ndarray
+    start: np.ndarray
+    window: np.ndarray
+    middle: np.ndarray
+    sigma: np.ndarray
+    reach: np.ndarray
+    base: np.ndarray
+    slope: np.ndarray
+    height: np.ndarray
+
+
+def search(
+    profiles: np.ndarray, board: np.ndarray, *, coarse: float, fine: float, options: StripeOptions, clip: float
+) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
+    """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
+
+    ``board`` (L, B + 2 `MARGIN`) holds the contrasts of the B blocks of each of the profiles (N, L), and zeros at
+    either end; blocks that are done with are set to 0 in it. Blocks lower than ``coarse`` and peaks lower than ``fine``
+    are noise. Under rule `strongest` a line with a stripe is searched once more for a second one.
+
+    Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), and the windows of
+    the lines with a stripe, in their order.
+    """
+    half, lines = options.half_window_px, profiles.shape[1]
+    rules = SearchRules(
+        half=half,
+        block=half // 2,
+        smoothing=options.smoothing_px,
+        share=options.ambiguous_ratio,
+        whole=options.peak is PeakRule.STRONGEST,
+        order=_ORDER[options.peak],
+        narrowest=options.min_fwhm_px / FWHM_PER_SIGMA,
+        widest=half / FWHM_PER_SIGMA,
+        coarse=coarse,
+        fine=fine,
+        bright=max(fine, _BRIGHT * clip),
+    )
+    numbers = np.empty((6, lines), np.float32)
+    window = np.empty((lines, 2 * half + rules.block), np.float32)
+    status, wide = np.full(lines, _NO_STRIPE, np.uint8), np.zeros(lines, np.bool_)
+    found = _Found(status, wide, np.empty(lines, np.intp), window, *numbers)
+    kernel = low_pass(options.smoothing_px)
+    # Numba compiles longest for arrays that compiled code makes itself.
+    smooth, pixels = np.empty(window.shape[1], np.float32), np.empty(window.shape[1] + kernel.size - 1, np.float32)
+    _search_lines(profiles, board, kernel, pixels, smooth, rules, found)
+    windows = PeakWindow(found.start, window, *numbers, smoothing=options.smoothing_px)
+    good = status == _OK
+    return status, wide, windows if good.all() else windows.keep(good)
+
+
+@compiled
+def _search_lines(
+    profiles: np.ndarray,
+    board: np.ndarray,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
+    rules: SearchRules,
+    found: _Found,
+) -> None:
+    size, border = smooth.size, kernel.size // 2
+    for line in range(profiles.shape[1]):
+        blocks, least = board[line], np.float32(rules.coarse)
+        for _ in range(_LOOKS):
+            chosen = _next_block(blocks, least, rules)
+            if chosen < 0:
+                break
+            there, place = np.float32(blocks[chosen]), (chosen - MARGIN) * rules.block
+            start = place - rules.half
+            window = pixels[border : border + size]
+            cut(profiles, line, start, window)
+            near = window[rules.half - 1 : rules.half + rules.block + 1]
+            if there < _CLEAR * rules.fine and _is_spike(near, there, rules.fine):
+                blocks[chosen] = 0
+                continue
+            filtered(pixels, kernel, smooth)
+            peak = measured(smooth, start, profiles.shape[0], rules)
+            # The window follows a peak of which a half-height crossing or a flank lies outside it.
+            to_end = np.float32(0.5 * (size - 1))
+            offset = peak.middle - to_end
+            outside = abs(offset) + peak.reach > to_end - FLANK + np.float32(0.5)
+            if (outside or not peak.closed) and peak.height >= rules.fine:
+                start += int(np.rint(offset))
+                cut(profiles, line, start, window)
+                filtered(pixels, kernel, smooth)
+                peak = measured(smooth, start, profiles.shape[0], rules)
+            verdict = _judged(peak, start, profiles.shape[0], rules)
+            if verdict == _NO_STRIPE:
+                if (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright:
+                    found.wide[line] = True
+                blocks[chosen] = 0
+                continue
+            # The window has been searched for rivals already.
+            for k in range(chosen - MARGIN, chosen + MARGIN + 1):
+                blocks[k] = 0
+            if found.status[line] == _OK:
+                # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
+                away = abs(start + peak.middle - (found.start[line] + found.middle[line]))
+                if (
+                    away > found.sigma[line] * np.float32(FWHM_PER_SIGMA)
+                    and peak.height >= rules.share * found.height[line]
+                ):
+                    found.status[line] = _AMBIGUOUS
+                    break
+                continue
+            found.status[line] = verdict
+            if verdict != _OK:
+                break
+            found.start[line] = start
+            found.middle[line], found.sigma[line], found.reach[line] = peak.middle, peak.sigma, peak.reach
+            found.base[line], found.slope[line], found.height[line] = peak.base, peak.slope, peak.height
+            for k in range(size):
+                found.window[line, k] = window[k]
+            if rules.order != _STRONGEST:
+                break
+            least = max(least, there * np.float32(rules.share * _COARSE_SLACK))
+
+
+@compiled
+def _next_block(blocks: np.ndarray, least: np.float32, rules: SearchRules) -> int:
+    """The block that the rule names among those that reach `least`; -1 where none does.
+
+    First and last are taken among the blocks with a share of the highest contrast on their line.
+    """
+    highest = blocks[0]
+    for k in range(blocks.size):
+        highest = max(highest, blocks[k])
+    if highest < least:
+        return -1
+    chosen = 0
+    if rules.order == _STRONGEST:
+        while blocks[chosen] != highest:
+            chosen += 1
+        return chosen
+    wanted = max(least, np.float32(highest) * np.float32(rules.share * _COARSE_SLACK))
+    if rules.order == _FIRST:
+        while blocks[chosen] < wanted:
+            chosen += 1
+        return chosen
+    chosen = blocks.size - 1
+    while blocks[chosen] < wanted:
+        chosen -= 1
+    return chosen
+
+
+@compiled
+def _is_spike(near: np.ndarray, there: np.float32, fine: float) -> bool:
+    """Whether a block sticks out by noise in single pixels: a cheap look that spares most unlit lines a close one.
+
+    ``near`` are the pixels of the block and one on either side. The mean of three pixels lowers a stripe less than the
+    low-pass does, after which it must still be ``fine`` high.
+    """
+    single, mean = near[1], np.float32(-np.inf)
+    for k in range(1, near.size - 1):
+        single = max(single, near[k])
+        mean = max(mean, near[k - 1] + near[k] + near[k + 1])
+    return there - (single - mean * np.float32(1.0 / 3.0)) < _SPIKE * fine
+
+
+@compiled
+def _judged(peak: Peak, start: int, count: int, rules: SearchRules) -> int:
+    """`StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
+    if peak.height < rules.fine:
+        return _NO_STRIPE
+    size, highest = 2 * rules.half + rules.block, start + peak.top
+    if not peak.closed:
+        # A peak whose far side is not in the image; one on the last pixel itself may be any rise towards the border.
+        outside = start < 0 or start + size > count
+        return _BORDER if outside and 1 < highest < count - 2 else _NO_STRIPE
+    if not rules.narrowest <= peak.sigma <= rules.widest:
+        return _NO_STRIPE
+    middle, extent = start + peak.middle, peak.reach + FLANK - 1
+    if middle - extent < 0 or middle + extent > count - 1:
+        return _BORDER
+    return _AMBIGUOUS if peak.crowded else _OK
