@@ -6,6 +6,8 @@ by one standard deviation of something that is independent of all other patterns
 follows, correlations included, from calculating it again with each pattern added.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from uwlts.calibration.joint.derivatives import COLUMNS
@@ -17,6 +19,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.optics.brightness import BLUR_STD, beside_std
+from uwlts.optics.line_table import LineTable
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 from uwlts.storage.files import sha256_of
@@ -25,6 +28,9 @@ _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
+_TABULATED = 5000
+"""Points from which their derivatives are tabulated: a table costs as much as some thousand of them."""
+_TABLE_TOLERANCE_MM = 1e-6
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
@@ -79,24 +85,28 @@ def point_uncertainty(
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
     known = stored_estimate(calibration, sensor, header.medium)
     across = 1 if calibration.stripe_along == "width" else 0
-    pixels = np.stack((line, centre_px) if across else (centre_px, line), axis=1).astype(np.float64)
     # Neighbours err together, so that they show only a part of the noise.
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
     noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
     pose = capture.pose[:, :3, :3]
     posed = np.all(np.isfinite(capture.pose), axis=(1, 2), keepdims=True)
-    into_scene = np.where(posed, pose, np.eye(3)) @ calibration.object_transform()[:3, :3].T
+    into_object = calibration.object_transform()[:3, :3].T
+    into_scene = np.where(posed, pose, np.eye(3)) @ into_object
     root = covariance_root(known.covariance)
     stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     beside = beside_std(header.sensor.uncertainty)
+    derivatives = _derivatives(known, across, root, line, centre_px)
     random, moved = [], []
-    for start in range(0, len(pixels), _BLOCK):
+    for start in range(0, len(line), _BLOCK):
         here = slice(start, start + _BLOCK)
-        by_pixel, by_root = _derivatives(known, pixels[here], COLUMNS.index("uv"[across]), root)
-        turned = into_scene[frame[here]]
-        by_pixel, by_root = np.einsum("nij,nj->ni", turned, by_pixel), np.einsum("nij,rnj->rni", turned, by_root)
+        by_pixel, by_root = derivatives(line[here], centre_px[here])
+        if posed.any():
+            turned = into_scene[frame[here]]
+            by_pixel, by_root = np.einsum("nij,nj->ni", turned, by_pixel), np.einsum("nij,rnj->rni", turned, by_root)
+        else:
+            by_pixel, by_root = by_pixel @ into_object.T, by_root @ into_object.T
         by_root += by_stage[:, None] * stage[frame[here], None]
         step = by_pixel * noise[here, None]
         random.append(np.stack([step[:, i] * step[:, j] for i, j in PAIRS], axis=1))
@@ -113,16 +123,38 @@ def point_uncertainty(
 
 
 def _derivatives(
-    known: StoredEstimate, pixels: np.ndarray, column: int, root: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of points in the camera frame: (N, 3) by the pixel across the stripe, (R, N, 3) by independent parts of all."""
-    points = known.parameters.on_sheet(known.values, known.view, pixels)
-    if points is None:
-        raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
-    by_global = np.stack(
-        [known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) for axis in range(3)]
-    )
-    return points.by_rays[column].T, np.einsum("anp,pr->rna", by_global, root, optimize=True)
+    known: StoredEstimate, across: int, root: np.ndarray, line: np.ndarray, centre_px: np.ndarray
+) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Function of lines and centres like those given, for derivatives of their points in the camera frame.
+
+    These are (N, 3) by the pixel across the stripe, coordinate ``across`` of the image, and (R, N, 3) by independent
+    parts of all parameters.
+    """
+    column = COLUMNS.index("uv"[across])
+
+    def exact(line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+        pixels = np.stack((line, centre_px) if across else (centre_px, line), axis=1).astype(np.float64)
+        points = known.parameters.on_sheet(known.values, known.view, pixels)
+        if points is None:
+            return np.full((len(line), 3 + 3 * root.shape[1]), np.nan)
+        by_global = [
+            known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) @ root
+            for axis in range(3)
+        ]
+        return np.hstack([points.by_rays[column].T, np.stack(by_global, axis=2).reshape(len(line), -1)])
+
+    table = None
+    if len(line) >= _TABULATED:
+        lines, places = (int(line.min()), int(line.max())), (float(centre_px.min()), float(centre_px.max()))
+        table = LineTable.of(exact, lines, places, tolerance=_TABLE_TOLERANCE_MM)
+
+    def derivatives(line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = exact(line, centre_px) if table is None else table.values(line, centre_px)
+        if not np.isfinite(values).all():
+            raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
+        return values[:, :3], values[:, 3:].reshape(len(line), -1, 3).transpose(1, 0, 2)
+
+    return derivatives
 
 
 def _patterns(moved: np.ndarray) -> np.ndarray:

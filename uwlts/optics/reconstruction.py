@@ -13,12 +13,16 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import RangeError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.optics.camera import directions
+from uwlts.optics.line_table import LineTable
 from uwlts.optics.sheet import SheetSurface, sheet_surface
 from uwlts.optics.window import RaysInMedium, RayStatus, trace_window
 
 # Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
 # angle would meet a sheet 1 mm away after a million kilometres.
 _PARALLEL = 1e-12
+
+# Points of profiles from which they are tabulated, which costs as much as some thousand of them; and how exactly.
+_TABULATED, _TABLE_TOLERANCE_MM = 10_000, 1e-7
 
 # Pixels computed together, so that all intermediate results stay in the processor's cache.
 _BLOCK = 4096
@@ -52,10 +56,28 @@ def reconstruct_profile(
     ``lines`` (N,) are image columns if the stripe runs along the width, else image rows; ``centres_px`` (N,) is the
     stripe's place on each. The rest is as for `reconstruct_pixels`.
     """
-    pixels = np.stack((lines, centres_px) if calibration.stripe_along == "width" else (centres_px, lines), axis=1)
-    return reconstruct_pixels(
-        calibration, pixels, medium_index=medium_index, stage_mm=stage_mm, stage_direction=stage_direction
-    )
+    found = _profile_points(calibration, lines, centres_px, medium_index=medium_index)
+    points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
+    return MeasuredPoints(points, found.status)
+
+
+def _profile_points(
+    calibration: Calibration, lines: np.ndarray, centres_px: np.ndarray, *, medium_index: float
+) -> MeasuredPoints:
+    """As `points_on_sheet`, by a table where there are many points and all of their part of the image has some."""
+
+    def exact(line: np.ndarray, place: np.ndarray) -> MeasuredPoints:
+        pixels = np.stack((line, place) if calibration.stripe_along == "width" else (place, line), axis=1)
+        return points_on_sheet(calibration, pixels, medium_index=medium_index)
+
+    lines, centres_px = np.asarray(lines), np.asarray(centres_px)
+    if len(lines) >= _TABULATED and lines.dtype.kind in "iu" and np.isfinite(centres_px).all():
+        ends = (int(lines.min()), int(lines.max())), (float(centres_px.min()), float(centres_px.max()))
+        table = LineTable.of(lambda line, place: exact(line, place).points_mm, *ends, tolerance=_TABLE_TOLERANCE_MM)
+        if table is not None:
+            status = np.full(len(lines), RayStatus.OK, dtype=np.uint8)
+            return MeasuredPoints(table.values(lines, centres_px), status)
+    return exact(lines, centres_px)
 
 
 def reconstruct_pixels(

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwlts.stripe.compiled import compiled
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import (
     FLANK,
     FWHM_PER_SIGMA,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from uwlts.stripe.compiled import compiled
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import PeakWindow, part_inside
 
 _ITERATIONS = 6

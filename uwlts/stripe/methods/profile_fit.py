@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from uwlts.stripe.compiled import compiled
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.methods import quadratic
 from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
 

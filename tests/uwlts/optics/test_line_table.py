@@ -1,0 +1,54 @@
+"""Tables of smooth functions: they give what the function gives, or there is none."""
+
+import numpy as np
+import pytest
+
+from uwlts.model.library import load_sensor
+from uwlts.optics.line_table import LineTable
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.reconstruction import reconstruct_pixels, reconstruct_profile
+
+
+def waves(line, place):
+    """Two values that vary a few times over the image."""
+    return np.stack([np.sin(line / 200 + place / 150), np.exp(-place / 300) * np.cos(line / 400)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("lines", "places"), [((0, 1279), (0.0, 1023.0)), ((100, 100), (50.0, 50.0)), ((3, 4), (7, 90))]
+)
+def test_values_are_those_of_the_function(lines, places):
+    table = LineTable.of(waves, lines, places, tolerance=1e-10)
+    assert table is not None
+    rng = np.random.default_rng(1)
+    line, place = rng.integers(lines[0], lines[1] + 1, 500), rng.uniform(*places, 500)
+    np.testing.assert_allclose(table.values(line, place), waves(line, place), rtol=0, atol=1e-9)
+
+
+def test_there_is_none_of_what_is_not_smooth_or_not_everywhere():
+    def kinked(line, place):
+        return np.abs(place - 400.3)[:, None]
+
+    def partly(line, place):
+        return np.where(line < 300, np.nan, place)[:, None]
+
+    for function in (kinked, partly):
+        assert LineTable.of(function, (0, 1279), (0.0, 1023.0), tolerance=1e-7) is None
+
+
+@pytest.mark.parametrize("along", ["width", "height"])
+@pytest.mark.parametrize("name", ["thesis-as-built", "thesis"])
+def test_points_of_many_stripes_are_those_of_each(name, along):
+    sensor = load_sensor(name)
+    sensor = sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"stripe_along": along})})
+    calibration, index = nominal_calibration(sensor, sensor.media["water"]), 1.33
+    rng = np.random.default_rng(2)
+    lines, across = (1280, 1024) if along == "width" else (1024, 1280)
+    line, place = rng.integers(0, lines, 12_000), rng.uniform(100.0, across - 100.0, 12_000)
+    motion = {"stage_mm": rng.uniform(-30, 30, 12_000), "stage_direction": np.array([1.0, 0.0, 0.0])}
+    found = reconstruct_profile(calibration, line, place, medium_index=index, **motion)
+    pixels = np.stack([line, place] if along == "width" else [place, line], axis=1)
+    each = reconstruct_pixels(calibration, pixels, medium_index=index, **motion)
+    np.testing.assert_array_equal(found.status, each.status)
+    np.testing.assert_allclose(found.points_mm, each.points_mm, rtol=0, atol=1e-7)
+    assert np.isfinite(found.points_mm).mean() > 0.9

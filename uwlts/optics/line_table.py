@@ -1,0 +1,97 @@
+"""Smooth functions of the stripe's place, tabulated for every profile line, so that many places cost little.
+
+Where a pixel's ray meets the sheet, and how that depends on the calibration, takes hundreds of operations to follow
+through lens, window and medium, and yet is so smooth over the image that a polynomial of some ten to thirty terms
+holds it to rounding. One is kept for every profile line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.runtime.compiled import compiled
+
+_NODES = (8, 16, 32)
+"""Numbers of nodes along either direction that are tried, one after another."""
+
+
+@dataclass(frozen=True, eq=False)
+class LineTable:
+    """A function of line and place on it with K values, as Chebyshev series of the place.
+
+    ``series`` (L, n, K) are those of the lines from ``first_line`` on, for places from ``low_px`` to ``high_px``.
+    """
+
+    series: np.ndarray
+    first_line: int
+    low_px: float
+    high_px: float
+
+    @classmethod
+    def of(
+        cls,
+        exact: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        lines: tuple[int, int],
+        places_px: tuple[float, float],
+        *,
+        tolerance: float,
+    ) -> LineTable | None:
+        """Table of a function for the lines and places between two, ends included.
+
+        ``exact`` gives the values (N, K) for lines (N,) and places (N,), both float. None where one is not finite, or
+        where the last terms of the series are not below the tolerance, as of a function that is not smooth.
+        """
+        (first, last), (low, high) = lines, places_px
+        half = max(0.5 * (high - low), 0.5)
+        middle = 0.5 * (low + high)
+        for count in _NODES:
+            nodes, into_series = _nodes(count)
+            line, place = np.meshgrid(
+                0.5 * (first + last) + max(0.5 * (last - first), 0.5) * nodes, middle + half * nodes
+            )
+            values = exact(line.ravel(), place.ravel()).reshape(count, count, -1)
+            if not np.isfinite(values).all():
+                return None
+            # Axes: term of the place, term of the line, value.
+            series = np.einsum("ip,jl,plk->ijk", into_series, into_series, values, optimize=True)
+            if max(np.abs(series[-2:]).max(), np.abs(series[:, -2:]).max()) <= tolerance:
+                at = (np.arange(first, last + 1) - 0.5 * (first + last)) / max(0.5 * (last - first), 0.5)
+                by_line = np.polynomial.chebyshev.chebvander(at, count - 1)
+                per_line = np.ascontiguousarray(np.einsum("lj,ijk->lik", by_line, series, optimize=True))
+                return cls(per_line, first, middle - half, middle + half)
+        return None
+
+    def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
+        """Values (N, K) for lines (N,) int and places (N,) within the table."""
+        result = np.empty((len(line), self.series.shape[2]))
+        row = np.ascontiguousarray(line, dtype=np.intp) - self.first_line
+        scale = 2.0 / (self.high_px - self.low_px)
+        at = np.ascontiguousarray((np.asarray(place_px, dtype=float) - self.low_px) * scale - 1.0)
+        _sum_series(self.series, row, at, result)
+        return result
+
+
+def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev's nodes (n,) in [-1, 1], and the matrix (n, n) from the values there to the series."""
+    angle = np.pi * (np.arange(count) + 0.5) / count
+    into_series = 2.0 / count * np.cos(np.outer(np.arange(count), angle))
+    into_series[0] *= 0.5
+    return np.cos(angle), into_series
+
+
+@compiled
+def _sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
+    """Sums of Chebyshev polynomials, each by recurrence from the two before."""
+    for n in range(row.size):
+        terms, sums, x = series[row[n]], result[n], at[n]
+        before, polynomial = x, 1.0
+        for k in range(sums.size):
+            sums[k] = 0.0
+        for term in range(terms.shape[0]):
+            weights = terms[term]
+            for k in range(sums.size):
+                sums[k] += polynomial * weights[k]
+            before, polynomial = polynomial, 2.0 * x * polynomial - before
