@@ -1,10 +1,12 @@
 """Images of circles: sub-pixel ellipses through their edges, their quality, and which of them carry a mark."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from uwlts.runtime.compiled import compiled
 from uwlts.targets.detection.blobs import Blobs, find_blobs, noise_level
 
 PASSES = 2
@@ -93,60 +95,48 @@ def _slopes(places, values):
 
 
 def _centroids(grey, centres, shapes, reaches, planes):
-    widest = shapes + np.eye(2) * reaches[1][:, None, None]
-    blob, v, outer, inner = _row_runs(centres, shapes - np.eye(2) * reaches[0][:, None, None], widest)
-    # Pixels further in than the band, a run per row: their number and the sums of their coordinates.
-    whole = np.maximum(inner[1] - inner[0] + 1, 0)
-    area = np.bincount(blob, whole, len(centres))
-    sum_u = np.bincount(blob, whole * ((inner[0] + inner[1]) / 2 - centres[blob, 0]), len(centres))
-    sum_v = np.bincount(blob, whole * (v - centres[blob, 1]), len(centres))
-    # Pixels of the band: the rest of the outer run, to the left and to the right of the inner one.
-    starts = np.concatenate([outer[0], np.maximum(inner[1] + 1, inner[0])])
-    lengths = np.maximum(np.concatenate([inner[0] - outer[0], outer[1] + 1 - starts[len(blob) :]]), 0)
-    total = int(lengths.sum())
-    u = np.arange(total) - np.repeat(np.cumsum(lengths) - lengths - starts, lengths)
-    v, blob = np.repeat(np.tile(v, 2), lengths), np.repeat(np.tile(blob, 2), lengths)
-    du, dv = u - centres[blob, 0], v - centres[blob, 1]
-    inside, outside = (
-        value[blob] + slope_u[blob] * du + slope_v[blob] * dv
-        for value, slope_u, slope_v in (planes[:, side].T for side in (0, 1))
-    )
-    contrast = (planes[:, 0, 0] - planes[:, 1, 0])[blob]
-    # Planes that meet within the band belong to no circle; their share stays finite, and the centre shows it.
-    relative = np.maximum((inside - outside) / contrast, MIN_RELATIVE_CONTRAST)
-    share = (grey[v, u] - outside) / (relative * contrast)
-    area += np.bincount(blob, share, len(centres))
-    sum_u += np.bincount(blob, share * du, len(centres))
-    sum_v += np.bincount(blob, share * dv, len(centres))
-    return centres + np.stack([sum_u, sum_v], 1) / area[:, None]
+    """Centroids (N, 2) of ellipses, whose pixels in the band count by their share."""
+    result = np.empty_like(centres)
+    # x' Q x = 1 with Q = shape^-2.
+    inner, outer = (np.linalg.inv(shapes + np.eye(2) * reach[:, None, None]) for reach in (-reaches[0], reaches[1]))
+    _sum_shares(grey, centres, inner @ inner, outer @ outer, planes, result)
+    return result
 
 
-def _row_runs(centres, inner_shapes, outer_shapes):
-    """Rows of pixels that ellipses cover: blob (R,), v (R,), first and last u within the outer and the inner ellipse.
+@compiled
+def _sum_shares(grey, centres, inner, outer, planes, result):
+    height, width = grey.shape
+    for n in range(len(centres)):
+        q, (centre_u, centre_v) = outer[n], centres[n]
+        (inside, inside_u, inside_v), (outside, outside_u, outside_v) = planes[n]
+        area, sum_u, sum_v = 0.0, 0.0, 0.0
+        half_height = math.sqrt(q[0, 0] / (q[0, 0] * q[1, 1] - q[0, 1] * q[0, 1]))
+        top, bottom = math.ceil(centre_v - half_height), math.floor(centre_v + half_height)
+        for v in range(max(top, 0), min(bottom + 1, height)):
+            dv = v - centre_v
+            first, last = _run(q, centre_u, dv)
+            whole_from, whole_to = _run(inner[n], centre_u, dv)
+            for u in range(max(first, 0), min(last + 1, width)):
+                du, share = u - centre_u, 1.0
+                if u < whole_from or u > whole_to:
+                    dark = outside + outside_u * du + outside_v * dv
+                    relative = (inside + inside_u * du + inside_v * dv - dark) / (inside - outside)
+                    # Planes that meet within the band belong to no circle; their share stays finite, and the centre
+                    # shows it.
+                    share = (grey[v, u] - dark) / (max(relative, MIN_RELATIVE_CONTRAST) * (inside - outside))
+                area, sum_u, sum_v = area + share, sum_u + share * du, sum_v + share * dv
+        result[n, 0], result[n, 1] = centre_u + sum_u / area, centre_v + sum_v / area
 
-    A row that misses the inner ellipse has an empty inner run, which starts after the end of the outer one.
-    """
-    half_height = np.linalg.norm(outer_shapes[:, 1], axis=1)
-    top = np.ceil(centres[:, 1] - half_height).astype(int)
-    count = np.floor(centres[:, 1] + half_height).astype(int) - top + 1
-    blob = np.repeat(np.arange(len(centres)), count)
-    v = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - top, count)
-    dv = v - centres[blob, 1]
-    runs = []
-    for shapes in (outer_shapes, inner_shapes):
-        # x' Q x = 1 with Q = shape^-2, solved for u.
-        inverse = np.linalg.inv(shapes)
-        quadratic = (inverse @ inverse)[blob]
-        mixed = quadratic[:, 0, 1] * dv
-        root = mixed**2 - quadratic[:, 0, 0] * (quadratic[:, 1, 1] * dv**2 - 1)
-        half = np.sqrt(np.maximum(root, 0.0)) / quadratic[:, 0, 0]
-        middle = centres[blob, 0] - mixed / quadratic[:, 0, 0]
-        first, last = np.ceil(middle - half).astype(int), np.floor(middle + half).astype(int)
-        runs.append((first, last, (root > 0) & (first <= last)))
-    (first, last, covered), (inner_first, inner_last, inner_covered) = runs
-    empty = last + 1
-    inner = np.where(inner_covered, inner_first, empty), np.where(inner_covered, inner_last, empty - 1)
-    return blob[covered], v[covered], (first[covered], last[covered]), (inner[0][covered], inner[1][covered])
+
+@compiled
+def _run(q, centre_u, dv):
+    """First and last u within an ellipse in a row; the first is after the last where the row misses it."""
+    mixed = q[0, 1] * dv
+    root = mixed * mixed - q[0, 0] * (q[1, 1] * dv * dv - 1.0)
+    if root <= 0.0:
+        return 1, 0
+    half, middle = math.sqrt(root) / q[0, 0], centre_u - mixed / q[0, 0]
+    return math.ceil(middle - half), math.floor(middle + half)
 
 
 # Reaches of an edge profile on either side of the ellipse, tried in turn. Two and a half pixels hold the edge of a lens
@@ -295,15 +285,20 @@ def _crossing(excess):
 
 def sample(grey, points):
     """Bilinear grey values (...) at pixel positions (..., 2), which must lie inside the image."""
-    width = grey.shape[1]
-    whole = points.astype(np.int32)
-    part = (points - whole).astype(np.float32)
-    index = whole[..., 1] * width + whole[..., 0]
-    flat = grey.reshape(-1)
-    du, dv = part[..., 0], part[..., 1]
-    top = flat[index] * (1 - du) + flat[index + 1] * du
-    bottom = flat[index + width] * (1 - du) + flat[index + width + 1] * du
-    return top * (1 - dv) + bottom * dv
+    values = np.empty(points.shape[:-1], np.float32)
+    _interpolate(grey, points.reshape(-1, 2), values.reshape(-1))
+    return values
+
+
+@compiled
+def _interpolate(grey, points, values):
+    height, width = grey.shape
+    for n in range(len(points)):
+        u, v = min(max(int(points[n, 0]), 0), width - 2), min(max(int(points[n, 1]), 0), height - 2)
+        du, dv = np.float32(points[n, 0] - u), np.float32(points[n, 1] - v)
+        top = grey[v, u] * (1 - du) + grey[v, u + 1] * du
+        bottom = grey[v + 1, u] * (1 - du) + grey[v + 1, u + 1] * du
+        values[n] = top * (1 - dv) + bottom * dv
 
 
 def find_circles(image):
