@@ -121,8 +121,11 @@ def stripe_spread(images: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(images.var(axis=0, ddof=1)[stripe].mean()) / truth.max())
 
 
-def campaign() -> tuple[int, float, float, float]:
-    """The thesis's spheres in air and water and its calibration: frames, seconds, GiB, and late over early frames."""
+def campaign(folder: Path) -> tuple[int, float, float, float]:
+    """The thesis's spheres in air and water and its calibration: frames, seconds, GiB, and late over early frames.
+
+    ``folder`` gets the captures: a target in air, steps near, at the stand-off and far, a target in water, and spheres.
+    """
     as_built = load_sensor("thesis-as-built")
     recordings = [("target", {}, 0), *(("step", {"placement": place}, 0) for place in ("near", "standoff", "far"))]
     recordings.append(("target-through-window", {"medium": "water", "motion": _in_water()}, 0))
@@ -130,16 +133,15 @@ def campaign() -> tuple[int, float, float, float]:
         recordings.append(("spheres", {"medium": medium, "placement": place}, seed))
     moments: list[float] = []
     start = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        for number, (name, changes, seed) in enumerate(recordings):
-            record_scene(
-                load_scene(name, **changes),
-                load_sensor("thesis"),
-                Path(folder, f"{number}.h5"),
-                as_built=as_built,
-                options=Options(seed=seed),
-                progress=lambda done, total: moments.append(time.perf_counter()),
-            )
+    for number, (name, changes, seed) in enumerate(recordings):
+        record_scene(
+            load_scene(name, **changes),
+            load_sensor("thesis"),
+            folder / f"{number}.h5",
+            as_built=as_built,
+            options=Options(seed=seed),
+            progress=lambda done, total: moments.append(time.perf_counter()),
+        )
     seconds = time.perf_counter() - start
     steps = np.diff(moments)
     # The spheres in water are the last half of the campaign; both thirds hold near, stand-off and far.

@@ -135,3 +135,15 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
         if board.cloud.total > before:
             moments.append(time.perf_counter())
     result.send((len(moments), (len(moments) - 1) / (moments[-1] - moments[0])))
+
+
+def following_rate() -> float:
+    """Frames per second that a follower shows, with stripe and points, where nothing has to be read."""
+    sensor = load_sensor("thesis")
+    view = RecordingView(Board("bench"), _header(sensor), nominal_calibration(sensor, sensor.medium("air")))
+    frames = [Frame(image, float(k), True, 1.0, float(k)) for k, image in enumerate(_images(sensor))]
+    view.see(frames[0], 0)
+    start = time.perf_counter()
+    for number, frame in enumerate(frames):
+        view.see(frame, number)
+    return len(frames) / (time.perf_counter() - start)
