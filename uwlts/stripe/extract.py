@@ -97,9 +97,11 @@ def extract_stripe(
 
     none = found.status == _NO_STRIPE
     if none.any():
-        raw = profiles if signal is image else _as_profiles(image, stripe_along=stripe_along)
-        _, low = block_extremes(raw, options.half_window_px // 2)
-        found.status[none & (low.max(axis=0) >= clip)] = _SATURATED
+        white = found.white
+        if signal is not image:
+            _, low = block_extremes(_as_profiles(image, stripe_along=stripe_along), options.half_window_px // 2)
+            white = low.max(axis=0) >= clip
+        found.status[none & white] = _SATURATED
     if options.end_lines:
         good = found.status == _OK
         jump_px = options.half_window_px / 2
@@ -132,9 +134,10 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
     status, wide, peak = search(profiles, cv2.transpose(board), coarse=coarse, fine=fine, options=options, clip=clip)
     # A plateau wider than the window does not even stick out.
-    wide[low.max(axis=0) >= clip] = True
+    white = low.max(axis=0) >= clip
+    wide |= white
     amplitude, width = np.full((2, len(status)), np.nan, np.float32)
-    found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide)
+    found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide, white)
     good = status == _OK
     if len(peak.start):
         centre, found.amplitude[good] = place_centre(options.method, peak)
@@ -153,6 +156,8 @@ class _Lines:
     status: np.ndarray
     wide: np.ndarray
     """Whether something bright was too wide to be measured."""
+    white: np.ndarray
+    """Whether pixels are saturated over a whole block."""
 
     def too_wide(self) -> bool:
         """Whether many lines show a stripe that is too wide to be measured."""

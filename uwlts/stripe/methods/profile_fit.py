@@ -86,7 +86,8 @@ def centres(peak: PeakWindow) -> np.ndarray:
         window = peak.window[haloed]
         plateau = np.count_nonzero(window == window.max(axis=1, keepdims=True), axis=1)
         flat = haloed[plateau > np.maximum(_MOSTLY * width[haloed], _PLATEAU)]
-        centre[flat] = quadratic.centres(peak.keep(flat))
+        if flat.size:
+            centre[flat] = quadratic.centres(peak.keep(flat))
     return centre
 
 

@@ -22,8 +22,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
     """
     half = np.float32(0.5 * FWHM_PER_SIGMA) * peak.kernel_sigma()
     centre = peak.middle.copy()
-    if centre.size:
-        _fit(peak.smooth(), half, peak.base, peak.slope, peak.middle, centre)
+    _fit(peak.smooth(), half, peak.base, peak.slope, peak.middle, centre)
     return centre
 
 
