@@ -1,5 +1,6 @@
 """The sequential calibration that chooses its lens and doubts its images, from views without drawn pixels."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -87,6 +88,15 @@ def test_a_stage_beside_the_normal_is_noticed_and_taken_for_no_other_lens():
     assert freer.warnings == []
     assert "lens: k1 k2, square pixels, the best of 6 models" in "\n".join(calibration_lines(freer.calibration))
     assert freer.camera.model.fx_px == pytest.approx(lens_of(BARE).fx, abs=4 * freer.camera.std()["f"])
+
+
+def test_pixels_of_another_shape_are_named_beside_a_leaning_stage():
+    images, poses = staged(2)
+    stretched = [replace(image, pixels=image.pixels * [1.0, 1.002]) for image in images]
+    (warning,) = calibrated(stretched, poses, seed=2).warnings
+    assert warning.startswith("the stage moves ") and "; or pixels are not of the shape described" in warning
+    fx, fy = map(float, re.findall(r"fx ([\d.]+) and fy ([\d.]+) px", warning)[0])
+    assert fy / fx == pytest.approx(1.002, abs=2e-4) and fx == pytest.approx(lens_of(BARE).fx, abs=1.0)
 
 
 @pytest.mark.slow
