@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
@@ -15,9 +18,23 @@ _FREEDOM = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
 
 def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """A function compiled by Numba; without a folder that can be written, anew in every process."""
+    """A function compiled by Numba. It may call such functions of its own package, and of no other.
+
+    Without a folder that can be written it is compiled anew in every process.
+    """
     options: dict[str, Any] = {"fastmath": _FREEDOM, "error_model": "numpy", "nogil": True}
     try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError:
+        kept: Any = njit(cache=True, **options)(function)
+        # Numba takes a function as unchanged where its own file is; here a change of what it calls shows as well.
+        kept._cache._cache_file._source_stamp = _stamp(Path(inspect.getfile(function)).parent)
+    except (RuntimeError, AttributeError):
         return njit(**options)(function)
+    return kept
+
+
+@cache
+def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
+    """Names, times and sizes of the source files of a folder's package: the one next below ``uwlts``."""
+    package = next((each for each in (folder, *folder.parents) if each.parent.name == "uwlts"), folder)
+    found = ((path, path.stat()) for path in sorted(package.rglob("*.py")))
+    return tuple((str(path.relative_to(package)), status.st_mtime_ns, status.st_size) for path, status in found)

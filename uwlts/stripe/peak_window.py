@@ -59,7 +59,7 @@ class Peak(NamedTuple):
 
     top: int
     middle: np.floating
-    sigma: float
+    sigma: float | np.floating
     reach: int
     base: np.floating
     slope: np.floating
@@ -154,6 +154,11 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     rise = highest - ground
     level = ground + np.float32(0.5) * rise
 
+    if rise <= 0:
+        # Its surroundings are as high: nothing stands there.
+        zero = np.float32(0.0)
+        return Peak(top, np.float32(top), zero, 0, ground, zero, zero, False, rise > 0)
+
     left, right = top, top
     while left >= 0 and smooth[left] >= level:
         left -= 1
@@ -232,7 +237,9 @@ def gaussian_moments(
     size = window.shape[1]
     for m in range(window.shape[0]):
         pixels, ground, middle, width = window[m], base[m], float(centre[m]), float(sigma[m])
-        near, reach, sharpness = math.floor(middle + 0.5), math.ceil(4.0 * width), 1.0 / (width * width)
+        reach, sharpness = math.ceil(4.0 * width), 1.0 / (width * width)
+        # A centre that has left its window has a sum all the same.
+        near = min(max(math.floor(middle + 0.5), 0), size - 1)
         # A Gaussian by recurrence: the ratio of neighbouring values falls by the same factor from pixel to pixel.
         falling = math.exp(-sharpness)
         highest = math.exp(-0.5 * sharpness * (near - middle) ** 2)

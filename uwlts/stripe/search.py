@@ -175,7 +175,7 @@ def _next_block(blocks: np.ndarray, least: np.float32, rules: SearchRules) -> in
     highest = blocks[0]
     for k in range(blocks.size):
         highest = max(highest, blocks[k])
-    if highest < least:
+    if highest < least or highest <= 0:
         return -1
     chosen = 0
     if rules.order == _STRONGEST:

@@ -520,3 +520,40 @@ def test_settings_of_the_sensor_and_of_the_call():
     ):
         with pytest.raises(DescriptionError, match=said):
             StripeOptions.of(sensor, wrong)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_an_image_shows_a_stripe_that_is_found_has_a_place(seed):
+    """Constant images, noise, stripes beyond the border, single bright columns, all types, methods and options."""
+    rng = np.random.default_rng(seed)
+    found = 0
+    for _ in range(60):
+        half = int(rng.integers(8, 24))
+        lines, length = int(rng.integers(1, 40)), int(rng.integers(4 * half, 6 * half))
+        x, sigma = np.arange(length), rng.uniform(0.3, half / 3)
+        stripe = np.exp(-0.5 * ((x - rng.uniform(-5, length + 5, (lines, 1))) / sigma) ** 2)
+        image = rng.normal(10, rng.choice([0, 1, 30]), (lines, length)) + rng.choice([0, 50, 300, 2000]) * stripe
+        if rng.random() < 0.2:
+            image[:] = rng.choice([0, 255])
+            image[:, rng.integers(length)] = 1e5
+        dtype = (np.uint8, np.uint16, np.float32)[rng.integers(3)]
+        if dtype is np.float32:
+            image = (image * rng.choice([1.0, 1e12])).astype(np.float32)
+        else:
+            image = grey(image, top=np.iinfo(dtype).max, dtype=dtype)
+        options = StripeOptions(
+            method=METHODS[rng.integers(len(METHODS))],
+            peak=list(PeakRule)[rng.integers(3)],
+            half_window_px=half,
+            smoothing_px=float(rng.uniform(0.5, half / 4)),
+            smoothing_lines=int(rng.choice([1, 3, 5])),
+            threshold_sigmas=float(rng.choice([1, 6])),
+            threshold_floor=float(rng.choice([0, 3])),
+            min_fwhm_px=float(rng.choice([0, 1.3])),
+            ambiguous_ratio=float(rng.uniform(0.05, 1)),
+        )
+        stripe = rows(image, options=options, saturation=None if rng.random() < 0.5 else 200.0)
+        good = stripe.status == StripeStatus.OK
+        assert np.isfinite(stripe.centre_px).tolist() == good.tolist()
+        found += np.count_nonzero(good)
+    assert found > 50
