@@ -556,4 +556,4 @@ def test_whatever_an_image_shows_a_stripe_that_is_found_has_a_place(seed):
         good = stripe.status == StripeStatus.OK
         assert np.isfinite(stripe.centre_px).tolist() == good.tolist()
         found += np.count_nonzero(good)
-    assert found > 50
+    assert found > 20
