@@ -59,7 +59,7 @@ def read_header(content: bytes, path: str | Path) -> ImageHeader:
     readers = {"PNG": _png_header, "BMP": _bmp_header, "JPEG": _jpeg_header, "TIFF": _tiff_header}
     try:
         found = readers[kind](content)
-    except (struct.error, IndexError, KeyError, ValueError) as error:
+    except (struct.error, IndexError, KeyError, ValueError, OverflowError) as error:
         raise ImageError(
             f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes, its header cannot be read); "
             "copy it again"

@@ -1,10 +1,11 @@
 """Cameras that other programs calibrated: OpenCV's files and ROS CameraInfo."""
 
-import re
+import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 import yaml
 
@@ -20,14 +21,21 @@ _BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
 
 
 _MOST_BYTES = 2**20
-_NESTING = re.compile(r"[\[\]{}]")
-_DASHES = re.compile(rf"(?:-[ \t]++){{{MOST_DEPTH}}}")
-_DEEPEST_INDENT = 1000
 _LARGEST = 1e9
 """Focal lengths in px and coefficients are far below it; their products stay in the range of numbers."""
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
 _SQUARE = 0.005  # calibrations of square pixels find focal lengths that differ by less
+
+
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_SafeLoader):
+    """Plain YAML, in which a matrix of OpenCV is a table."""
+
+
+_Loader.add_multi_constructor(
+    "tag:yaml.org,2002:opencv-", lambda loader, suffix, node: loader.construct_mapping(node, deep=True)
+)
 
 
 @dataclass(frozen=True)
@@ -51,10 +59,8 @@ def read_intrinsics(path: Path) -> KnownCamera:
     text = read_text(
         path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
     )
-    if _too_deep(text):
-        raise DescriptionError(f"{path} nests its tables and lists more than {MOST_DEPTH} deep")
-    of_opencv = text.lstrip().startswith(("%YAML", "<?xml", "{")) or "!!opencv-matrix" in text
-    entries = _opencv(text, path) if of_opencv else _plain_yaml(text, path)
+    # OpenCV's own parser hangs or ends the process with some damaged files.
+    entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
     known = {key.lower().replace("_", ""): value for key, value in entries.items()}
     model = str(known.get("distortionmodel") or "").lower()
     if model not in _BROWN_CONRADY:
@@ -96,30 +102,38 @@ def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Senso
     return validated(Sensor, merged(sensor.model_dump(), {"camera": changes}), source)
 
 
-def _opencv(text: str, path: Path) -> dict[str, object]:
-    """Top entries of a file of `cv2.FileStorage`: matrices, lists, numbers and texts."""
+def _xml(text: str, path: Path) -> dict[str, object]:
+    """Top entries of an XML file of OpenCV; what is plain text there are its words."""
+    if "<!" in text.replace("<!--", ""):
+        raise DescriptionError(f"{path} declares a type of document or entities, which no file of OpenCV does")
+    depth, root = 0, None
     try:
-        # Its nodes hold only as long as the storage does.
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        names = storage.root().keys()
-        return {name: _value(storage.getNode(name)) for name in names}
-    # OpenCV's binding fails with a SystemError where the constructor throws.
-    except (cv2.error, SystemError) as error:
-        raise DescriptionError(f"{path} is no complete file of OpenCV: {' '.join(str(error).split())}") from error
+        for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):
+            depth += 1 if event == "start" else -1
+            if depth > MOST_DEPTH:
+                raise DescriptionError(f"{path} nests its elements more than {MOST_DEPTH} deep")
+            root = element
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise DescriptionError(f"{path} is no complete XML: {error}") from error
+    return {child.tag: _value(child) for child in root} if root is not None else {}
 
 
-def _value(node: cv2.FileNode) -> object:
-    if node.isMap():
-        # A matrix, with its tag or without, as ROS writes it.
-        return _value(node.getNode("data"))
-    if node.isSeq():
-        return [_value(node.at(place)) for place in range(node.size())]
-    if node.isString():
-        return node.string()
-    return node.real() if node.isInt() or node.isReal() else None
+def _value(element: ElementTree.Element) -> object:
+    if len(element) == 0:
+        words = [word.strip('"') for word in (element.text or "").split()]
+        return words[0] if len(words) == 1 else words
+    if all(child.tag == "_" for child in element):
+        return [_value(child) for child in element]
+    return {child.tag: _value(child) for child in element}
 
 
-def _plain_yaml(text: str, path: Path) -> dict[str, object]:
+def _yaml(text: str, path: Path) -> dict[str, object]:
+    """Entries of a file of YAML, or of JSON, which is YAML but for its tabs."""
+    if text.startswith("%YAML"):
+        # OpenCV writes "%YAML:1.0", which YAML does not know.
+        text = text.partition("\n")[2]
+    if text.lstrip().startswith("{"):
+        text = text.expandtabs(1)
     try:
         _refuse_references(text)
         # What `rostopic echo` prints ends with the mark of a next document.
@@ -143,22 +157,6 @@ def _refuse_references(text: str) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MOST_DEPTH:
             raise ValueError(f"it is nested more than {MOST_DEPTH} deep")
-
-
-def _too_deep(text: str) -> bool:
-    """Whether brackets, elements of XML, dashes or indentation nest more than `MOST_DEPTH` deep.
-
-    OpenCV's parser calls itself for each and ends the process where the stack does. Brackets within texts count too.
-    """
-    depth = 0
-    for found in _NESTING.finditer(text):
-        depth += 1 if found[0] in "[{" else -1
-        if depth > MOST_DEPTH:
-            return True
-    if text.count("<") - 2 * text.count("</") > 2 * MOST_DEPTH or _DASHES.search(text):
-        return True
-    indents = (len(line) - len(line.lstrip(" ")) for line in text.splitlines())
-    return max(indents, default=0) > _DEEPEST_INDENT
 
 
 def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
