@@ -51,6 +51,7 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_lens_and_window_are_found_from_a_target_in_water(folder: Path, thesis_as_built: Sensor):
     """Besides the stated uncertainty the finite pupil, which no pinhole knows, shifts images by some 0.01 px."""
     calibration = read_calibration(folder / "calibration.json")
@@ -70,6 +71,7 @@ def test_lens_and_window_are_found_from_a_target_in_water(folder: Path, thesis_a
     assert "window distance: " in said and "scatter: target " in said
 
 
+@pytest.mark.slow
 def test_spheres_in_water_have_their_distance_and_size(folder: Path):
     """Spacing and diameters to 0.02 mm by three sigma of what speckle and this calibration leave."""
     run(
@@ -82,6 +84,7 @@ def test_spheres_in_water_have_their_distance_and_size(folder: Path):
     assert abs(figures["diameter error sphere 2"]) < 0.03
 
 
+@pytest.mark.slow
 def test_verify_judges_a_known_object_by_both_uncertainties_and_a_limit(folder: Path):
     def verify(*options: object) -> subprocess.CompletedProcess[str]:
         return uwlts("verify", folder / "spheres.h5", "--calibration", folder / "calibration.json", *options)

@@ -68,6 +68,7 @@ def centres(image: np.ndarray) -> np.ndarray:
     return extract_stripe(image, stripe_along="width").centre_px
 
 
+@pytest.mark.slow
 def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, sensor, tmp_path):
     exposure = served.exposure_ms["laser"]
     done = run(written(folder, served, top=f"laser_ms = {exposure}"), tmp_path / "scan.h5")

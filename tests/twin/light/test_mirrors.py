@@ -80,6 +80,7 @@ def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(t
     assert abs(first - last) > 3.0
 
 
+@pytest.mark.slow
 def test_the_straight_stripe_is_the_same_with_a_mirror(thesis):
     scenes = [scene_of(BLOCK, mirror(share)) for share in (SHARE, 0.0)]
     renderers = [Renderer(thesis, clear(), scene, effects=EFFECTS) for scene in scenes]

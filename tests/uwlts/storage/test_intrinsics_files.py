@@ -131,7 +131,10 @@ def test_longer_models_pass_where_they_say_no_more(tmp_path: Path):
         (ROS[: ROS.index("640.5")], "no valid YAML"),
         ("[1, 2, 3]\n", "holds no table"),
         ("", "holds no table"),
-        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  data: [ 1., 0.", "no complete file of OpenCV"),
+        ("%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  data: [ 1., 0.", "no valid YAML"),
+        ("<?xml version='1.0'?>\n<opencv_storage><K>1. 0. 0.", "no complete XML"),
+        ("<?xml version='1.0'?>\n<!DOCTYPE a [<!ENTITY b 'c'>]>\n<a>&b;</a>", "declares a type of document"),
+        ("<?xml version='1.0'?>\n" + 200 * "<a>" + 200 * "</a>", "nests its elements"),
     ],
 )
 def test_what_is_no_such_camera(tmp_path: Path, text: str, words: str):
