@@ -39,7 +39,7 @@ check: setup
 	@$(PYTHON) -m ruff format --check --quiet .
 	@$(PYTHON) -m ruff check --quiet .
 	@$(VENV)/bin/lint-imports --no-logo
-	@$(VENV)/bin/basedpyright
+	@$(VENV)/bin/basedpyright --threads 2
 
 fuzz: setup
 	@$(PYTHON) -m tests.fuzz $(if $(CASES),--cases $(CASES)) $(READERS)
