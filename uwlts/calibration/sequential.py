@@ -275,8 +275,9 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
     warnings = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
     if options.poses == "stage-normal" and lens.options.pixel_aspect is not None:
         freer = solved(used.images, poses="stage", options=lens.options)
-        unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
-        warnings += _leaning(camera, freer, unsquare)
+        if freer.stage_tilt_rad is not None and freer.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
+            unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
+            warnings.append(_leaning(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
     return _Seen(camera, lens, used, warnings)
 
 
@@ -375,14 +376,12 @@ def _halves_apart_rad(sheet: SheetSolution, lens: LensCalibration, found: AirEvi
     return None if one is None or two is None else float(np.arccos(np.clip(one @ two, -1.0, 1.0)))
 
 
-def _leaning(camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution) -> list[str]:
+def _leaning(camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution, *, tilt_rad: float) -> str:
     """What speaks against a stage that moves along the target's normal: one that moves freely, or other pixels.
 
     Images of one pose, moved along the stage, hardly tell the two apart.
     """
-    if freer.stage_tilt_rad is None or freer.sigma_px > _CLEARLY_LESS * camera.sigma_px:
-        return []
-    tilt, f, other_f = np.degrees(freer.stage_tilt_rad), camera.model.fx_px, freer.model.fx_px
+    tilt, f, other_f = np.degrees(tilt_rad), camera.model.fx_px, freer.model.fx_px
     warning = (
         f"the stage moves {tilt:.2f} deg beside the target's normal: with poses 'stage' the points miss by "
         f"{freer.sigma_px:.3f} in place of {camera.sigma_px:.3f} px, and f is {other_f:.1f} in place of {f:.1f} px"
@@ -393,7 +392,7 @@ def _leaning(camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolu
             f"; or pixels are not of the shape described: free, they miss by {unsquare.sigma_px:.3f} px, with fx "
             f"{model.fx_px:.1f} and fy {model.fy_px:.1f} px. Views of the target turned by 20 deg and more would tell"
         )
-    return [warning]
+    return warning
 
 
 def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:

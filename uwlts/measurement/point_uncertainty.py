@@ -23,13 +23,12 @@ from uwlts.optics.line_table import LineTable
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 from uwlts.storage.files import sha256_of
+from uwlts.stripe.result import pixels_of
 
 _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
-_TABULATED = 5000
-"""Points from which their derivatives are tabulated: a table costs as much as some thousand of them."""
 _TABLE_TOLERANCE_MM = 1e-6
 
 
@@ -84,7 +83,6 @@ def point_uncertainty(
     if scans and sha256_of(capture.path) in scans:
         sensor = sensor.model_copy(update={"uncertainty": sensor.uncertainty.model_copy(update={"drift_k": 0.0})})
     known = stored_estimate(calibration, sensor, header.medium)
-    across = 1 if calibration.stripe_along == "width" else 0
     # Neighbours err together, so that they show only a part of the noise.
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
     noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
@@ -97,7 +95,7 @@ def point_uncertainty(
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     beside = beside_std(header.sensor.uncertainty)
-    derivatives = _derivatives(known, across, root, line, centre_px)
+    derivatives = _derivatives(known, root, line, centre_px, stripe_along=calibration.stripe_along)
     random, moved = [], []
     for start in range(0, len(line), _BLOCK):
         here = slice(start, start + _BLOCK)
@@ -123,17 +121,16 @@ def point_uncertainty(
 
 
 def _derivatives(
-    known: StoredEstimate, across: int, root: np.ndarray, line: np.ndarray, centre_px: np.ndarray
+    known: StoredEstimate, root: np.ndarray, line: np.ndarray, centre_px: np.ndarray, *, stripe_along: str
 ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Function of lines and centres like those given, for derivatives of their points in the camera frame.
 
-    These are (N, 3) by the pixel across the stripe, coordinate ``across`` of the image, and (R, N, 3) by independent
-    parts of all parameters.
+    These are (N, 3) by the pixel across the stripe and (R, N, 3) by independent parts of all parameters.
     """
-    column = COLUMNS.index("uv"[across])
+    column = COLUMNS.index("v" if stripe_along == "width" else "u")
 
     def exact(line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
-        pixels = np.stack((line, centre_px) if across else (centre_px, line), axis=1).astype(np.float64)
+        pixels = pixels_of(line, centre_px, stripe_along=stripe_along)
         points = known.parameters.on_sheet(known.values, known.view, pixels)
         if points is None:
             return np.full((len(line), 3 + 3 * root.shape[1]), np.nan)
@@ -143,10 +140,7 @@ def _derivatives(
         ]
         return np.hstack([points.by_rays[column].T, np.stack(by_global, axis=2).reshape(len(line), -1)])
 
-    table = None
-    if len(line) >= _TABULATED:
-        lines, places = (int(line.min()), int(line.max())), (float(centre_px.min()), float(centre_px.max()))
-        table = LineTable.of(exact, lines, places, tolerance=_TABLE_TOLERANCE_MM)
+    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM)
 
     def derivatives(line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values = exact(line, centre_px) if table is None else table.values(line, centre_px)

@@ -11,11 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import chebyshev
 
 from uwlts.runtime.compiled import compiled
 
 _NODES = (8, 16, 32)
 """Numbers of nodes along either direction that are tried, one after another."""
+
+_WORTH = 5000
+"""Places from which a table is worth making: it costs as much as some thousand of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,25 +48,39 @@ class LineTable:
         ``exact`` gives the values (N, K) for lines (N,) and places (N,), both float. None where one is not finite, or
         where the last terms of the series are not below the tolerance, as of a function that is not smooth.
         """
-        (first, last), (low, high) = lines, places_px
-        half = max(0.5 * (high - low), 0.5)
-        middle = 0.5 * (low + high)
+        (line, half_lines), (place, half_places) = (
+            (0.5 * (low + high), max(0.5 * (high - low), 0.5)) for low, high in (lines, places_px)
+        )
         for count in _NODES:
-            nodes, into_series = _nodes(count)
-            line, place = np.meshgrid(
-                0.5 * (first + last) + max(0.5 * (last - first), 0.5) * nodes, middle + half * nodes
-            )
-            values = exact(line.ravel(), place.ravel()).reshape(count, count, -1)
+            nodes = chebyshev.chebpts1(count)
+            into_series = 2.0 / count * chebyshev.chebvander(nodes, count - 1).T
+            into_series[0] *= 0.5
+            at_line, at_place = np.meshgrid(line + half_lines * nodes, place + half_places * nodes)
+            values = exact(at_line.ravel(), at_place.ravel()).reshape(count, count, -1)
             if not np.isfinite(values).all():
                 return None
             # Axes: term of the place, term of the line, value.
             series = np.einsum("ip,jl,plk->ijk", into_series, into_series, values, optimize=True)
             if max(np.abs(series[-2:]).max(), np.abs(series[:, -2:]).max()) <= tolerance:
-                at = (np.arange(first, last + 1) - 0.5 * (first + last)) / max(0.5 * (last - first), 0.5)
-                by_line = np.polynomial.chebyshev.chebvander(at, count - 1)
+                by_line = chebyshev.chebvander((np.arange(lines[0], lines[1] + 1) - line) / half_lines, count - 1)
                 per_line = np.ascontiguousarray(np.einsum("lj,ijk->lik", by_line, series, optimize=True))
-                return cls(per_line, first, middle - half, middle + half)
+                return cls(per_line, lines[0], place - half_places, place + half_places)
         return None
+
+    @classmethod
+    def about(
+        cls,
+        exact: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        line: np.ndarray,
+        place_px: np.ndarray,
+        *,
+        tolerance: float,
+    ) -> LineTable | None:
+        """Table for all of the places (N,) on lines (N,) int; None also where they are too few to be worth one."""
+        if len(line) < _WORTH or line.dtype.kind not in "iu" or not np.isfinite(place_px).all():
+            return None
+        lines, places_px = (int(line.min()), int(line.max())), (float(place_px.min()), float(place_px.max()))
+        return cls.of(exact, lines, places_px, tolerance=tolerance)
 
     def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
         """Values (N, K) for lines (N,) int and places (N,) within the table."""
@@ -72,14 +90,6 @@ class LineTable:
         at = np.ascontiguousarray((np.asarray(place_px, dtype=float) - self.low_px) * scale - 1.0)
         _sum_series(self.series, row, at, result)
         return result
-
-
-def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev's nodes (n,) in [-1, 1], and the matrix (n, n) from the values there to the series."""
-    angle = np.pi * (np.arange(count) + 0.5) / count
-    into_series = 2.0 / count * np.cos(np.outer(np.arange(count), angle))
-    into_series[0] *= 0.5
-    return np.cos(angle), into_series
 
 
 @compiled

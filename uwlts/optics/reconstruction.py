@@ -16,13 +16,14 @@ from uwlts.optics.camera import directions
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.sheet import SheetSurface, sheet_surface
 from uwlts.optics.window import RaysInMedium, RayStatus, trace_window
+from uwlts.stripe.result import pixels_of
 
 # Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
 # angle would meet a sheet 1 mm away after a million kilometres.
 _PARALLEL = 1e-12
 
-# Points of profiles from which they are tabulated, which costs as much as some thousand of them; and how exactly.
-_TABULATED, _TABLE_TOLERANCE_MM = 10_000, 1e-7
+# To which points of profiles are tabulated.
+_TABLE_TOLERANCE_MM = 1e-7
 
 # Pixels computed together, so that all intermediate results stay in the processor's cache.
 _BLOCK = 4096
@@ -67,16 +68,15 @@ def _profile_points(
     """As `points_on_sheet`, by a table where there are many points and all of their part of the image has some."""
 
     def exact(line: np.ndarray, place: np.ndarray) -> MeasuredPoints:
-        pixels = np.stack((line, place) if calibration.stripe_along == "width" else (place, line), axis=1)
+        pixels = pixels_of(line, place, stripe_along=calibration.stripe_along)
         return points_on_sheet(calibration, pixels, medium_index=medium_index)
 
     lines, centres_px = np.asarray(lines), np.asarray(centres_px)
-    if len(lines) >= _TABULATED and lines.dtype.kind in "iu" and np.isfinite(centres_px).all():
-        ends = (int(lines.min()), int(lines.max())), (float(centres_px.min()), float(centres_px.max()))
-        table = LineTable.of(lambda line, place: exact(line, place).points_mm, *ends, tolerance=_TABLE_TOLERANCE_MM)
-        if table is not None:
-            status = np.full(len(lines), RayStatus.OK, dtype=np.uint8)
-            return MeasuredPoints(table.values(lines, centres_px), status)
+    table = LineTable.about(
+        lambda line, place: exact(line, place).points_mm, lines, centres_px, tolerance=_TABLE_TOLERANCE_MM
+    )
+    if table is not None:
+        return MeasuredPoints(table.values(lines, centres_px), np.full(len(lines), RayStatus.OK, dtype=np.uint8))
     return exact(lines, centres_px)
 
 

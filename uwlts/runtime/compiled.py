@@ -13,8 +13,8 @@ from numba import njit
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
-_FREEDOM = {"reassoc", "contract", "arcp", "nsz", "nnan"}
-"""What vector units need: sums may be reordered, and nothing compared is NaN. Infinity keeps its meaning."""
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz", "nnan"}
+"""LLVM's fast-math flags for vectorization: sums may be reassociated, and NaN must not occur; infinities may."""
 
 
 def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
@@ -22,7 +22,7 @@ def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, 
 
     Without a folder that can be written it is compiled anew in every process.
     """
-    options: dict[str, Any] = {"fastmath": _FREEDOM, "error_model": "numpy", "nogil": True}
+    options: dict[str, Any] = {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True}
     try:
         kept: Any = njit(cache=True, **options)(function)
         # Numba takes a function as unchanged where its own file is; here a change of what it calls shows as well.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -23,13 +22,16 @@ FLANK = 5
 """Pixels of background taken on either side of a peak."""
 
 
+FIRST, STRONGEST, LAST = -1, 0, 1
+
+
 class SearchRules(NamedTuple):
     """Options of the search: lengths in px, heights in grey levels.
 
-    A window is ``block`` pixels and ``half`` pixels on either side, ``smoothing`` the sigma of the low-pass. A second
-    peak of ``share`` of the first one's height makes a window crowded; it is looked for in the ``whole`` window, else
-    only as far as the pixels used reach. ``order`` says which of several stripes counts: the first, the strongest or
-    the last for -1, 0, 1. A stripe's sigma lies between ``narrowest`` and ``widest``. Blocks lower than ``coarse`` and
+    A window is ``block`` pixels and ``half`` pixels on either side, ``smoothing`` the sigma of the low-pass. ``order``
+    says which of several stripes counts: `FIRST`, `STRONGEST` or `LAST`. A second peak of ``share`` of the first one's
+    height makes a window crowded; for the strongest it is looked for in the whole window, else only as far as the
+    pixels used reach. A stripe's sigma lies between ``narrowest`` and ``widest``. Blocks lower than ``coarse`` and
     peaks lower than ``fine`` are noise; what is too wide is noticed from ``bright`` on.
     """
 
@@ -37,7 +39,6 @@ class SearchRules(NamedTuple):
     block: int
     smoothing: float
     share: float
-    whole: bool
     order: int
     narrowest: float
     widest: float
@@ -68,9 +69,8 @@ class Peak(NamedTuple):
     crowded: np.bool_
 
 
-@dataclass(frozen=True)
-class PeakWindow:
-    """Peaks in M windows of W pixels.
+class PeakWindow(NamedTuple):
+    """Peaks in M windows of W pixels, as compiled code takes them.
 
     ``start`` (M,) int is the first pixel's position on its line, ``window`` (M, W) float32 the pixels, with the border
     pixel repeated beyond the border, ``smoothing`` the sigma of the low-pass, px. All others are (M,) float32; see
@@ -87,9 +87,16 @@ class PeakWindow:
     height: np.ndarray
     smoothing: float
 
+    @classmethod
+    def empty(cls, count: int, size: int, smoothing: float) -> PeakWindow:
+        """Room for so many windows of so many pixels."""
+        numbers = np.empty((6, count), np.float32)
+        window = np.empty((count, size), np.float32)
+        return cls(np.empty(count, np.intp), window, *numbers, smoothing=smoothing)
+
     def keep(self, which: np.ndarray) -> PeakWindow:
         """The windows chosen by a boolean mask or by their numbers."""
-        *values, smoothing = vars(self).values()
+        *values, smoothing = self
         return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
 
     def smooth(self) -> np.ndarray:
@@ -177,7 +184,7 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     after = _flank(smooth, near + reach - 1)
     slope = (after - before) / np.float32(2 * reach + FLANK - 2)
     base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
-    extent = size if rules.whole else reach + FLANK - 1
+    extent = size if rules.order == STRONGEST else reach + FLANK - 1
     beside = max(
         greatest(smooth[max(near - extent, 0) : left + 1]), greatest(smooth[right : min(near + extent + 1, size)])
     )
@@ -230,13 +237,11 @@ def noise_gain(sigma: float) -> float:
 
 
 @compiled
-def gaussian_moments(
-    window: np.ndarray, base: np.ndarray, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray
-) -> None:
-    """M0, M1 and M2 (M, 3) of windows (M, W) above `base` under a Gaussian weight at `centre`; see `zero_crossing`."""
-    size = window.shape[1]
-    for m in range(window.shape[0]):
-        pixels, ground, middle, width = window[m], base[m], float(centre[m]), float(sigma[m])
+def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray) -> None:
+    """M0, M1 and M2 (M, 3) of the windows above `base` under a Gaussian weight at `centre`; see `zero_crossing`."""
+    count, size = peak.window.shape
+    for m in range(count):
+        pixels, ground, middle, width = peak.window[m], peak.base[m], float(centre[m]), float(sigma[m])
         reach, sharpness = math.ceil(4.0 * width), 1.0 / (width * width)
         # A centre that has left its window has a sum all the same.
         near = min(max(math.floor(middle + 0.5), 0), size - 1)

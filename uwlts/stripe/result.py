@@ -170,7 +170,10 @@ class Stripe:
 
     def pixels(self) -> np.ndarray:
         """(M, 2) float64: image coordinates (u = column, v = row) of the centres of `lines`, px."""
-        lines = self.lines
-        across = self.centre_px[lines]
-        order = (across, lines) if self.stripe_along == "height" else (lines, across)
-        return np.column_stack(order).astype(np.float64)
+        return pixels_of(self.lines, self.centre_px[self.lines], stripe_along=self.stripe_along)
+
+
+def pixels_of(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str) -> np.ndarray:
+    """(N, 2) float64: image coordinates (u = column, v = row) of places (N,) on profile lines (N,), px."""
+    order = (places_px, lines) if stripe_along == "height" else (lines, places_px)
+    return np.column_stack(order).astype(np.float64)

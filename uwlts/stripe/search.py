@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import (
+    FIRST,
     FLANK,
     FWHM_PER_SIGMA,
+    LAST,
+    STRONGEST,
     Peak,
     PeakWindow,
     SearchRules,
@@ -40,23 +41,7 @@ MARGIN = 2
 
 _OK, _NO_STRIPE = int(StripeStatus.OK), int(StripeStatus.NO_STRIPE)
 _AMBIGUOUS, _BORDER = int(StripeStatus.AMBIGUOUS), int(StripeStatus.BORDER)
-_FIRST, _STRONGEST, _LAST = -1, 0, 1
-_ORDER = {PeakRule.FIRST: _FIRST, PeakRule.STRONGEST: _STRONGEST, PeakRule.LAST: _LAST}
-
-
-class _Found(NamedTuple):
-    """Results (L,) of the search, `window` (L, W): those of lines without a stripe are undefined but for `status`."""
-
-    status: np.ndarray
-    wide: np.ndarray
-    start: np.ndarray
-    window: np.ndarray
-    middle: np.ndarray
-    sigma: np.ndarray
-    reach: np.ndarray
-    base: np.ndarray
-    slope: np.ndarray
-    height: np.ndarray
+_ORDER = {PeakRule.FIRST: FIRST, PeakRule.STRONGEST: STRONGEST, PeakRule.LAST: LAST}
 
 
 def search(
@@ -77,7 +62,6 @@ def search(
         block=half // 2,
         smoothing=options.smoothing_px,
         share=options.ambiguous_ratio,
-        whole=options.peak is PeakRule.STRONGEST,
         order=_ORDER[options.peak],
         narrowest=options.min_fwhm_px / FWHM_PER_SIGMA,
         widest=half / FWHM_PER_SIGMA,
@@ -85,17 +69,15 @@ def search(
         fine=fine,
         bright=max(fine, _BRIGHT * clip),
     )
-    numbers = np.empty((6, lines), np.float32)
-    window = np.empty((lines, 2 * half + rules.block), np.float32)
+    peaks = PeakWindow.empty(lines, 2 * half + rules.block, options.smoothing_px)
     status, wide = np.full(lines, _NO_STRIPE, np.uint8), np.zeros(lines, np.bool_)
-    found = _Found(status, wide, np.empty(lines, np.intp), window, *numbers)
     kernel = low_pass(options.smoothing_px)
     # Numba compiles longest for arrays that compiled code makes itself.
-    smooth, pixels = np.empty(window.shape[1], np.float32), np.empty(window.shape[1] + kernel.size - 1, np.float32)
-    _search_lines(profiles, board, kernel, pixels, smooth, rules, found)
-    windows = PeakWindow(found.start, window, *numbers, smoothing=options.smoothing_px)
+    smooth = np.empty(peaks.window.shape[1], np.float32)
+    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
+    _search_lines(profiles, board, kernel, pixels, smooth, rules, status, wide, peaks)
     good = status == _OK
-    return status, wide, windows if good.all() else windows.keep(good)
+    return status, wide, peaks if good.all() else peaks.keep(good)
 
 
 @compiled
@@ -106,8 +88,11 @@ def _search_lines(
     pixels: np.ndarray,
     smooth: np.ndarray,
     rules: SearchRules,
-    found: _Found,
+    status: np.ndarray,
+    wide: np.ndarray,
+    peaks: PeakWindow,
 ) -> None:
+    """Fill `status`, `wide` and the windows of the lines that have a stripe; the windows of others are undefined."""
     size, border = smooth.size, kernel.size // 2
     for line in range(profiles.shape[1]):
         blocks, least = board[line], np.float32(rules.coarse)
@@ -137,31 +122,31 @@ def _search_lines(
             verdict = _judged(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 if (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright:
-                    found.wide[line] = True
+                    wide[line] = True
                 blocks[chosen] = 0
                 continue
             # The window has been searched for rivals already.
             for k in range(chosen - MARGIN, chosen + MARGIN + 1):
                 blocks[k] = 0
-            if found.status[line] == _OK:
+            if status[line] == _OK:
                 # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
-                away = abs(start + peak.middle - (found.start[line] + found.middle[line]))
+                away = abs(start + peak.middle - (peaks.start[line] + peaks.middle[line]))
                 if (
-                    away > found.sigma[line] * np.float32(FWHM_PER_SIGMA)
-                    and peak.height >= rules.share * found.height[line]
+                    away > peaks.sigma[line] * np.float32(FWHM_PER_SIGMA)
+                    and peak.height >= rules.share * peaks.height[line]
                 ):
-                    found.status[line] = _AMBIGUOUS
+                    status[line] = _AMBIGUOUS
                     break
                 continue
-            found.status[line] = verdict
+            status[line] = verdict
             if verdict != _OK:
                 break
-            found.start[line] = start
-            found.middle[line], found.sigma[line], found.reach[line] = peak.middle, peak.sigma, peak.reach
-            found.base[line], found.slope[line], found.height[line] = peak.base, peak.slope, peak.height
+            peaks.start[line] = start
+            peaks.middle[line], peaks.sigma[line], peaks.reach[line] = peak.middle, peak.sigma, peak.reach
+            peaks.base[line], peaks.slope[line], peaks.height[line] = peak.base, peak.slope, peak.height
             for k in range(size):
-                found.window[line, k] = window[k]
-            if rules.order != _STRONGEST:
+                peaks.window[line, k] = window[k]
+            if rules.order != STRONGEST:
                 break
             least = max(least, there * np.float32(rules.share * _COARSE_SLACK))
 
@@ -178,12 +163,12 @@ def _next_block(blocks: np.ndarray, least: np.float32, rules: SearchRules) -> in
     if highest < least or highest <= 0:
         return -1
     chosen = 0
-    if rules.order == _STRONGEST:
+    if rules.order == STRONGEST:
         while blocks[chosen] != highest:
             chosen += 1
         return chosen
     wanted = max(least, np.float32(highest) * np.float32(rules.share * _COARSE_SLACK))
-    if rules.order == _FIRST:
+    if rules.order == FIRST:
         while blocks[chosen] < wanted:
             chosen += 1
         return chosen

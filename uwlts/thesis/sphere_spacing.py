@@ -20,6 +20,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
+from uwlts.stripe.result import pixels_of
 from uwlts.thesis.campaign import STEP_PLACES, CampaignFolder
 from uwlts.thesis.results import WindowChoice, WindowProfile
 
@@ -58,10 +59,9 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
     away = np.abs(np.linalg.norm(scan.points_mm[used, None] - centres, axis=2) - radii)
     kept = scan.stripe[used]
     line, centre = stripes.line[kept], stripes.centre_px[kept]
-    along_width = capture.header.sensor.camera.stripe_along == "width"
     return SphereScan(
         placement=placement,
-        pixels=np.stack((line, centre) if along_width else (centre, line), axis=1).astype(float),
+        pixels=pixels_of(line, centre, stripe_along=capture.header.sensor.camera.stripe_along),
         stage_mm=capture.stage_mm[stripes.frame[kept]],
         sphere=np.argmin(away, axis=1),
         stage_direction=np.array(capture.header.stage_direction),

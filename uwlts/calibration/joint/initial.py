@@ -40,6 +40,7 @@ from uwlts.optics.brightness import BLUR_STD, beside_sheet, beside_std
 from uwlts.optics.camera import directions
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.optics.window import trace_window
+from uwlts.stripe.result import pixels_of
 
 _LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3
 """Pixels, or a share of the focal length: what the stage's errors leave in the images that a start is found from."""
@@ -290,7 +291,7 @@ def surface_scan(
     """
     line, centre, direction = stripes.line, stripes.centre_px, stripes.stage_direction
     across = 1 if start.stripe_along == "width" else 0
-    pixels = np.stack((line, centre) if across else (centre, line), axis=1).astype(np.float64)
+    pixels = pixels_of(line, centre, stripe_along=start.stripe_along)
     stage_mm = stripes.stage_mm[stripes.frame]
 
     def reconstructed(pixels: np.ndarray, stage_mm: np.ndarray) -> np.ndarray:

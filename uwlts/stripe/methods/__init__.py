@@ -32,7 +32,7 @@ def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]
     centre = _method(method)(peak)
     sigma, kernel = np.maximum(peak.sigma, np.float32(0.3)), peak.kernel_sigma()
     moments = np.empty((centre.size, 3), np.float32)
-    gaussian_moments(peak.window, peak.base, centre, kernel, moments)
+    gaussian_moments(peak, centre, kernel, moments)
     # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
     joint = 0.5 / math.pi * (1 / (sigma * sigma) + 1 / (kernel * kernel))
     return centre, moments[:, 0] * np.sqrt(joint)

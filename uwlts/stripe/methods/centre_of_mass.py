@@ -20,27 +20,21 @@ def centres(peak: PeakWindow) -> np.ndarray:
     """
     half = np.float32(2.25) * peak.kernel_sigma()
     centre = peak.middle.copy()
-    _follow(peak.window, half, peak.base, peak.slope, peak.middle, peak.height, centre)
+    _follow(peak, half, centre)
     return centre
 
 
 @compiled
-def _follow(
-    window: np.ndarray,
-    half: np.ndarray,
-    base: np.ndarray,
-    slope: np.ndarray,
-    middle: np.ndarray,
-    height: np.ndarray,
-    centre: np.ndarray,
-) -> None:
+def _follow(peak: PeakWindow, half: np.ndarray, centre: np.ndarray) -> None:
     for m in range(centre.size):
         for _ in range(_ITERATIONS):
             total, moment = 0.0, 0.0
             first, last = math.ceil(centre[m] - half[m] - 0.5), math.floor(centre[m] + half[m] + 0.5)
-            for x in range(max(first, 0), min(last + 1, window.shape[1])):
+            for x in range(max(first, 0), min(last + 1, peak.window.shape[1])):
                 u = x - centre[m]
-                share = part_inside(u, half[m]) * (window[m, x] - (base[m] + slope[m] * (x - middle[m])))
+                share = part_inside(u, half[m]) * (
+                    peak.window[m, x] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m]))
+                )
                 total, moment = total + share, moment + share * u
-            step = moment / max(total, 0.1 * height[m])
+            step = moment / max(total, 0.1 * peak.height[m])
             centre[m] += min(max(step, -half[m]), half[m])

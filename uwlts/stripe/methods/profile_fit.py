@@ -67,16 +67,14 @@ def centres(peak: PeakWindow) -> np.ndarray:
     """
     sampled = np.arange(0, peak.start.size, max(1, peak.start.size // _SAMPLED))
     flanks = np.zeros(sampled.size, np.float32)
-    _flank_noise(peak.window, peak.base, peak.slope, peak.middle, peak.reach, sampled, flanks)
+    _flank_noise(peak, sampled, flanks)
     # The floor: that of the usual line.
     noise = max(_LEAST_NOISE, math.sqrt(np.median(flanks) / _MEDIAN_MEAN_SQUARE))
     groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
     # Flat rows, of which the compiler knows that their parts do not overlap.
     signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
     known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(8 * _LANES, np.float32)
-    _set_side_by_side(
-        peak.window, peak.middle, peak.sigma, peak.reach, peak.base, peak.slope, peak.height, noise, signal, known
-    )
+    _set_side_by_side(peak, noise, signal, known)
     _improve(known, signal, sums, _USUAL_CONTRAST, _FIRST_STEPS)
     _improve(known, signal, sums, _contrast(known, signal, sampled, noise), _STEPS - _FIRST_STEPS)
     centre = np.floor(peak.middle + np.float32(0.5)) + known[:, _CENTRE : _CENTRE + _LANES].ravel()[: peak.start.size]
@@ -92,60 +90,44 @@ def centres(peak: PeakWindow) -> np.ndarray:
 
 
 @compiled
-def _flank_noise(
-    window: np.ndarray,
-    base: np.ndarray,
-    slope: np.ndarray,
-    middle: np.ndarray,
-    reach: np.ndarray,
-    sampled: np.ndarray,
-    result: np.ndarray,
-) -> None:
+def _flank_noise(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -> None:
     """Mean square (S,) of the pixels of both flanks about the line through them, of sampled lines."""
     for number in range(sampled.size):
         m = sampled[number]
-        near = math.floor(middle[m] + np.float32(0.5))
+        near = math.floor(peak.middle[m] + np.float32(0.5))
         for away in range(-FLANK, FLANK):
-            x = near + away + (int(reach[m]) if away >= 0 else 1 - int(reach[m]))
-            x = min(max(x, 0), window.shape[1] - 1)
-            left = window[m, x] - (base[m] + slope[m] * (np.float32(x) - middle[m]))
+            x = near + away + (int(peak.reach[m]) if away >= 0 else 1 - int(peak.reach[m]))
+            x = min(max(x, 0), peak.window.shape[1] - 1)
+            left = peak.window[m, x] - (peak.base[m] + peak.slope[m] * (np.float32(x) - peak.middle[m]))
             result[number] += left * left / np.float32(2 * FLANK)
 
 
 @compiled
-def _set_side_by_side(
-    window: np.ndarray,
-    middle: np.ndarray,
-    sigma: np.ndarray,
-    reach: np.ndarray,
-    base: np.ndarray,
-    slope: np.ndarray,
-    height: np.ndarray,
-    noise: float,
-    signal: np.ndarray,
-    known: np.ndarray,
-) -> None:
+def _set_side_by_side(peak: PeakWindow, noise: float, signal: np.ndarray, known: np.ndarray) -> None:
     """Signal above the background (G, (2 R + 1) lanes) and what is known (G, 8 lanes) of G groups of lines.
 
     Positions count from the pixel nearest to each peak's middle. The last group is filled up with the last line.
     """
-    count, size = window.shape
+    count, size = peak.window.shape
     most = signal.shape[1] // (2 * _LANES)
     for group in range(known.shape[0]):
         for k in range(_LANES):
             m = min(group * _LANES + k, count - 1)
-            near = math.floor(middle[m] + np.float32(0.5))
-            centre, offset = middle[m] - np.float32(near), base[m] + slope[m] * (np.float32(near) - middle[m])
+            near = math.floor(peak.middle[m] + np.float32(0.5))
+            centre, offset = (
+                peak.middle[m] - np.float32(near),
+                peak.base[m] + peak.slope[m] * (np.float32(near) - peak.middle[m]),
+            )
             for x in range(-most, most + 1):
-                pixel = window[m, min(max(near + x, 0), size - 1)]
-                signal[group, (most + x) * _LANES + k] = pixel - (offset + slope[m] * np.float32(x))
-            half_width = np.float32(0.5 * FWHM_PER_SIGMA) * sigma[m]
-            broad = max(sigma[m], np.float32(_NARROWEST))
-            known[group, _CENTRE + k], known[group, _HEIGHT + k] = centre, max(height[m], _TINY)
+                pixel = peak.window[m, min(max(near + x, 0), size - 1)]
+                signal[group, (most + x) * _LANES + k] = pixel - (offset + peak.slope[m] * np.float32(x))
+            half_width = np.float32(0.5 * FWHM_PER_SIGMA) * peak.sigma[m]
+            broad = max(peak.sigma[m], np.float32(_NARROWEST))
+            known[group, _CENTRE + k], known[group, _HEIGHT + k] = centre, max(peak.height[m], _TINY)
             known[group, _SIGMA + k], known[group, _WIDEST + k] = broad, broad * np.float32(_WIDENING)
             known[group, _FIRST + k], known[group, _LAST + k] = centre - half_width, centre + half_width
-            known[group, _FLOOR + k] = np.float32(noise * noise) + (np.float32(_UNMODELLED) * height[m]) ** 2
-            known[group, _REACH + k] = reach[m]
+            known[group, _FLOOR + k] = np.float32(noise * noise) + (np.float32(_UNMODELLED) * peak.height[m]) ** 2
+            known[group, _REACH + k] = peak.reach[m]
 
 
 @compiled

@@ -22,14 +22,12 @@ def centres(peak: PeakWindow) -> np.ndarray:
     """
     half = np.float32(0.5 * FWHM_PER_SIGMA) * peak.kernel_sigma()
     centre = peak.middle.copy()
-    _fit(peak.smooth(), half, peak.base, peak.slope, peak.middle, centre)
+    _fit(peak, peak.smooth(), half, centre)
     return centre
 
 
 @compiled
-def _fit(
-    smooth: np.ndarray, half: np.ndarray, base: np.ndarray, slope: np.ndarray, middle: np.ndarray, centre: np.ndarray
-) -> None:
+def _fit(peak: PeakWindow, smooth: np.ndarray, half: np.ndarray, centre: np.ndarray) -> None:
     for m in range(centre.size):
         for _ in range(_ITERATIONS):
             s0 = s1 = s2 = s3 = s4 = t0 = t1 = t2 = 0.0
@@ -37,7 +35,7 @@ def _fit(
             for x in range(max(first, 0), min(last + 1, smooth.shape[1])):
                 u = x - centre[m]
                 w = part_inside(u, half[m])
-                f = w * (smooth[m, x] - (base[m] + slope[m] * (x - middle[m])))
+                f = w * (smooth[m, x] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m])))
                 s0, s1, s2 = s0 + w, s1 + w * u, s2 + w * u * u
                 s3, s4 = s3 + w * u**3, s4 + w * u**4
                 t0, t1, t2 = t0 + f, t1 + f * u, t2 + f * u * u
