@@ -25,7 +25,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, WebSocketRoute
 
 COUNT = 8
 DESCRIPTIONS = {
@@ -311,6 +311,27 @@ def test_a_camera_whose_cable_is_pulled_ends_the_scan_and_is_connected_again(des
     says(page, "wrote scan.h5")
     with Capture(desk.folder / "scan.h5") as scan:
         assert len(scan) == 16
+
+
+def test_what_is_typed_before_the_page_is_connected_is_kept(desk, chromium):
+    """The socket comes after the page, on a slow network much later."""
+    with watched(chromium.new_page()) as page:
+        page.set_default_timeout(SLOW_MS)
+        sockets: list[WebSocketRoute] = []
+        page.route_web_socket(re.compile("nicegui"), lambda socket: sockets.append(socket))
+        page.goto(desk.operator_address)
+        typed = {"camera": f"replay:{desk.folder / 'none.h5'}", "stage": "", "exposure, ms": "7"}
+        for label, text in typed.items():
+            page.get_by_label(label, exact=True).fill(text)
+        tab(page, "Scan")
+        page.get_by_label("positions").fill("6")
+        sockets[0].connect_to_server()
+        tab(page, "Connect")
+        press(page, "connect")
+        says(page, "none.h5")
+        assert {label: page.get_by_label(label, exact=True).input_value() for label in typed} == typed
+        tab(page, "Scan")
+        assert page.get_by_label("positions").input_value() == "6"
 
 
 @pytest.mark.slow

@@ -65,8 +65,11 @@ class Camera(CameraDevice):
         if self.due_s is None: return None
         if self.lit and hangs == "frame":
             time.sleep(60)
+        if hangs == "lost":
+            time.sleep(timeout_s)
+            return None
         time.sleep(min(timeout_s, max(self.due_s - time.monotonic(), 0)))
-        if time.monotonic() < self.due_s or hangs == "lost":
+        if time.monotonic() < self.due_s:
             return None
         self.due_s, self.number = None, self.number + 1
         image = np.random.default_rng(self.number).integers(3, 7, (512, 96), np.uint8)
@@ -103,11 +106,18 @@ class Scanning:
         raise AssertionError(self.program.communicate()[1])
 
     def dark_after_s(self, *, at_most_s: float = ALLOWED_S) -> float:
-        """Time in s until the controller's laser pin is off."""
-        began = time.monotonic()
+        """Time in s until the controller's laser pin is off.
+
+        What this process is kept from running is allowed on top, as the machine keeps the others from it as well.
+        """
+        began = before = time.monotonic()
+        late_s = 0.0
         while self.controller.state().laser_on:
-            assert time.monotonic() - began < at_most_s + LOAD_S, "the laser is still on"
             time.sleep(0.002)
+            now = time.monotonic()
+            late_s += max(now - before - 0.01, 0.0)
+            before = now
+            assert now - began < at_most_s + LOAD_S + late_s, "the laser is still on"
         return time.monotonic() - began
 
     def ended(self, code: int, says: str) -> None:
@@ -215,11 +225,10 @@ def test_a_scan_that_hangs_in_the_cameras_driver_is_dark(start, hangs):
 
 
 def test_a_frame_that_does_not_come_leaves_no_laser_on(start):
-    """The scan waits for 3 s beyond the exposure, as the camera may begin late, and its guard with it."""
+    """The scan waits for 3 s beyond the exposure, as the camera may begin late, and its guard with it for 1 s more."""
     scan = start(hangs="lost")
     scan.lit()
-    # Half a second for the exchanges with a controller on a busy machine.
-    print(f"dark after {scan.dark_after_s(at_most_s=EXPOSURE_S + 3.5):.3f} s")
+    print(f"dark after {scan.dark_after_s(at_most_s=3.0 + ALLOWED_S):.3f} s")
     scan.lit()
     scan.lit()
     scan.program.stdout.read()

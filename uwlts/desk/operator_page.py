@@ -173,7 +173,6 @@ class _OperatorPage:
         self._view = BoardView(desk.board, picked=self._picked)
         self._only: list[tuple[ui.button, tuple[InstrumentState, ...]]] = []
         self._files: tuple[object, ...] = ()
-        self._exposed: tuple[object, float] | None = None
 
     def build(self) -> None:
         """Build all of it."""
@@ -228,9 +227,8 @@ class _OperatorPage:
     def _refresh(self) -> None:
         self._view.refresh()
         self._show_request()
-        light = self._instrument.light
-        self._light.value = light or "none"
-        if (shown := (light, self._instrument.exposure_ms[light or "lamp"])) != self._exposed:
+        self._light.value = self._instrument.light or "none"
+        if (shown := self._exposure_now()) != self._exposed:
             # Not while the operator types in it.
             self._exposed, self._exposure.value = shown, shown[1]
         for element, states in self._only:
@@ -239,13 +237,15 @@ class _OperatorPage:
     # Connect
 
     def _connect_part(self) -> None:
-        plans, begun = self._desk.plans(load_plan), self._desk.plan
+        plans, plan = self._desk.plans(load_plan), self._desk.plan
         chosen = None if self._desk.plan_path is None else str(self._desk.plan_path)
+        # Values go to the constructors here and below: one that is set later reaches the browser as a message, after
+        # what the operator may have typed by then.
+        camera, stage = _addresses(plan) if plan else ("", "")
         self._plan = ui.select(plans, label="plan of the scan", value=chosen, on_change=self._choose).classes("w-full")
-        self._camera = ui.input("camera", placeholder="gige:NAME, genicam:PRODUCER.cti, replay:FILE").classes("w-full")
-        self._stage = ui.input("stage", placeholder="/dev/ttyACM0; empty: none").classes("w-full")
-        if begun is not None:
-            self._fill(begun)
+        kinds = "gige:NAME, genicam:PRODUCER.cti, replay:FILE"
+        self._camera = ui.input("camera", value=camera, placeholder=kinds).classes("w-full")
+        self._stage = ui.input("stage", value=stage, placeholder="/dev/ttyACM0; empty: none").classes("w-full")
         with ui.row():
             self._button("connect", self._connect, (InstrumentState.DISCONNECTED, *_FREE))
             self._button("disconnect", self._instrument.disconnect, _FREE).props("outline")
@@ -255,7 +255,8 @@ class _OperatorPage:
             self._light = ui.toggle({"lamp": "lamp", "laser": "laser", "none": "stop"}, value="none")
             self._light.on_value_change(lambda event: self._look(event.value))
             self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
-        self._exposure = ui.number("exposure, ms", min=0.001, step=0.1, format="%.3g")
+        self._exposed = self._exposure_now()
+        self._exposure = ui.number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
         self._exposure.on("change", self._expose)
         ui.label("With the laser's light the laser is lit only while an image is exposed.").classes("text-xs")
 
@@ -269,11 +270,9 @@ class _OperatorPage:
             self._board.say(str(error), "error")
             return
         self._desk.plan_path, self._desk.plan = Path(self._plan.value), plan
-        self._fill(plan)
-        self._fill_scan(plan)
-
-    def _fill(self, plan: ScanPlan) -> None:
-        self._camera.value, self._stage.value = plan.camera or "", plan.stage.port or ""
+        self._camera.value, self._stage.value = _addresses(plan)
+        stage = plan.stage
+        self._start.value, self._step.value, self._number.value = stage.start_mm, stage.step_mm, stage.count
 
     def _chosen_plan(self) -> ScanPlan:
         if self._desk.plan is None:
@@ -288,6 +287,10 @@ class _OperatorPage:
         # The toggle follows the instrument, too.
         if wanted != self._instrument.light:
             self._instrument.light = wanted
+
+    def _exposure_now(self) -> tuple[str | None, float]:
+        light = self._instrument.light
+        return light, self._instrument.exposure_ms[light or "lamp"]
 
     def _expose(self) -> None:
         light, value = self._instrument.light, self._exposure.value
@@ -339,11 +342,15 @@ class _OperatorPage:
     # Scan
 
     def _scan_part(self) -> None:
+        plan = self._desk.plan
+        stage = None if plan is None else plan.stage
+        start, step, count = (None, None, None) if stage is None else (stage.start_mm, stage.step_mm, stage.count)
         with ui.row():
-            self._start = ui.number("first position, mm", format="%.3f")
-            self._step = ui.number("step, mm", format="%.4f")
-            self._number = ui.number("positions", min=1, precision=0)
+            self._start = ui.number("first position, mm", value=start, format="%.3f")
+            self._step = ui.number("step, mm", value=step, format="%.4f")
+            self._number = ui.number("positions", value=count, min=1, precision=0)
         self._extent = ui.label().classes("text-sm")
+        self._show_extent()
         for each in (self._start, self._step, self._number):
             each.on_value_change(self._show_extent)
         self._calibration = ui.select([], label="calibration for the cloud", clearable=True).classes("w-full")
@@ -358,12 +365,6 @@ class _OperatorPage:
             self._button("pause", self._instrument.pause, (InstrumentState.SCANNING,))
             self._button("go on", self._instrument.resume, (InstrumentState.PAUSED,))
             self._button("stop", self._instrument.stop, _RUNNING).props("color=warning")
-        if self._desk.plan is not None:
-            self._fill_scan(self._desk.plan)
-
-    def _fill_scan(self, plan: ScanPlan) -> None:
-        stage = plan.stage
-        self._start.value, self._step.value, self._number.value = stage.start_mm, stage.step_mm, stage.count
 
     def _show_extent(self) -> None:
         start, step, count = self._start.value, self._step.value, self._number.value
@@ -507,6 +508,11 @@ class _OperatorPage:
         self._board.say(text)
         with self._results:
             ui.label(text).move(target_index=0)
+
+
+def _addresses(plan: ScanPlan) -> tuple[str, str]:
+    """Of the camera and of the stage."""
+    return plan.camera or "", plan.stage.port or ""
 
 
 def _size_text(size: int) -> str:
