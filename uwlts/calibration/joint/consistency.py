@@ -1,7 +1,7 @@
 """Checks whether evidence, prior knowledge and noise of a joint estimate agree, and which images and values do not."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import assert_never
 
 import numpy as np
@@ -100,13 +100,15 @@ class Findings:
 
     ``contradictions`` are those of what is known before, and make it useless. ``unfit`` are images, by their sources,
     that contradict all others, and ``misfits`` kinds of residuals that show throughout what the model lacks. Doubts are
-    everything else.
+    everything else. ``stretch`` is what the evidence alone says of the target's rows and columns where that is not
+    what was known; pixels of another shape look like it.
     """
 
     contradictions: list[str]
     unfit: dict[str, str]
     misfits: dict[str, str]
     doubts: list[str]
+    stretch: dict[ParameterKey, float] = field(default_factory=dict)
 
     def all_against(self) -> list[str]:
         """All that speaks against the estimate but doubts."""

@@ -101,8 +101,10 @@ class JointProblem:
         compared, factor = deviations(result, least=0.0), understated(result)
         of_target = [each for each in compared if isinstance(each.key, TargetParameter)]
         form = [each for each in of_target if each.sigmas > _NOTICED]
+        stretch = {each.key: each.alone for each in of_target if each.key in STRETCH}
+        stretch = stretch if any(each.key in STRETCH for each in form) else {}
         if not (form or factor > 1.0) or any(each.wrong() for each in compared if each not in of_target):
-            return result, findings(result, self.evidence, sensor=self.sensor)
+            return result, replace(findings(result, self.evidence, sensor=self.sensor), stretch=stretch)
         off = {each.key: abs(each.alone - each.known) for each in of_target}
         priors = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
         for alike in (BENDS, STRETCH):
@@ -120,7 +122,7 @@ class JointProblem:
                 f"what the description states of window, media, laser, stage and target is off by {factor:.1f} times "
                 "the uncertainties stated with it: all are taken for that much larger; check [uncertainty]"
             )
-        return result, replace(against, doubts=doubts + against.doubts)
+        return result, replace(against, doubts=doubts + against.doubts, stretch=stretch)
 
 
 def _of_unknown_size(piece: Evidence) -> Evidence:
@@ -264,12 +266,36 @@ class _Attempt:
             free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
             if free is not None and (free_poses or free._scatter() < _CLEARLY_LESS * best._scatter()):
                 best = _explaining_best([best, free])
-        if best is self:
-            return best
-        given = [name for name in best.options.camera.distortion if name not in camera.distortion]
-        given += ["free pixels"] if best.options.camera.pixel_aspect != camera.pixel_aspect else []
-        said = f"the lens was given {', '.join(given)}: without, images and description contradict each other"
-        return replace(best, said=(*best.said, said))
+        if best is not self:
+            given = [name for name in best.options.camera.distortion if name not in camera.distortion]
+            given += ["free pixels"] if best.options.camera.pixel_aspect != camera.pixel_aspect else []
+            said = f"the lens was given {', '.join(given)}: without, images and description contradict each other"
+            best = replace(best, said=(*best.said, said))
+        if choice.pixels == "auto" and not free_poses:
+            best = best._with_spacings_and_pixels_free() or best
+        return best
+
+    def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
+        """With the target's spacings and the pixels' shape unknown; None where the spacings are as described.
+
+        On a stage, spacings that are wrong along one side look like pixels of another shape: which of both it is, only
+        placements of the target that are turned against each other tell.
+        """
+        found = list(self.against.stretch.values())
+        if not found or self.options.camera.pixel_aspect is None:
+            return None
+        stated = self.gathered.sensor.uncertainty.target_stretch
+        known = {"target_stretch": max(stated, sum(map(abs, found)))}
+        uncertainty = self.gathered.sensor.uncertainty.model_copy(update=known)
+        sensor = self.gathered.sensor.model_copy(update={"uncertainty": uncertainty})
+        camera = replace(self.options.camera, pixel_aspect=None)
+        freed = replace(self, gathered=replace(self.gathered, sensor=sensor))._with_lens(camera)
+        said = (
+            f"the target's spacings are {' and '.join(f'{1e6 * value:+.0f}' for value in found)} µm/m off along rows "
+            "and columns, or pixels are of another shape than described: both are estimated. Placements of the target "
+            "turned by 90° against each other tell which, and so does --pixels square or free"
+        )
+        return None if freed is None else replace(freed, said=(*freed.said, said))
 
     def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
         """With another lens; None where that is not determined, or the evidence contradicts what is described."""

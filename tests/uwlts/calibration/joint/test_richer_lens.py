@@ -46,3 +46,36 @@ def test_a_wrong_spacing_is_not_taken_for_pixels_that_are_not_square(thesis):
     assert any("images show something that the model lacks" in said for said in result.warnings)
     camera = result.calibration.camera
     assert camera.fy_px / camera.fx_px == pytest.approx(1.0, abs=1e-12)
+
+
+def target_in_air_and_water(sensor, *, columns_wider=1.0):
+    """Four images each of a target whose columns are described so many times too far apart."""
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
+    air = target_series(sensor, window=False, positions=np.linspace(-200.0, 60.0, 4), noise=noise, columns=13)
+    water = target_series(sensor, medium=0, positions=np.linspace(-120.0, 60.0, 4), noise=noise, columns=13)
+    for series in (air, water):
+        images = [replace(i, points_mm=i.points_mm * [columns_wider, 1.0, 1.0]) for i in series.found.images]
+        stripes = [pixels[::4] for pixels in series.found.stripes]
+        yield replace(series, found=replace(series.found, images=images, stripes=stripes))
+
+
+@pytest.mark.parametrize(("aspect", "columns_wider"), [(1.003, 1.0), (1.0, 1.003)])
+@pytest.mark.parametrize("alignment_deg", [0.15, 0.4])
+def test_pixels_of_another_shape_look_like_a_stretched_target(thesis, aspect, columns_wider, alignment_deg):
+    """Where the stage does not tell them apart, both are estimated: the focal lengths are within what is stated."""
+    built = altered(BUILT, {"camera": {"pixel_aspect": aspect}})
+    known = altered(thesis, {"uncertainty": {"stage_alignment_deg": alignment_deg}})
+    evidence = gathered(known, list(target_in_air_and_water(built, columns_wider=columns_wider)))
+    result = solve_jointly(evidence, options=OPTIONS)
+    assert any("or pixels are of another shape than described: both are estimated" in said for said in result.warnings)
+    camera, std = result.calibration.camera, result.estimate.std()
+    focal_px = built.camera.focal_length_px()
+    assert abs(camera.fx_px - focal_px) < 4.5 * std[LensParameter.FX]
+    assert abs(camera.fy_px - aspect * focal_px) < 4.5 * std[LensParameter.FY]
+
+
+def test_pixels_said_to_be_square_stay_so(thesis):
+    evidence = gathered(thesis, list(target_in_air_and_water(BUILT, columns_wider=1.003)))
+    result = solve_jointly(evidence, options=replace(OPTIONS, lens=LensChoice(pixels="square")))
+    assert any("stretch of the target along its" in said for said in result.warnings)
+    assert result.calibration.camera.fx_px == result.calibration.camera.fy_px
