@@ -29,6 +29,8 @@ demo: setup
 	@$(PYTHON) -m twin.cli demo
 
 test: PYTEST_OPTIONS := -m "not slow"
+# Threads of two test processes on two cores would wait for each other in every small product of matrices.
+test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: check
 	@$(PYTHON) -m twin.devices.aravis_install
 	@# Without a browser only the tests of pages fail.

@@ -33,6 +33,8 @@ def run(app: App) -> int:
 
     A wrong command line is explained by cyclopts, on standard error like all errors.
     """
+    # Matrices are small here: threads for their products gain nothing, and wait for each other where other work runs.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A shell starts what a script puts in the background with SIGINT ignored, and a laser could not be stopped by it.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
