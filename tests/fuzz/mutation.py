@@ -77,7 +77,7 @@ def changed(content: bytes, form: str, rng: Random, folder: Path) -> bytes:
     """The content with some change; ``folder`` is for what is changed in place."""
     if rng.random() < 0.4:
         return _bytes(content, rng)
-    forms = {"json": _json, "toml": _toml, "lines": _words, "image": _image}
+    forms = {"json": _json, "toml": _toml, "lines": _words, "image": _image, "bytes": _bytes}
     if form == "hdf5":
         return _hdf5(content, rng, folder / "changed.h5")
     return forms[form](content, rng)

@@ -1,6 +1,7 @@
 """Everything that reads files from outside, each with a small valid file made by the program itself."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import trimesh
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
@@ -16,26 +18,33 @@ from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_truth import a_header as truth_header
 from tests.uwlts.storage.test_truth import a_truth
 from twin.design.description import load_study
+from twin.design.screening import as_part, read_parts
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
+from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
 from uwlts.measurement.evaluation import read_evaluation
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.certificate import certificate_of, check_certificate
+from uwlts.report.gather import load_reference
 from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration, write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import read_cloud, write_cloud
 from uwlts.storage.export_ import export_cloud
-from uwlts.storage.import_ import read_image, read_intrinsics, with_intrinsics
+from uwlts.storage.image_file import read_image
+from uwlts.storage.import_ import read_intrinsics, with_intrinsics
 from uwlts.storage.import_.description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
 from uwlts.storage.truth import read_truth, write_truth
+from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
+from uwlts.thesis.tables import load_published
 
 
 @dataclass(frozen=True)
@@ -220,6 +229,42 @@ def _read_mesh(path: Path) -> None:
     _surface_from_file(Mesh(kind="mesh", path=str(path)))
 
 
+def _glb(path: Path) -> None:
+    trimesh.Scene(trimesh.creation.box()).export(path)
+
+
+def _part(path: Path) -> None:
+    number = np.arange(40)
+    path.write_bytes(as_part({"design": number, "line_mm": 150.0 + number, "failure": np.full(40, "")}))
+
+
+def _read_part(path: Path) -> None:
+    folder = path.with_name("screen")
+    folder.mkdir(exist_ok=True)
+    shutil.copyfile(path, folder / "part-000000.parquet")
+    read_parts(folder)
+
+
+def _results(path: Path) -> None:
+    measured = Measurement("spheres", "near", "water", "proposed", "ours", {"SSE": 0.01, "STD": 0.02}, 4000)
+    CampaignResults(
+        measurements=[measured],
+        window={"all": WindowChoice("all", 47.3, 0.02)},
+        window_profiles=[WindowProfile(47.3, [(1.0, 2.0), (1.5, 2.5)])],
+        two_refractions_distance_mm=47.3,
+        polynomials={},
+        budget={"index": 0.01},
+        line_profiles={"near": LineProfile(180.0, [(1.0, 2.0)])},
+        monte_carlo=[SpacingInterval("near", 0.01, 0.02, (-0.03, 0.05), True)],
+        trials=100,
+    ).keep(path)
+
+
+def _guided_plan(path: Path) -> None:
+    text = 'title = "A calibration"\nsensor = "thesis"\nposes = "stage"\n[stage]\nfirst_mm = 1.0\nlast_mm = 90.0\n'
+    path.write_text(text + 'count = 5\n[target]\nkind = "chessboard"\ncolumns = 9\nrows = 6\nsquare_mm = 15\n')
+
+
 READERS = {
     each.name: each
     for each in (
@@ -251,5 +296,12 @@ READERS = {
         Reader("intrinsics-xml", ".xml", "lines", _opencv, _sensor_with),
         *(Reader(f"image-{kind}", f".{kind}", "image", _picture, read_image) for kind in ("png", "tif", "bmp", "jpg")),
         Reader("mesh", ".obj", "lines", _mesh, _read_mesh),
+        Reader("mesh-binary", ".glb", "bytes", _glb, _read_mesh),
+        Reader("texture", ".png", "image", _picture, read_grey),
+        Reader("screened", ".parquet", "bytes", _part, _read_part),
+        Reader("results", ".json", "json", _results, CampaignResults.read),
+        Reader("guided-plan", ".toml", "toml", _guided_plan, load_guided_plan),
+        Reader("reference", ".toml", "toml", _shipped("references/thesis.toml"), load_reference),
+        Reader("published", ".toml", "toml", _shipped("references/thesis-tables.toml"), load_published),
     )
 }

@@ -72,8 +72,12 @@ def read_parts(folder: Path) -> Columns:
     tables = []
     for path in parts(folder):
         try:
-            tables.append(pq.read_table(path))
-        except (pa.ArrowException, OSError) as error:
+            table = pq.read_table(path)
+            if "design" not in table.column_names:
+                raise KeyError("it has no numbers of designs")
+            tables.append(table)
+        # Names of columns are decoded when they are asked for.
+        except (pa.ArrowException, OSError, UnicodeDecodeError, KeyError) as error:
             advice = "remove it, and the sweep judges its designs anew"
             raise CaptureError(f"{path} is damaged: {error}; {advice}") from error
     if not tables:

@@ -19,9 +19,11 @@ from twin.scene.description import AnyObject, Flat, Placed, Printed
 from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.media import check_range
-from uwlts.storage.image_header import SUFFIXES, read_header, read_image_file
+from uwlts.storage.image_file import read_image
 
 _MOST_TEXTURE_BYTES = 2**27
+_LUMINANCE = np.array([0.0722, 0.7152, 0.2126], np.float32)
+"""Of blue, green and red, linear: ITU-R BT.709-6, item 3.2."""
 _SHIFT = "point_shift_mm"
 _CELLS_PER_PATCH = 4
 """Cells of the grid that lists the patches near a place: so many that most cells list at most three patches."""
@@ -105,26 +107,16 @@ def _reflectance(thing: Placed, scale: float = 1.0) -> float | mi.Texture:
 def read_grey(path: str | Path) -> np.ndarray:
     """Grey values (H, W) of a picture, full scale as 1, taken as they are: they are linear, not gamma-coded.
 
-    DescriptionError where the file is missing, no picture that Mitsuba reads, or its values lie outside 0 to 1.
+    Colours count as their luminance (ITU-R BT.709). DescriptionError where the file is missing, damaged, or no PNG,
+    JPEG, TIFF or BMP of 8 or 16 bit without transparency.
     """
     require_regular_file(path, most_bytes=_MOST_TEXTURE_BYTES, error=DescriptionError, called="texture")
-    if Path(path).suffix.lower() in SUFFIXES:
-        try:
-            read_header(read_image_file(path), path)
-        except ImageError as error:
-            raise DescriptionError(f"texture {error}") from error
     try:
-        picture = mi.Bitmap(str(path))
-        # A picture marked as gamma-coded would be made linear by the conversion.
-        picture.set_srgb_gamma(False)
-        grey = np.array(picture.convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, False))
-    except RuntimeError as error:
-        readable = "picture that Mitsuba reads as a texture (PNG, JPEG, EXR, ...)"
-        raise DescriptionError(f"{path} is no {readable}: {error}") from error
-    grey = grey.reshape(grey.shape[:2])
-    if grey.size == 0 or not (np.isfinite(grey).all() and grey.min() >= 0 and grey.max() <= 1):
-        raise DescriptionError(f"{path} has grey values outside 0 to 1; a texture multiplies the reflectance")
-    return grey
+        picture = read_image(Path(path))
+    except ImageError as error:
+        raise DescriptionError(f"texture {error}") from error
+    grey = picture / np.float32(np.iinfo(picture.dtype).max)
+    return grey if grey.ndim == 2 else grey @ _LUMINANCE
 
 
 def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 4096) -> np.ndarray:

@@ -14,7 +14,8 @@ from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, T
 from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import read_table
 from uwlts.storage.files import written_aside
-from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel, read_image
+from uwlts.storage.image_file import read_image
+from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel
 from uwlts.targets import Target, parse_target
 
 _FEWEST_IMAGES = 4

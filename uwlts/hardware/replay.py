@@ -11,8 +11,8 @@ from uwlts.hardware.camera import BUFFERS, CameraDevice, CameraInfo, CameraSetti
 from uwlts.model.errors import HardwareError, ImageError
 from uwlts.model.input_file import is_regular_file
 from uwlts.storage.capture import Capture
+from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
-from uwlts.storage.import_.images import read_image
 
 
 class ReplayCamera(CameraDevice):

@@ -11,7 +11,7 @@ from uwlts.calibration.intrinsics import DISTORTION
 from uwlts.calibration.photographs import CameraCalibration, Photograph
 from uwlts.report.page_toolkit import BLUE, MISSING, RED, new_figure, plain_text, png_data_uri, render_page, svg_of
 from uwlts.report.page_toolkit import write_page as write_text
-from uwlts.storage.import_ import read_image
+from uwlts.storage.image_file import read_image
 
 _THUMBNAIL_PX = 420
 _MOST_PICTURES = 12

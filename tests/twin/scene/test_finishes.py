@@ -360,18 +360,17 @@ def test_a_texture_on_a_mesh_without_coordinates_is_refused(tmp_path, picture):
         built(scene)
 
 
-def test_a_missing_foreign_or_too_bright_texture_is_refused(tmp_path):
+def test_a_missing_or_foreign_texture_is_refused(tmp_path):
     scene = scene_of(plate() | {"texture": str(tmp_path / "grey.png")})
     with pytest.raises(DescriptionError, match=r"no texture at .*grey\.png"):
         built(scene)
     for content in (b"", b"hello", b"\x89PNG\r\n\x1a\n" + b"\x00" * 40):
         (tmp_path / "grey.png").write_bytes(content)
-        with pytest.raises(DescriptionError, match=r"grey\.png is (no PNG|no picture)"):
+        with pytest.raises(DescriptionError, match=r"grey\.png is (no|a) PNG"):
             built(scene)
-    for value in (1.5, -0.1, np.nan):
-        mi.Bitmap(np.full((4, 4, 1), value, np.float32)).write(str(tmp_path / "bright.exr"))
-        with pytest.raises(DescriptionError, match=r"bright\.exr has grey values outside 0 to 1"):
-            built(scene_of(plate() | {"texture": str(tmp_path / "bright.exr")}))
+    assert cv2.imwrite(str(tmp_path / "float.tif"), np.full((4, 4), 1.5, np.float32))
+    with pytest.raises(DescriptionError, match=r"float\.tif holds values of float32"):
+        built(scene_of(plate() | {"texture": str(tmp_path / "float.tif")}))
 
 
 def test_deep_and_coloured_pictures_are_read_linearly(tmp_path):

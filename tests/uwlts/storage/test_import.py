@@ -12,10 +12,11 @@ from uwlts import cli
 from uwlts.model.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, part_path
+from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
 from uwlts.storage.import_.channels import one_channel
-from uwlts.storage.import_.images import grey_values, read_image
+from uwlts.storage.import_.images import grey_values
 from uwlts.storage.import_.matching import natural_key, read_rows
 from uwlts.stripe import extract_stripe
 

@@ -3,7 +3,6 @@
 from uwlts.storage.import_.channels import Channel, checked_channel, one_channel
 from uwlts.storage.import_.description import NAME as DESCRIPTION_NAME
 from uwlts.storage.import_.folder import Imported, import_images
-from uwlts.storage.import_.images import read_image
 from uwlts.storage.import_.intrinsics import KnownCamera, read_intrinsics, with_intrinsics
 from uwlts.storage.import_.matching import image_files
 
@@ -16,7 +15,6 @@ __all__ = [
     "image_files",
     "import_images",
     "one_channel",
-    "read_image",
     "read_intrinsics",
     "with_intrinsics",
 ]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.model.errors import ImageError
+from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.channels import one_channel
-from uwlts.storage.import_.images import read_image
 from uwlts.targets import Target
 
 _MOST_IMAGES, _MOST_TRIED, _FEWEST_POINTS = 3, 6, 8

@@ -14,6 +14,7 @@ from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
+from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
 from uwlts.storage.import_.channels import is_formula, one_channel
 from uwlts.storage.import_.chromatic import chromatic_warnings
@@ -24,7 +25,7 @@ from uwlts.storage.import_.description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.images import bits_of, grey_values, read_image, without_background
+from uwlts.storage.import_.images import bits_of, grey_values, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe.recording import BLACK, WHITE, is_black, shown_stripe, white_share
 from uwlts.targets import parse_target

@@ -1,0 +1,85 @@
+"""Reads image files as grey values and finds those that are damaged.
+
+libpng, libjpeg and libtiff fill in what they cannot decode, and report it on the process's standard error only. So that
+is read meanwhile: lines about damage are returned, everything else is passed on.
+"""
+
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from uwlts.model.errors import ImageError
+from uwlts.storage.image_header import ImageHeader, png_damage, read_header, read_image_file
+
+_STANDARD_ERROR = 2
+_DAMAGE = re.compile(rb"libpng error|Corrupt JPEG data|Premature end of JPEG|\[ERROR:")
+# Such as of tags that nobody knows.
+_WARNING = b"[ WARN:"
+# OpenCV puts time, file, line and function around what the decoder said.
+_AROUND = re.compile(r"^libpng error: |^\[ERROR:\S+ global \S+ (TIFF_Error |.*error: \([^)]*\) )|in function '\w+'$")
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """The lines about damage that are written to the standard error inside the ``with``, there after its end."""
+    said: list[str] = []
+    usual = os.dup(_STANDARD_ERROR)
+    with tempfile.TemporaryFile() as listener:
+        os.dup2(listener.fileno(), _STANDARD_ERROR)
+        try:
+            yield said
+        finally:
+            os.dup2(usual, _STANDARD_ERROR)
+            os.close(usual)
+            listener.seek(0)
+            for line in listener:
+                if _DAMAGE.search(line):
+                    said.append(line.decode(errors="replace"))
+                elif line.strip() and not line.startswith(_WARNING):
+                    os.write(_STANDARD_ERROR, line)
+
+
+def read_image(path: Path, *, accept: Callable[[ImageHeader], None] = lambda declared: None) -> np.ndarray:
+    """Image (H, W) or (H, W, 3) in blue, green, red, of uint8 or uint16, as stored: not turned by what EXIF says.
+
+    ``accept`` may refuse what the file says of itself, before it is decoded. ImageError where the file is missing,
+    foreign, truncated, has an alpha channel, several pages, or other than whole numbers of 8 or 16 bit.
+    """
+    content = read_image_file(path)
+    declared = read_header(content, path)
+    accept(declared)
+    kind = declared.kind
+    if kind == "PNG" and (damage := png_damage(content)):
+        raise ImageError(f"{path} is a PNG file that is truncated or damaged ({damage}); copy it again")
+    if declared.least_bytes() > len(content):
+        raise ImageError(
+            f"{path} is a {kind} file that is truncated or damaged ({len(content)} bytes cannot hold "
+            f"{declared.width_px} x {declared.height_px} pixels); copy it again"
+        )
+    try:
+        with _heard() as said:
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ImageError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    damage = " ".join(_AROUND.sub("", said[0].strip()).split()) if said else ""
+    if image is None or damage:
+        found = f"{len(content)} bytes" + (f", its decoder says: {damage}" if damage else "")
+        raise ImageError(f"{path} is a {kind} file that is truncated or damaged ({found}); copy it again")
+    with _heard():
+        count = cv2.imcount(str(path)) if kind == "TIFF" else 1
+    if count > 1:
+        raise ImageError(f"{path} holds {count} pages; expected one image per file: split it")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ImageError(f"{path} holds values of {image.dtype}; expected whole numbers of 8 or 16 bit")
+    if image.ndim == 3 and image.shape[2] not in (1, 3):
+        raise ImageError(
+            f"{path} has {image.shape[2]} channels, that is with an alpha channel: grey values behind it have no "
+            "certain meaning; save it without transparency"
+        )
+    return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
