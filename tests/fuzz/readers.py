@@ -1,7 +1,6 @@
 """Everything that reads files from outside, each with a small valid file made by the program itself."""
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -241,7 +240,9 @@ def _part(path: Path) -> None:
 def _read_part(path: Path) -> None:
     folder = path.with_name("screen")
     folder.mkdir(exist_ok=True)
-    shutil.copyfile(path, folder / "part-000000.parquet")
+    part = folder / "part-000000.parquet"
+    part.unlink(missing_ok=True)
+    part.symlink_to(path)
     read_parts(folder)
 
 

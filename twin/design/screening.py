@@ -27,9 +27,12 @@ from optuna.trial import Trial, TrialState
 from twin.design.description import Study
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
+from uwlts.model.input_file import require_regular_file
 from uwlts.runtime.workers import Lost, Workers
 from uwlts.storage.files import written_aside
 from uwlts.storage.json_files import another, read_json
+
+_MOST_PART_BYTES = 2**28
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
@@ -71,6 +74,7 @@ def read_parts(folder: Path) -> Columns:
     a part is damaged or foreign."""
     tables = []
     for path in parts(folder):
+        require_regular_file(path, most_bytes=_MOST_PART_BYTES, called="part of a sweep")
         try:
             table = pq.read_table(path)
             if "design" not in table.column_names:
