@@ -44,6 +44,11 @@ class Stage(GrblStage):
     def __init__(self, port):
         super().__init__(port)
         Stage.opened = self
+    def laser(self, on, **how):
+        super().laser(on, **how)
+        if not on and hangs == "lost":
+            # Dark for long enough to be seen from outside, before the next try.
+            time.sleep(0.3)
 
 class Camera(CameraDevice):
     number = 0

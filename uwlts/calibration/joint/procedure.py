@@ -101,8 +101,9 @@ class JointProblem:
         compared, factor = deviations(result, least=0.0), understated(result)
         of_target = [each for each in compared if isinstance(each.key, TargetParameter)]
         form = [each for each in of_target if each.sigmas > _NOTICED]
-        stretch = {each.key: each.alone for each in of_target if each.key in STRETCH}
-        stretch = stretch if any(each.key in STRETCH for each in form) else {}
+        # What is farthest off is taken for the cause: spacings wrong along both sides show in the stage's scale.
+        stretched = compared[0] in form and compared[0].key in STRETCH
+        stretch = {each.key: each.alone for each in of_target if stretched and each.key in STRETCH}
         if not (form or factor > 1.0) or any(each.wrong() for each in compared if each not in of_target):
             return result, replace(findings(result, self.evidence, sensor=self.sensor), stretch=stretch)
         off = {each.key: abs(each.alone - each.known) for each in of_target}
