@@ -264,7 +264,7 @@ class AravisCamera(CameraDevice):
 
     def _stop(self) -> None:
         if self._gone:
-            raise HardwareError(f"the camera {self.address} does not answer any more and cannot be stopped")
+            raise HardwareError(f"the camera {self.address} does not answer any more: check power and cable")
         self._call("stop_acquisition")
         stream, self._stream = self._stream, None
         if stream is not None:
