@@ -1,6 +1,7 @@
 """Everything that reads files from outside, each with a small valid file made by the program itself."""
 
 import json
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -238,12 +239,9 @@ def _part(path: Path) -> None:
 
 
 def _read_part(path: Path) -> None:
-    folder = path.with_name("screen")
-    folder.mkdir(exist_ok=True)
-    part = folder / "part-000000.parquet"
-    part.unlink(missing_ok=True)
-    part.symlink_to(path)
-    read_parts(folder)
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "part-000000.parquet").symlink_to(path.absolute())
+        read_parts(Path(folder))
 
 
 def _results(path: Path) -> None:
