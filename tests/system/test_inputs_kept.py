@@ -182,6 +182,19 @@ def test_functions_keep_their_inputs_too(tmp_path, nominal):
     uwlts.write_cloud(cloud, uwlts.read_cloud(cloud), overwrite=True)
 
 
+def test_a_file_that_has_the_inode_of_one_replaced_may_be_read(tmp_path):
+    """File systems give the inode of a file that is gone to the next; a link keeps it here."""
+    out, other = tmp_path / "out.txt", tmp_path / "other.txt"
+    out.write_text("old", encoding="utf-8")
+    os.link(out, other)
+    with command_files({}):
+        with written_aside(out, overwrite=True) as aside:
+            with pytest.raises(OutputError, match="is an input"):
+                note_input(other)
+            aside.write_text("new", encoding="utf-8")
+        note_input(other)
+
+
 def test_a_file_in_a_reported_folder_is_not_replaced_by_the_report(tmp_path, nominal):
     calibration = tmp_path / "calibration.json"
     calibration.write_bytes(nominal.read_bytes())

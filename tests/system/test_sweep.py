@@ -171,8 +171,9 @@ def test_two_machines_share_a_study(study, tmp_path, expected):
     first = begun(study, out, "--workers", "1")
     until(lambda: len(parts(out / "screen")) >= 1)
     second = begun(study, out, "--workers", "1")
-    codes = [process.communicate(timeout=200)[1:] and process.returncode for process in (first, second)]
-    assert codes == [0, 0]
+    for process in (first, second):
+        _, said = process.communicate(timeout=200)
+        assert process.returncode == 0, said
     same(out, expected)
 
 

@@ -77,10 +77,10 @@ def read_parts(folder: Path) -> Columns:
         require_regular_file(path, most_bytes=_MOST_PART_BYTES, called="part of a sweep")
         try:
             table = pq.read_table(path)
+            # Names of columns are decoded when they are asked for.
             if "design" not in table.column_names:
-                raise KeyError("it has no numbers of designs")
+                raise pa.ArrowInvalid("it has no numbers of designs")
             tables.append(table)
-        # Names of columns are decoded when they are asked for.
         except (pa.ArrowException, OSError, UnicodeDecodeError, KeyError) as error:
             advice = "remove it, and the sweep judges its designs anew"
             raise CaptureError(f"{path} is damaged: {error}; {advice}") from error

@@ -17,11 +17,9 @@ from pydantic import TypeAdapter
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
 from twin.scene.description import AnyObject, Flat, Placed, Printed
 from uwlts.model.errors import DescriptionError, ImageError
-from uwlts.model.input_file import require_regular_file
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
 
-_MOST_TEXTURE_BYTES = 2**27
 _LUMINANCE = np.array([0.0722, 0.7152, 0.2126], np.float32)
 """Of blue, green and red, linear: ITU-R BT.709-6, item 3.2."""
 _SHIFT = "point_shift_mm"
@@ -110,11 +108,10 @@ def read_grey(path: str | Path) -> np.ndarray:
     Colours count as their luminance (ITU-R BT.709). DescriptionError where the file is missing, damaged, or no PNG,
     JPEG, TIFF or BMP of 8 or 16 bit without transparency.
     """
-    require_regular_file(path, most_bytes=_MOST_TEXTURE_BYTES, error=DescriptionError, called="texture")
     try:
         picture = read_image(Path(path))
     except ImageError as error:
-        raise DescriptionError(f"texture {error}") from error
+        raise DescriptionError(f"texture: {error}") from error
     grey = picture / np.float32(np.iinfo(picture.dtype).max)
     return grey if grey.ndim == 2 else grey @ _LUMINANCE
 

@@ -103,7 +103,8 @@ def note_input(path: str | os.PathLike[str]) -> None:
         return
     if identity in scope.made:
         return
-    if (output := scope.written.get(identity)) is not None:
+    # A file that was replaced has left its inode to others, here and below.
+    if (output := scope.written.get(identity)) is not None and _identity(output) == identity:
         raise _same(output, Path(path))
     scope.read.setdefault(identity, Path(path))
 
@@ -113,7 +114,6 @@ def refuse_input(target: str | os.PathLike[str]) -> None:
     if (scope := _current()) is None or (identity := _identity(target)) is None:
         return
     target = Path(target)
-    # An input that is gone has left its inode to others.
     if (read := scope.read.get(identity)) is not None and _identity(read) == identity:
         raise _same(target, read)
     if identity not in scope.made:

@@ -21,7 +21,6 @@ would err by 0.015 px with the pixel phase instead of 0.005."""
 FLANK = 5
 """Pixels of background taken on either side of a peak."""
 
-
 FIRST, STRONGEST, LAST = -1, 0, 1
 
 

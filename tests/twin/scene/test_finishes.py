@@ -362,7 +362,7 @@ def test_a_texture_on_a_mesh_without_coordinates_is_refused(tmp_path, picture):
 
 def test_a_missing_or_foreign_texture_is_refused(tmp_path):
     scene = scene_of(plate() | {"texture": str(tmp_path / "grey.png")})
-    with pytest.raises(DescriptionError, match=r"no texture at .*grey\.png"):
+    with pytest.raises(DescriptionError, match=r"texture: no image at .*grey\.png"):
         built(scene)
     for content in (b"", b"hello", b"\x89PNG\r\n\x1a\n" + b"\x00" * 40):
         (tmp_path / "grey.png").write_bytes(content)
