@@ -252,7 +252,7 @@ class Renderer:
     ) -> np.ndarray:
         """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
         x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
-        total = np.zeros(len(rows))
+        total, side = np.zeros(len(rows)), dr.opaque(mi.Float, size_px)
         most = max(1, WALKS_AT_ONCE // len(rows))
         for part, first in enumerate(range(0, walks, most)):
             some = min(most, walks - first)
@@ -262,7 +262,7 @@ class Renderer:
             keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
             u, v = (mi.sample_tea_float32(place, key) for key in keys)
             column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
-            bundle = self.view.bundle(column + u * size_px - 0.5, row + v * size_px - 0.5)
+            bundle = self.view.bundle(column + u * side - 0.5, row + v * side - 0.5)
             total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
         return total / walks
 

@@ -24,9 +24,9 @@ from uwlts.report.gather import (
     gather_campaign,
     load_reference,
 )
-from uwlts.report.inventory import shift_texts
 from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.report.page_toolkit import (
+    MISSING,
     ComparisonTable,
     FigureCollector,
     Tile,
@@ -155,18 +155,19 @@ def _measurement(
     measurement: GatheredMeasurement, pictures: MeasurementPictures, collected: FigureCollector
 ) -> dict[str, Any]:
     """Parts of a measurement's section; what it lacks is None."""
-    cloud, evaluation = measurement.cloud, None if measurement.judged is None else measurement.judged.evaluation
-    truth = None if measurement.judged is None else measurement.judged.truth
+    cloud, judged = measurement.cloud, measurement.judged
+    evaluation, truth = (None, None) if judged is None else (judged.evaluation, judged.truth)
     shown = figures = None
     if cloud is not None and pictures.cloud is not None:
         figure, caption = plot.interactive_cloud(cloud)
         shown = collected.add(figure, caption, webgl=True, still=png_data_uri(pictures.cloud))
-    if evaluation is not None:
-        rows = [
-            (name, "", (small_length(value, signed="error" in name or "SSE" in name),))
-            for name, value in evaluation.figures_mm.items()
-        ]
-        figures = ComparisonTable(("value",), tuple(rows))
+    if judged is not None and evaluation is not None:
+        rows = []
+        for name, value in evaluation.figures_mm.items():
+            stated = judged.uncertainty[name].expanded_mm if name in judged.uncertainty else None
+            values = small_length(value, signed="error" in name or "SSE" in name), small_length(stated)
+            rows.append((name, "", values if judged.uncertainty else values[:1]))
+        figures = ComparisonTable(("value", "U (k = 2)") if judged.uncertainty else ("value",), tuple(rows))
     recorded = measurement.capture is not None
     no_stripe = "no image of its capture shows a stripe" if recorded else "its capture is not in the folder"
     return {
@@ -227,8 +228,10 @@ def _truth_table(compared: TruthComparisons) -> ComparisonTable:
         for truth in shown.values()
     ]
     rows = [*zip(texts[0], zip(*(column.values() for column in texts), strict=True), strict=True)]
-    for axis, text in zip("XYZ", shift_texts(compared), strict=False):
-        rows.append((f"mean error along {axis}, k = 2", (text, "–")[: len(shown)]))
+    stated = compared.shift_expanded_mm
+    for number, shift in enumerate(compared.shift_mm or ()):
+        text = small_length(shift, signed=True) + (f" ± {small_length(stated[number])}" if stated else "")
+        rows.append((f"mean error along {'XYZ'[number]}, k = 2", (text, MISSING)[: len(shown)]))
     return ComparisonTable(tuple(shown), tuple((words, "", values) for words, values in rows))
 
 

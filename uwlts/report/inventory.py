@@ -309,13 +309,13 @@ def evaluation_lines(record: EvaluationRecord) -> list[str]:
                     f"{100 * part.share_within_tolerance:.1f} % within {part.tolerance_mm:g} mm"
                 )
         if truth.shift_mm is not None:
-            shift = ", ".join(f"{axis} {value}" for axis, value in zip("XYZ", shift_texts(truth), strict=True))
+            shift = ", ".join(f"{axis} {value}" for axis, value in zip("XYZ", _shift_texts(truth), strict=True))
             lines.append(f"  shift of all points: {shift}{' (k = 2)' if truth.shift_expanded_mm else ''}")
         lines.append(f"  {truth.missed} stripe points missed, {truth.false_points} false")
     return lines
 
 
-def shift_texts(truth: TruthComparisons) -> list[str]:
+def _shift_texts(truth: TruthComparisons) -> list[str]:
     """Mean errors of all points along X, Y and Z, with what is stated for them; nothing where the file has none."""
     shift = truth.shift_mm or ()
     stated = truth.shift_expanded_mm or (None,) * len(shift)

@@ -27,8 +27,9 @@ _WIDTH = 110
 class Row:
     """One quantity, in mm or as a share.
 
-    ``true`` is the calibrated (or, for a twin, set) value with its ``uncertainty``; ``published`` are errors for
-    quantities that have a true value of their own, else values of the quantity itself.
+    ``true`` is the calibrated (or, for a twin, set) value with its ``uncertainty``, ``stated`` the expanded uncertainty
+    (k = 2) of the measured one; ``published`` are errors for quantities that have a true value of their own, else
+    values of the quantity itself.
     """
 
     measurement: str
@@ -36,20 +37,22 @@ class Row:
     true: float | None = None
     measured: float | None = None
     error: float | None = None
+    stated: float | None = None
     published: tuple[float, ...] = ()
     uncertainty: float | None = None
     unit: Literal["mm", "share"] = "mm"
 
-    def texts(self) -> tuple[str, str, str, str, str, str]:
-        """The row as text: measurement, quantity, true, measured, error, published."""
+    def texts(self) -> tuple[str, str, str, str, str, str, str]:
+        """The row as text: measurement, quantity, true, measured, error, stated, published."""
         if self.unit == "share":
             measured = MISSING if self.measured is None else f"{fixed(100 * self.measured, 2)} %"
         else:
             measured = fixed(self.measured)
         # Two decimals below a millimetre where more were not printed: 0.10 is not the same claim as 0.1.
         published = [fixed(v, 2) if abs(v) < 1 and round(v, 2) == v else f"{v:g}" for v in self.published]
-        error = fixed(self.error, signed=True)
-        return self.measurement, self.quantity, fixed(self.true), measured, error, ", ".join(published) or MISSING
+        error, stated = fixed(self.error, signed=True), fixed(self.stated)
+        known = fixed(self.true), measured, error, stated
+        return self.measurement, self.quantity, *known, ", ".join(published) or MISSING
 
 
 def summary_table(campaign: GatheredCampaign, reference: Reference | None = None) -> list[Row]:
@@ -64,7 +67,7 @@ def print_table(rows: list[Row], *, published: str = "thesis", console: Console 
         usual = Console()
         console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
     table = Table(box=box.SIMPLE_HEAD, title="lengths in mm", title_justify="left", pad_edge=False)
-    for number, heading in enumerate(("measurement", "quantity", "true", "measured", "error", published)):
+    for number, heading in enumerate(("measurement", "quantity", "true", "measured", "error", "U (k = 2)", published)):
         table.add_column(heading, justify="left" if number < 2 else "right", no_wrap=number >= 2)
     last = None
     for row in rows:
@@ -87,12 +90,13 @@ def _measurement_rows(measurement: GatheredMeasurement, reference: Reference | N
         if key is not None and key.is_detail:
             continue
         published = () if reference is None else reference.values(measurement.known_as, figure)
+        stated = judged.uncertainty[figure].expanded_mm if figure in judged.uncertainty else None
         if key is None or key.calibrated is None:
             name = _QUANTITIES.get(figure, figure)
-            rows.append(Row(measurement.name, name, measured=value, published=published))
+            rows.append(Row(measurement.name, name, measured=value, stated=stated, published=published))
         else:
             name, true, std = key.calibrated.name, key.calibrated.value_mm, key.calibrated.uncertainty_mm
-            rows.append(Row(measurement.name, name, true, true + value, value, published, std))
+            rows.append(Row(measurement.name, name, true, true + value, value, stated, published, std))
     rows.sort(key=lambda row: [*map(row.quantity.startswith, _ORDER), True].index(True))
     if judged.truth is not None:
         truth, fitted = judged.truth, judged.truth.after_best_fit
@@ -117,7 +121,7 @@ def _window_rows(campaign: GatheredCampaign, reference: Reference | None) -> lis
         published = reference.values((CALIBRATION,), "window_distance_mm") if reference is not None and pane else ()
         error = None if true is None else window.distance_mm - true
         quantity = "window distance" if pane else "interface distance (1 refraction)"
-        rows.append(Row(found.name, quantity, true, window.distance_mm, error, published))
+        rows.append(Row(found.name, quantity, true, window.distance_mm, error, published=published))
     return rows
 
 

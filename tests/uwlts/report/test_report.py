@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 from rich.console import Console
 
-from uwlts.measurement.evaluation import evaluate, write_evaluation
+from uwlts.measurement.evaluation import StoredUncertainty, evaluate, write_evaluation
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CaptureError, DescriptionError, OutputError
@@ -339,19 +339,32 @@ def test_the_summary_is_json_and_written_once(campaign, tmp_path):
 def test_rows_hold_true_measured_error_and_published(campaign):
     table = summary_table(campaign, load_reference("thesis"))
     rows = {(row.measurement, row.quantity): row.texts()[2:] for row in table}
-    assert rows["spheres-near", "sphere spacing"] == ("99.180", "99.210", "+0.030", "0.08, 0.06")
-    assert rows["spheres-far", "sphere spacing"] == ("99.180", "99.170", "-0.010", "0.23, 0.18")
-    assert rows["spheres-near", "diameter, sphere 2"] == ("50.140", "50.140", "0.000", "-")
-    assert rows["spheres-near", "deviations STD"] == ("-", "0.000", "-", "0.12, 0.14")
-    assert rows["step", "step height"] == ("23.170", "23.180", "+0.010", "-")
+    assert rows["spheres-near", "sphere spacing"] == ("99.180", "99.210", "+0.030", "-", "0.08, 0.06")
+    assert rows["spheres-far", "sphere spacing"] == ("99.180", "99.170", "-0.010", "-", "0.23, 0.18")
+    assert rows["spheres-near", "diameter, sphere 2"] == ("50.140", "50.140", "0.000", "-", "-")
+    assert rows["spheres-near", "deviations STD"] == ("-", "0.000", "-", "-", "0.12, 0.14")
+    assert rows["step", "step height"] == ("23.170", "23.180", "+0.010", "-", "-")
     # Where there is a best-fit motion, the share is the one after it; the motion takes out a part of the distances.
     assert ("step", "within 0.010 of truth") not in rows
     assert float(rows["step", "within 0.010 after best fit"][1].removesuffix(" %")) > 50
     assert float(rows["step", "rms distance after best fit"][1]) < 0.014
-    assert rows["step", "rms distance to truth"] == ("-", "0.014", "-", "-")
-    assert rows["calibration", "window distance"] == ("47.300", "47.350", "+0.050", "40.7")
+    assert rows["step", "rms distance to truth"] == ("-", "0.014", "-", "-", "-")
+    assert rows["calibration", "window distance"] == ("47.300", "47.350", "+0.050", "-", "40.7")
     # A single interface has no true distance, and the published one is for two refractions.
-    assert rows["calibration-one-refraction", "interface distance (1 refraction)"] == ("-", "45.000", "-", "-")
+    assert rows["calibration-one-refraction", "interface distance (1 refraction)"] == ("-", "45.000", "-", "-", "-")
+
+
+def test_stated_uncertainties_stand_beside_what_was_measured(campaign):
+    one = next(m for m in campaign.measurements if m.name == "spheres-near")
+    known = {"SSE": StoredUncertainty(random_mm=0.01, systematic_mm=0.02, expanded_mm=0.0447)}
+    judged = one.judged.model_copy(update={"uncertainty": known})
+    stating = replace(campaign, measurements=(replace(one, judged=judged),))
+    rows = {row.quantity: row.texts()[2:6] for row in summary_table(stating)}
+    assert rows["sphere spacing"] == ("99.180", "99.210", "+0.030", "0.045")
+    assert rows["diameter, sphere 2"] == ("50.140", "50.140", "0.000", "-")
+    page = report_page(stating)
+    assert page.count("U (k = 2)") == 2
+    assert "<td>+30.0 µm</td><td>44.7 µm</td>" in page
 
 
 def test_published_values_are_found_by_the_captures_name(campaign):
@@ -368,7 +381,7 @@ def test_the_table_prints_on_a_dumb_terminal(campaign, capsys, monkeypatch):
     assert "\x1b" not in text
     assert max(map(len, text.splitlines())) <= 110
     row = next(line.split() for line in text.splitlines() if "spheres-near" in line)
-    assert row == ["spheres-near", "sphere", "spacing", "99.180", "99.210", "+0.030", "0.08,", "0.06"]
+    assert row == ["spheres-near", "sphere", "spacing", "99.180", "99.210", "+0.030", "-", "0.08,", "0.06"]
     assert len([line for line in text.splitlines() if "sphere spacing" in line]) == 3
 
 
