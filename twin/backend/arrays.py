@@ -1,7 +1,8 @@
-"""Arrays between NumPy and Dr.Jit, moved so that equal work always gives equal kernels.
+"""Numbers and arrays between Python and Dr.Jit, moved so that equal work always gives equal kernels.
 
 Dr.Jit wraps NumPy's memory without copying and compiles its alignment into the kernel; it also compiles the size into
-the kernel that gathers a vector's components. Either would compile kernels anew from frame to frame.
+the kernel that gathers a vector's components, and every plain number. Any of these would compile kernels anew, which
+takes seconds, from frame to frame or from sensor to sensor.
 """
 
 from __future__ import annotations
@@ -46,6 +47,19 @@ def to_numpy(vector: Point3f) -> np.ndarray:
 def scalar_transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
     """A transform (4, 4) of a shape, fixed in the scene."""
     return mi.ScalarTransform4f(matrix)
+
+
+def opaque(value: float) -> Float:
+    """A number that is not compiled into kernels, but for 0, which saves work where something is absent.
+
+    Two of the same value are two inputs of a kernel: what is computed from both is computed twice.
+    """
+    return dr.opaque(mi.Float, value) if value else mi.Float(0.0)
+
+
+def opaque_point(place: np.ndarray) -> Point3f:
+    """A point (3,) whose numbers are not compiled into kernels."""
+    return mi.Point3f(*(opaque(float(x)) for x in place))
 
 
 def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:

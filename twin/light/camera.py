@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,6 +19,8 @@ from twin.backend.arrays import (
     Point3f,
     SurfaceInteraction3f,
     Vector3f,
+    opaque,
+    opaque_transform,
     scalar_transform,
     to_jit,
     to_numpy,
@@ -42,11 +45,23 @@ _CLEAR_MM = 1e-2
 """Reflected rays start this far from the mirror."""
 
 
-@dataclass(frozen=True)
 class LensRays:
-    """Ray generator of a camera; the entrance pupil is a disc about the origin of the camera frame, square to z."""
+    """Ray generator of a camera; the entrance pupil is a disc about the origin of the camera frame, square to z.
 
-    camera: Camera
+    ``irradiance_on_axis`` is the irradiance on the image sensor per radiance at the pupil, in sr, on the axis; off it
+    cos^4 comes on top. E = L (pi / 4) / (N (1 + m))^2 with the magnification m at the focus distance (Smith, Modern
+    Optical Engineering, 4th ed., Eqs. 8.7 and 8.10).
+    """
+
+    def __init__(self, camera: Camera):
+        focal, focus = camera.focal_length_mm, camera.focus_distance_mm
+        working_f_number = camera.f_number * (1 + focal / (focus - focal))
+        self.irradiance_on_axis = opaque(math.pi / 4 / working_f_number**2)
+        self._pupil_radius_mm, self._focus_mm = opaque(0.5 * focal / working_f_number), opaque(focus)
+        numbers = *camera.focal_lengths_px(), *camera.principal_point()
+        self._fx, self._fy, self._cx, self._cy = map(opaque, numbers)
+        self._distortion = {name: opaque(value) for name, value in camera.distortion.model_dump().items()}
+        self._distorts = any(camera.distortion.model_dump().values())
 
     def through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
         """Origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
@@ -54,50 +69,36 @@ class LensRays:
         ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens). The pupil's
         radius is D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant).
         """
-        radius_mm = 0.5 * self.camera.focal_length_mm / self._working_f_number()
-        origin = radius_mm * mi.Point3f(pupil.x, pupil.y, 0.0)
-        focused = chief * (self.camera.focus_distance_mm / chief.z)
+        origin = self._pupil_radius_mm * mi.Point3f(pupil.x, pupil.y, 0.0)
+        focused = chief * (self._focus_mm / chief.z)
         return origin, dr.normalize(mi.Vector3f(focused - origin))
 
     def directions(self, x: Float, y: Float) -> Vector3f:
         """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
-        (fx, fy), (cx, cy) = self.camera.focal_lengths_px(), self.camera.principal_point()
-        true = self._undistorted(mi.Point2f((x - cx) / fx, (y - cy) / fy))
+        true = self._undistorted(mi.Point2f((x - self._cx) / self._fx, (y - self._cy) / self._fy))
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
     def _undistorted(self, seen: Point2f) -> Point2f:
         """Invert the distortion, a rational Brown-Conrady model (`Distortion`), by Newton's method."""
-        d = self.camera.distortion
-        if not any(d.model_dump().values()):
+        if not self._distorts:
             return seen
+        k1, k2, k3, k4, k5, k6, p1, p2 = (self._distortion[name] for name in sorted(self._distortion))
         point = mi.Point2f(seen)
         for _ in range(_NEWTON_STEPS):
             x, y = point.x, point.y
             r2 = x * x + y * y
-            below = 1 + r2 * (d.k4 + r2 * (d.k5 + r2 * d.k6))
-            radial = (1 + r2 * (d.k1 + r2 * (d.k2 + r2 * d.k3))) / below
-            above_by, below_by = d.k1 + r2 * (2 * d.k2 + r2 * 3 * d.k3), d.k4 + r2 * (2 * d.k5 + r2 * 3 * d.k6)
+            below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / below
+            above_by, below_by = k1 + r2 * (2 * k2 + r2 * 3 * k3), k4 + r2 * (2 * k5 + r2 * 3 * k6)
             slope = 2 * (above_by - radial * below_by) / below
-            off_x = x * radial + 2 * d.p1 * x * y + d.p2 * (r2 + 2 * x * x) - seen.x
-            off_y = y * radial + 2 * d.p2 * x * y + d.p1 * (r2 + 2 * y * y) - seen.y
-            xx = radial + slope * x * x + 2 * d.p1 * y + 6 * d.p2 * x
-            xy = slope * x * y + 2 * d.p1 * x + 2 * d.p2 * y
-            yy = radial + slope * y * y + 2 * d.p2 * x + 6 * d.p1 * y
+            off_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - seen.x
+            off_y = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) - seen.y
+            xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+            yy = radial + slope * y * y + 2 * p2 * x + 6 * p1 * y
             determinant = xx * yy - xy * xy
             point = mi.Point2f(x - (yy * off_x - xy * off_y) / determinant, y - (xx * off_y - xy * off_x) / determinant)
         return point
-
-    def irradiance_on_axis(self) -> float:
-        """Irradiance on the image sensor per radiance at the pupil, in sr, on the axis; off it cos^4 comes on top.
-
-        E = L (pi / 4) / (N (1 + m))^2 with the magnification m at the focus distance (Smith, Modern Optical
-        Engineering, 4th ed., Eqs. 8.7 and 8.10).
-        """
-        return math.pi / 4 / self._working_f_number() ** 2
-
-    def _working_f_number(self) -> float:
-        focal = self.camera.focal_length_mm
-        return self.camera.f_number * (1 + focal / (self.camera.focus_distance_mm - focal))
 
 
 def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
@@ -125,12 +126,12 @@ class WindowFaces:
                 raise DesignError("a window is left out although the sensor is in water: mount it or measure in air")
             return
         glass = window.index(wavelength_nm)
-        self._absorption = window.absorption_per_mm()
+        self._absorption = opaque(window.absorption_per_mm())
         normal = rotation @ window.normal()
         inner = origin_mm + window.distance_mm * rotation[:, 2]
         outer = inner + window.thickness_mm * normal
-        self._faces = []
-        for centre, outside, inside in ((inner, 1.0, glass), (outer, glass, index)):
+        self._faces: list[tuple[Any, Float]] = []
+        for centre, ratio in ((inner, glass), (outer, index / glass)):
             to_world = np.eye(4)
             to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (
                 window.aperture_diameter_mm / 2,
@@ -138,8 +139,7 @@ class WindowFaces:
                 1,
             )
             to_world[:3, 3] = centre
-            bsdf = {"type": "dielectric", "int_ior": inside, "ext_ior": outside}
-            self._faces.append(mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world), "bsdf": bsdf}))
+            self._faces.append((mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world)}), opaque(ratio)))
 
     def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
         """Send rays from the module's side through both faces; the weight of those that do not pass is 0.
@@ -151,17 +151,18 @@ class WindowFaces:
         weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
         if not self.mounted:
             return Rays(origin, direction, weight)
-        context = mi.BSDFContext(mode)
-        context.component = 1
         ray = mi.Ray3f(origin, direction)
-        for face in self._faces:
+        for number, (face, ratio) in enumerate(self._faces):
             si = face.ray_intersect(ray, active=valid)
-            valid &= si.is_valid() & (mi.Frame3f.cos_theta(si.wi) > 0)
-            sample, transmitted = face.bsdf().sample(context, si, mi.Float(0.5), mi.Point2f(0.5), valid)
-            weight *= dr.select(valid, transmitted[0], 0.0)
-            if face is self._faces[1] and self._absorption > 0:
+            cosine = mi.Frame3f.cos_theta(si.wi)
+            valid &= si.is_valid() & (cosine > 0)
+            reflected, refracted_cosine, _, inverse = mi.fresnel(cosine, ratio)
+            weight *= dr.select(valid, 1 - reflected, 0.0)
+            if mode == mi.TransportMode.Radiance:
+                weight *= dr.square(inverse)
+            if number == 1:
                 weight *= dr.exp(-self._absorption * (si.t + _STEP_MM))
-            onward = si.to_world(sample.wo)
+            onward = si.to_world(mi.refract(si.wi, refracted_cosine, inverse))
             ray = mi.Ray3f(si.p + onward * _STEP_MM, onward)
         return Rays(ray.o, ray.d, dr.select(valid & (weight > 0), weight, 0.0))
 
@@ -175,7 +176,8 @@ class CameraView:
         place = {"origin_mm": np.zeros(3), "rotation": np.eye(3)}
         self._faces = WindowFaces(self.camera.window, medium, wavelength_nm=sensor.laser.wavelength_nm, **place)
         self._camera_from_object = camera_from_object(sensor)
-        self._to_object = np.linalg.inv(self._camera_from_object)
+        self._to_camera = opaque_transform(self._camera_from_object)
+        self._to_object = opaque_transform(np.linalg.inv(self._camera_from_object))
         self._grids: dict[int, tuple[Rays, tuple[int, int]]] = {}
 
     def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Rays:
@@ -186,10 +188,9 @@ class CameraView:
         chief = self.lens.directions(x, y)
         origin, direction = (mi.Point3f(0.0), chief) if pupil is None else self.lens.through_pupil(chief, pupil)
         path = self._faces.through(origin, direction, mode=mi.TransportMode.Radiance)
-        transform = mi.Transform4f(mi.Matrix4f(self._to_object))
         cosine = dr.square(dr.square(chief.z))
-        weight = dr.select(path.weight > 0, path.weight * cosine * self.lens.irradiance_on_axis(), 0.0)
-        return Rays(transform @ path.origin, transform @ path.direction, weight)
+        weight = dr.select(path.weight > 0, path.weight * cosine * self.lens.irradiance_on_axis, 0.0)
+        return Rays(self._to_object @ path.origin, self._to_object @ path.direction, weight)
 
     def grid(self, spacing: int) -> tuple[Rays, tuple[int, int]]:
         """Chief rays of nodes at pixel corners every ``spacing`` pixels, and the grid's shape (rows, columns)."""
@@ -203,13 +204,12 @@ class CameraView:
 
     def slopes(self, p: Point3f) -> Point2f:
         """Slopes (x / z, y / z) in the camera frame of the straight lines from the pupil to points of the OCS."""
-        seen = mi.Transform4f(mi.Matrix4f(self._camera_from_object)) @ mi.Point3f(p)
+        seen = self._to_camera @ mi.Point3f(p)
         return mi.Point2f(seen.x / seen.z, seen.y / seen.z)
 
     def depth_mm(self, p: Point3f) -> Float:
         """Depth z in the camera frame of points of the OCS."""
-        row = self._camera_from_object[2]
-        return p.x * float(row[0]) + p.y * float(row[1]) + p.z * float(row[2]) + float(row[3])
+        return (self._to_camera @ mi.Point3f(p)).z
 
     def blur_radius_px(self, depth_mm: np.ndarray) -> np.ndarray:
         """Largest distance in the image between a point's chief ray and its other rays, for depths of any shape.
@@ -264,7 +264,7 @@ class RaySegment:
 
 
 def ray_segments(
-    objects: Objects, extinction: float, pose: SensorPose, bundle: Rays, travel_mm: Float | None, *, mirrors: int
+    objects: Objects, extinction: Float, pose: SensorPose, bundle: Rays, travel_mm: Float | None, *, mirrors: int
 ) -> Iterator[RaySegment]:
     """The first segment of camera rays, then one for each of up to ``mirrors`` mirrors that they meet in turn."""
     o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque_transform
+from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
 from twin.scene.objects import MirrorFace
@@ -24,15 +24,15 @@ class Light:
 
     def __init__(self, sheet: Sheet, pose: SensorPose, mirror: MirrorFace | None = None):
         self.sheet, self._pose, self._mirror = sheet, pose, mirror
-        own = sheet.own_from_object
+        self.power_w, own = opaque(sheet.power_w), sheet.own_from_object
         if mirror is not None:
             object_from_face = np.linalg.inv(pose.scene_from_object) @ mirror.pose
             reflection = object_from_face @ np.diag([1.0, 1.0, -1.0, 1.0]) @ np.linalg.inv(object_from_face)
             self._reflection = opaque_transform(reflection)
             self._to_face = opaque_transform(np.linalg.inv(object_from_face))
             self._from_face = opaque_transform(object_from_face)
-            self._half = mi.Vector2f(*(dr.opaque(mi.Float, float(h)) for h in mirror.half_size_mm))
-            self._share = dr.opaque(mi.Float, mirror.share)
+            self._half = mi.Vector2f(*(opaque(float(h)) for h in mirror.half_size_mm))
+            self._share = opaque(mirror.share)
         self._to_own = None if own is None else opaque_transform(own)
         self._from_own = None if own is None else opaque_transform(np.linalg.inv(own))
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point3f, Vector3f, opaque_transform
+from twin.backend.arrays import Float, Point3f, Vector3f, opaque, opaque_point, opaque_transform
 
 
 @dataclass(frozen=True)
@@ -38,8 +37,8 @@ class Travel:
 
     def at(self, row: Float, moment: Float | float) -> Float:
         """Travel in mm of image rows at a moment of their exposure, from 0 to 1."""
-        exposure, per_row = dr.opaque(mi.Float, self.exposure_mm), dr.opaque(mi.Float, self.row_mm)
-        return (row - self.middle_row) * per_row + (moment - 0.5) * exposure
+        exposure, per_row = opaque(self.exposure_mm), opaque(self.row_mm)
+        return (row - opaque(self.middle_row)) * per_row + (moment - 0.5) * exposure
 
     def ends(self, rows: int) -> tuple[float, float]:
         """Smallest and largest travel in mm within a frame of ``rows`` rows."""
@@ -56,7 +55,7 @@ class SensorPose:
         self._to_scene = opaque_transform(self.scene_from_object)
         self._to_object = opaque_transform(np.linalg.inv(self.scene_from_object))
         if travel is not None:
-            self._direction = mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in travel.direction))
+            self._direction = mi.Vector3f(opaque_point(travel.direction))
 
     def moved(self, travel_mm: float) -> SensorPose:
         """The pose after a travel, standing still."""

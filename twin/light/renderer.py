@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, to_jit
+from twin.backend.arrays import Float, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
@@ -98,7 +98,7 @@ class Renderer:
         # Through the water to the stand-off and back, light is scattered so many times.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 8 * scatterings)
-        self._reach_mm = 4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3]))
+        self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
 
     def irradiance(
         self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
@@ -155,7 +155,7 @@ class Renderer:
 
     def _segments(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
-        return ray_segments(self.objects, self.scattering.extinction, pose, bundle, travel_mm, mirrors=mirrors)
+        return ray_segments(self.objects, self.scattering.c, pose, bundle, travel_mm, mirrors=mirrors)
 
     def _sigmas(self, light: Light, segment: RaySegment) -> Float:
         """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
@@ -170,7 +170,7 @@ class Renderer:
             lit = light.reaches(self.objects.scene, end, here, travel_mm, segment.valid & (here.irradiance > 0))
             towards = segment.si.to_local(pose.direction(-here.direction))
             radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
-        return radiance * dr.exp(-self.scattering.extinction * dr.select(segment.valid, segment.si.t, 0.0))
+        return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
     # --- nodes: where the stripe is, and the haze ---------------------------------------------------------------------
 
@@ -228,7 +228,7 @@ class Renderer:
             segment.origin + segment.direction * dr.minimum(t, dr.select(segment.valid, segment.si.t, dr.inf))
         )
         reached = light.reaches(self.objects.scene, place, light.at(place), None, (t > 0) & (scattered > 0))
-        return dr.select(reached, scattered * dr.exp(-self.scattering.extinction * t), 0.0)
+        return dr.select(reached, scattered * dr.exp(-self.scattering.c * t), 0.0)
 
     # --- light on longer ways -----------------------------------------------------------------------------------------
 
@@ -252,7 +252,7 @@ class Renderer:
     ) -> np.ndarray:
         """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
         x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
-        total, side = np.zeros(len(rows)), dr.opaque(mi.Float, size_px)
+        total, side = np.zeros(len(rows)), opaque(size_px)
         most = max(1, WALKS_AT_ONCE // len(rows))
         for part, first in enumerate(range(0, walks, most)):
             some = min(most, walks - first)
@@ -299,12 +299,12 @@ class Renderer:
         """
         segment = next(self._segments(pose, bundle, travel_mm))
         lamp = self.sensor.lamp
-        level = 1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2)
-        left = dr.exp(-self.scattering.extinction * dr.select(segment.valid, segment.si.t, dr.inf))
+        level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
+        left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
         radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
-            radiance += scattered / self.scattering.extinction * (1 - left)
+            radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self._uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
         return (segment.weight * level * radiance,)
@@ -350,7 +350,9 @@ class Renderer:
         """
         x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
         index = dr.arange(mi.UInt32, len(rows) * spp)
-        pixel, sample = index // spp, index % spp
+        per_pixel = dr.opaque(mi.UInt32, spp)
+        pixel = index // per_pixel
+        sample = index - pixel * per_pixel
         axes = 2 + 2 * self.effects.defocus + (pose.travel is not None)
         places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp, axes)]
         row = dr.gather(mi.Float, y, pixel)

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, to_jit
+from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, opaque, opaque_point, to_jit
 from twin.light.camera import WindowFaces, frame_about
 from twin.light.pose import Rays
 from uwlts.model.errors import DesignError
@@ -75,29 +75,31 @@ class Sheet:
             None if laser is None else np.linalg.inv(camera_from_object(own)) @ camera_from_object(sensor)
         )
         laser = own.laser
-        self._origin, angle, fan = _traced(own, medium)
+        origin, angle, fan = _traced(own, medium)
+        self._origin = opaque_point(origin)
         o, d = fan.origin, fan.direction
         slope, tilt = d[1] / d[2], d[0] / d[2]
-        self._y0 = _series(slope, o[1] - slope * o[2], _SERIES_MM)
-        self._x0 = _series(slope, o[0] - tilt * o[2], _SERIES_MM)
-        self._tilt, self._exit_z = _series(slope, tilt, _SERIES_SLOPE), _series(slope, o[2], _SERIES_MM)
-        self.begins_at_z_mm = float(o[2].min())
+        y0, x0 = _series(slope, o[1] - slope * o[2], _SERIES_MM), _series(slope, o[0] - tilt * o[2], _SERIES_MM)
+        k, exit_z = _series(slope, tilt, _SERIES_SLOPE), _series(slope, o[2], _SERIES_MM)
+        self.begins_at_z_mm = opaque(float(o[2].min()))
         far = o + 1e3 * d
-        miss = np.hypot(
-            self._y0(slope) + slope * far[2] - far[1], self._x0(slope) + self._tilt(slope) * far[2] - far[0]
-        ).max()
+        miss = np.hypot(y0(slope) + slope * far[2] - far[1], x0(slope) + k(slope) * far[2] - far[0]).max()
         if miss > _LARGEST_MISS_MM:
             raise DesignError(
                 f"the laser's window bends the {laser.fan_angle_deg:g} deg fan so unevenly that its rays are followed "
                 f"to {miss:.3f} mm only, not to {_LARGEST_MISS_MM:g} mm: make the fan narrower or tilt the window less"
             )
-        self._dy0, self._dx0, self._dtilt = self._y0.deriv(), self._x0.deriv(), self._tilt.deriv()
+        self._y0, self._x0, self._tilt, self._exit_z = map(_Series, (y0, x0, k, exit_z))
+        self._dy0, self._dx0, self._dtilt = (_Series(each.deriv()) for each in (y0, x0, k))
+        (low, high), (offset, scale) = y0.domain, y0.mapparms()
+        self._least, self._most = opaque(low - 0.05 * (high - low)), opaque(high + 0.05 * (high - low))
+        self._offset, self._scale = opaque(offset), opaque(scale)
         self._power, self.power_w = _power_along(laser, slope, angle, fan.weight)
         waist = laser.waist_radius_mm
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
-        self._waist, self._rayleigh, self._waist_at = waist, rayleigh, laser.waist_distance_mm
-        self._extinction = medium.extinction_per_mm(laser.wavelength_nm)
+        self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
+        self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
 
     def at(self, p: Point3f) -> SheetLight:
         """Light of the sheet at points in the OCS.
@@ -106,22 +108,21 @@ class Sheet:
         P'(m) dm; across it spreads as a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
         (Siegman, Lasers, Eqs. 17.5, and 17.6 for zR, with M2), s being the distance from the laser.
         """
-        m = p.y / (p.z - float(self._origin[2]))
-        low, high = self._y0.domain
+        m = p.y / (p.z - self._origin.z)
         for _ in range(_NEWTON_STEPS):
             t = self._normalised(m)
-            m -= (_value(self._y0, t) + m * p.z - p.y) / (_value(self._dy0, t) + p.z)
-            m = dr.clip(m, low - 0.05 * (high - low), high + 0.05 * (high - low))
+            m -= (self._y0(t) + m * p.z - p.y) / (self._dy0(t) + p.z)
+            m = dr.clip(m, self._least, self._most)
         t = self._normalised(m)
-        tilt, normal = _value(self._tilt, t), self._normal(m, t, p.z)
-        distance = (p.x - _value(self._x0, t) - tilt * p.z) * normal.x
+        tilt, normal = self._tilt(t), self._normal(m, t, p.z)
+        distance = (p.x - self._x0(t) - tilt * p.z) * normal.x
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
-        exit_mm = (p.z - _value(self._exit_z, t)) * stretch
-        away = dr.norm(p - mi.Point3f(self._origin)) - self._waist_at
+        exit_mm = (p.z - self._exit_z(t)) * stretch
+        away = dr.norm(p - self._origin) - self._waist_at
         sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
         gauss = dr.exp(-0.5 * dr.square(distance / sigma)) / (sigma * math.sqrt(2 * math.pi))
         # A plane Z = const is crossed by P'(m) dm / dY per length along Y, spread along X as the Gaussian is cut there.
-        density = self._power.at(m) / (_value(self._dy0, t) + p.z) * normal.x
+        density = self._power.at(m) / (self._dy0(t) + p.z) * normal.x
         irradiance = density * gauss * stretch * dr.exp(-self._extinction * exit_mm)
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
         return SheetLight(distance, sigma, dr.select(exit_mm > 0, irradiance, 0.0), direction, normal, exit_mm)
@@ -135,14 +136,14 @@ class Sheet:
         """
         m = self._power.draw(u.x)
         t = self._normalised(m)
-        tilt, z = _value(self._tilt, t), _value(self._exit_z, t)
+        tilt, z = self._tilt(t), self._exit_z(t)
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
         along = cast(Vector3f, mi.Vector3f(tilt, m, 1.0))
-        leaves = mi.Point3f(_value(self._x0, t) + tilt * z, _value(self._y0, t) + m * z, z)
+        leaves = mi.Point3f(self._x0(t) + tilt * z, self._y0(t) + m * z, z)
         # Where the ray is as far from the laser as the waist.
-        from_laser = leaves - mi.Point3f(self._origin)
+        from_laser = leaves - self._origin
         ahead = dr.dot(from_laser, along) / stretch
-        to_waist = dr.safe_sqrt(ahead * ahead - dr.squared_norm(from_laser) + self._waist_at**2) - ahead
+        to_waist = dr.safe_sqrt(ahead * ahead - dr.squared_norm(from_laser) + dr.square(self._waist_at)) - ahead
         waist_z = z + to_waist / stretch
         sigma = 0.5 * self._waist / self._normal(m, t, waist_z).x
         beside, turned = sigma * _standard_normal(u.y), sigma / self._rayleigh * _standard_normal(u.z)
@@ -151,15 +152,14 @@ class Sheet:
         return Rays(leaves, dr.normalize(along), mi.Float(1.0))
 
     def _normalised(self, m: Float) -> Float:
-        offset, scale = self._y0.mapparms()
-        return dr.fma(m, scale, offset)
+        return dr.fma(m, self._scale, self._offset)
 
     def _normal(self, m: Float, t: Float, z: Float) -> Vector3f:
         """Unit normal of the surface X(Y, Z): its derivatives are X_Y = (x0' + k' Z) / (y0' + Z), X_Z = k - m X_Y."""
         # At the fan's origin, where all rays meet, both derivatives vanish.
-        spread = dr.maximum(_value(self._dy0, t) + z, _SMALLEST_SPREAD_MM)
-        by_y = (_value(self._dx0, t) + _value(self._dtilt, t) * z) / spread
-        return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - _value(self._tilt, t)))
+        spread = dr.maximum(self._dy0(t) + z, _SMALLEST_SPREAD_MM)
+        by_y = (self._dx0(t) + self._dtilt(t) * z) / spread
+        return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - self._tilt(t)))
 
 
 def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Rays]:
@@ -204,12 +204,18 @@ def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshe
     return fit.truncate(max(1, np.count_nonzero(left > tolerance)))
 
 
-def _value(series: Chebyshev, t: Float) -> Float:
-    """The series at its variable brought to -1 to 1, by Clenshaw's recurrence, which keeps 32 bits exact."""
-    ahead, beyond = mi.Float(0.0), mi.Float(0.0)
-    for coefficient in series.coef[:0:-1]:
-        ahead, beyond = dr.fma(2 * t, ahead, float(coefficient) - beyond), ahead
-    return dr.fma(t, ahead, float(series.coef[0]) - beyond)
+class _Series:
+    """A Chebyshev series as kernels take it: another one of the same degree needs no other kernel."""
+
+    def __init__(self, series: Chebyshev):
+        self._coefficients = [opaque(float(each)) for each in series.coef]
+
+    def __call__(self, t: Float) -> Float:
+        """Value at the variable brought to -1 to 1, by Clenshaw's recurrence, which keeps 32 bits exact."""
+        ahead, beyond = mi.Float(0.0), mi.Float(0.0)
+        for coefficient in self._coefficients[:0:-1]:
+            ahead, beyond = dr.fma(2 * t, ahead, coefficient - beyond), ahead
+        return dr.fma(t, ahead, self._coefficients[0] - beyond)
 
 
 def _standard_normal(u: Float) -> Float:
@@ -258,11 +264,11 @@ class PowerTable:
     """
 
     def __init__(self, nodes: np.ndarray, density: np.ndarray, *, power_w: float):
-        self._low, self._step, self._cells = float(nodes[0]), float(nodes[1] - nodes[0]), len(nodes) - 1
+        low, step, self._cells = float(nodes[0]), float(nodes[1] - nodes[0]), len(nodes) - 1
+        self._low, self._step, self._power_per_step = opaque(low), opaque(step), opaque(power_w / step)
         share = density / np.trapezoid(density)
         below = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]))])
         self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
-        self._power_per_step = power_w / self._step
 
     def at(self, x: Float) -> Float:
         """Power in W per unit of the coordinate."""

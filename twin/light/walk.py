@@ -74,7 +74,7 @@ class Walker:
     effects: Effects
     pose: SensorPose
     lights: list[Light]
-    reach_mm: float
+    reach_mm: Float
 
     @property
     def _scatters(self) -> bool:
@@ -117,7 +117,7 @@ class Walker:
         state, sequence = mi.sample_tea_32(seed, walks.number)
         random = cast(Any, mi.PCG32)
         rng: PCG32 = random(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
-        o, d, c = walks.origin, walks.direction, self.scattering.extinction
+        o, d, c = walks.origin, walks.direction, self.scattering.c
         si = self.objects.scene.ray_intersect(self.pose.ray(o, d))
         hit = si.is_valid()
         length = dr.select(hit, si.t, self.reach_mm)
@@ -206,7 +206,7 @@ class Walker:
         active = active & (density > 0) & (here.irradiance > 0)
         lit = light.reaches(self.objects.scene, p, here, None, active)
         source = here.irradiance * self.scattering.phase(_one_minus_cosine(-here.direction, d))
-        value = self.scattering.coefficient * source * dr.exp(-self.scattering.extinction * t) / density
+        value = self.scattering.b * source * dr.exp(-self.scattering.c * t) / density
         return dr.select(lit, value, 0.0)
 
     def _lit_end(
@@ -227,8 +227,8 @@ class Walker:
 
     def _light_density(self, light: Light, here: SheetLight, cosine: Float) -> Float:
         """Density per mm2 of the lit points that `_connected` draws: the share of the power that falls there."""
-        unweakened = here.irradiance * dr.exp(self.scattering.extinction * here.exit_mm)
-        return unweakened * dr.abs(cosine) / light.sheet.power_w
+        unweakened = here.irradiance * dr.exp(self.scattering.c * here.exit_mm)
+        return unweakened * dr.abs(cosine) / light.power_w
 
     def _connected(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
         """Light of a lit point, drawn in proportion to the power that falls there, that the vertex scatters on."""
@@ -251,7 +251,7 @@ class Walker:
         by_light = self._light_density(light, here, mi.Frame3f.cos_theta(si.wi))
         by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
         way = here.exit_mm + distance
-        light_there = light.sheet.power_w * sent * dr.exp(-self.scattering.extinction * way) / dr.square(distance)
+        light_there = light.power_w * sent * dr.exp(-self.scattering.c * way) / dr.square(distance)
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
     def _free_path(self, length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
@@ -261,13 +261,13 @@ class Walker:
         distances fall off by at least one reach, so that in clear water they are not drawn far behind the scene.
         """
         choice, u = rng.next_float32(), rng.next_float32()
-        c = self.scattering.extinction
+        c = self.scattering.c
         through = dr.exp(-c * length)
         if not self._scatters:
             return dr.full(mi.Bool, False, dr.width(hit)), length, dr.select(hit, through, 0.0)
-        fall = max(c, 4 / self.reach_mm)
+        fall = dr.maximum(c, 4 / self.reach_mm)
         share = 1 - dr.exp(-fall * length)
-        promised = self.scattering.coefficient / fall * share
+        promised = self.scattering.b / fall * share
         likely = dr.select(hit, dr.clip(promised / (promised + 0.5 * through), 0.3, 0.7), 1.0)
         in_water = choice < likely
         distance = -dr.log(1 - u * share) / fall

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point2f, UInt32, Vector3f, to_jit
+from twin.backend.arrays import Float, Point2f, UInt32, Vector3f, opaque, to_jit
 from twin.light.sheet import SheetLight
 from uwlts.model.phase_functions import Molecular, PhaseFunction, Scatterer
 from uwlts.model.sensor import Medium
@@ -90,19 +90,21 @@ def _normalised(log_density: np.ndarray, forward: float) -> PhaseTable:
 class Scattering:
     """Absorption and scattering of light of one wavelength in a medium: coefficients in 1/mm and the phase function.
 
-    ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``backward_share`` is the share of b that
-    scatters by more than 90 deg. The phase function of all that scatters lies in a table, read by the same kernels
-    whatever the medium. RangeError where the medium's tables do not reach the wavelength.
+    ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``b`` and ``c`` are the same as kernels take
+    them. ``backward_share`` is the share of b that scatters by more than 90 deg. The phase function of all that
+    scatters lies in a table, read by the same kernels whatever the medium. RangeError where the medium's tables do not
+    reach the wavelength.
     """
 
     def __init__(self, medium: Medium, wavelength_nm: float):
         self.absorption = medium.absorption_per_mm(wavelength_nm)
         self.coefficient = medium.scattering_per_mm(wavelength_nm)
         self.extinction = self.absorption + self.coefficient
+        self.b, self.c = opaque(self.coefficient), opaque(self.extinction)
         table = tabulated(medium.scatterers(wavelength_nm))
         self.backward_share = 1 - float(np.interp(math.pi / 2, node_angles(), table.cumulative))
         self._log_density = to_jit(mi.Float, table.log_density)
-        self._forward = dr.opaque(mi.Float, table.cumulative[0] / FORWARD_SR)
+        self._forward = opaque(table.cumulative[0] / FORWARD_SR)
         self._cumulative = to_jit(mi.Float, table.cumulative)
 
     def phase(self, one_minus_cosine: Float) -> Float:
@@ -168,10 +170,9 @@ def single_scattering(
     The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos| times the share of the
     Gaussian that the ray has passed.
     """
-    b = dr.opaque(mi.Float, scattering.coefficient)
     cosine = dr.maximum(dr.abs(dr.dot(direction, light.normal)), 1e-3)
     peak = light.irradiance * light.sigma_mm * math.sqrt(2 * math.pi)
     share = 0.5 * (1 + dr.erf(surface_sigmas / math.sqrt(2.0)))
     # The light leaves against the camera ray, so that the difference of both directions is a sum here.
     phase = scattering.phase(0.5 * dr.squared_norm(light.direction + direction))
-    return b * phase * peak / cosine * share
+    return scattering.b * phase * peak / cosine * share

@@ -1,4 +1,7 @@
-"""Frames after the first reuse its kernels, wherever the sensor stands and however many pixels are lit."""
+"""Frames after the first reuse its kernels, wherever the sensor stands and however many pixels are lit.
+
+Another sensor's do, too, and in other water: a design study compiles no kernel anew from design to design.
+"""
 
 import drjit as dr
 import numpy as np
@@ -9,11 +12,19 @@ from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
 from twin.recording.studio import true_stripe
 from twin.scene.description import load_scene
+from uwlts.model.sensor import Medium, Sensor
+
+
+SMALL = {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}}
 
 
 @pytest.fixture
 def new_kernels():
-    """Counts kernels launched since the last call that were compiled or read from disk, not found in memory."""
+    """Counts kernels launched since the last call that were compiled or read from disk, not found in memory.
+
+    None is in memory at first, whatever other tests have left.
+    """
+    dr.flush_kernel_cache()
     dr.kernel_history()
     dr.set_flag(dr.JitFlag.KernelHistory, True)
 
@@ -32,10 +43,7 @@ def sphere() -> dict[str, object]:
 
 @pytest.mark.slow
 def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels):
-    # A focal length of its own makes sure that no other test has left these kernels in memory.
-    sensor = altered(
-        thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2, "focal_length_mm": 12.61}}
-    )
+    sensor = altered(thesis, SMALL)
     renderer = Renderer(sensor, clear(0.3, 0.5), scene_of(sphere(), plate(60.0, side=150.0, x=40.0)))
     new_kernels()
 
@@ -57,10 +65,7 @@ def test_a_laser_scan_compiles_nothing_after_its_first_frame(thesis, new_kernels
 
 
 def test_lamp_images_compile_nothing_after_the_first(thesis, new_kernels):
-    sensor = altered(
-        thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2, "focal_length_mm": 12.62}}
-    )
-    renderer = Renderer(sensor, clear(), load_scene("target"))
+    renderer = Renderer(altered(thesis, SMALL), clear(), load_scene("target"))
     new_kernels()
     renderer.irradiance("lamp", sensor_at(), spp=4)
     assert new_kernels()[1] >= 2
@@ -69,6 +74,40 @@ def test_lamp_images_compile_nothing_after_the_first(thesis, new_kernels):
     launched, new = new_kernels()
     assert launched >= 16
     assert new == 0
-    # A number that is compiled in, such as the absorption, does compile anew: the count can tell.
-    Renderer(sensor, clear(0.4), load_scene("target")).irradiance("lamp", sensor_at(), spp=4)
+
+
+OTHER = {
+    "camera": {
+        "width_px": 400,
+        "height_px": 240,
+        "pixel_size_um": 19.0,
+        "focal_length_mm": 14.1,
+        "f_number": 6.3,
+        "window": {"distance_mm": 33.0, "thickness_mm": 4.2, "glass": 1.49},
+    },
+    "laser": {
+        "baseline_mm": 171.0,
+        "triangulation_angle_deg": 33.0,
+        "fan_angle_deg": 24.0,
+        "power_mw": 71.0,
+        "waist_radius_mm": 0.081,
+    },
+}
+"""Numbers by which designs differ; what one has and another lacks, such as distortion, takes kernels of its own."""
+
+
+def test_another_sensor_in_other_water_compiles_nothing(thesis, new_kernels):
+    def frames(sensor: Sensor, medium: Medium, thing: dict[str, object], *, spp: int) -> None:
+        renderer = Renderer(sensor, medium, scene_of(thing, plate(60.0, side=150.0, x=40.0)))
+        for light in ("laser", "lamp"):
+            renderer.irradiance(light, sensor_at(x=0.5), spp=spp)
+
+    frames(altered(thesis, SMALL), clear(0.3, 0.5), sphere(), spp=4)
+    assert new_kernels()[1] >= 4
+    frames(altered(thesis, OTHER), clear(0.5, 0.2), sphere() | {"diameter_mm": 38.1}, spp=7)
+    launched, new = new_kernels()
+    assert launched >= 10
+    assert new == 0
+    # An effect that is absent does compile anew: the count can tell.
+    frames(altered(thesis, SMALL), clear(0.3), sphere(), spp=4)
     assert new_kernels()[1] > 0
