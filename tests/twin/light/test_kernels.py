@@ -14,7 +14,6 @@ from twin.recording.studio import true_stripe
 from twin.scene.description import load_scene
 from uwlts.model.sensor import Medium, Sensor
 
-
 SMALL = {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}}
 
 
