@@ -248,7 +248,8 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
     )
     processes: list[subprocess.Popen[bytes]] = []
     try:
-        until(found.is_file)
+        # The file is there before its text is.
+        until(lambda: found.is_file() and found.read_text().endswith("}"))
         processes += [
             subprocess.Popen(
                 [
