@@ -77,6 +77,7 @@ SERVING = {
     "test_calibrate_live.py",
     "test_scan_command.py",
     "test_scan_exposure.py",
+    "test_scan_ended.py",
     "test_scan_faults.py",
     "test_live_view.py",
     "test_cameras.py",

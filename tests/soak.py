@@ -14,30 +14,17 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 import uwlts
 from tests.browser import find_chromium, open_chromium
-from tests.system.small_board import small_sensor
-from twin.devices.gige_camera import GigeCamera
+from tests.system.drawn_hardware import RESOLUTION_MM, STAGE, DrawnCamera, write_plan
 from twin.devices.grbl_controller import GrblController
 from uwlts.storage.capture import Capture
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-WIDTH, HEIGHT = 96, 512
-TRAVEL_MM, STEP_MM = 120.0, 0.001
 GROWTH = 1.25
 SPEED_UP = 500.0
-
-
-def drawn(exposure_ms: float, *, rng: np.random.Generator, lit: bool) -> np.ndarray:
-    """A stripe across a noisy image (HEIGHT, WIDTH), as bright as it was exposed."""
-    rows = np.arange(HEIGHT)[:, None]
-    stripe = 400.0 * exposure_ms * np.exp(-0.5 * ((rows - 250.0 - 0.1 * np.arange(WIDTH)) / 2.0) ** 2)
-    image = rng.normal(4.0, 1.0, (HEIGHT, WIDTH)) + (stripe if lit else 0.0)
-    return np.clip(image, 0, 255).astype(np.uint8)
 
 
 def memory_mib(process: int) -> float:
@@ -64,24 +51,11 @@ def main(images: int) -> int:
 
 
 def _soak(folder: Path, images: int) -> int:
-    rng = np.random.default_rng(0)
-    controller = GrblController(settings={100: 1 / STEP_MM, 130: TRAVEL_MM}, speed_up=SPEED_UP)
-    camera = GigeCamera(
-        lambda exposure_ms: drawn(exposure_ms, rng=rng, lit=controller.state().laser_on),
-        width_px=WIDTH,
-        height_px=HEIGHT,
-    )
-    with controller, camera:
-        stage = (f"travel_mm = {TRAVEL_MM}", f"resolution_mm = {STEP_MM}", "settling_s = 0.0")
-        (folder / "sensor.toml").write_text(small_sensor(*stage))
-        (folder / "plan.toml").write_text(
-            f'title = "Soak"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{camera.address}"\nlaser_ms = 0.4\n'
-            f'[stage]\nport = "{controller.port}"\nstart_mm = 5.0\nstep_mm = {STEP_MM}\ncount = {images}\n'
-            "feed_mm_per_min = 900.0\n"
-        )
+    with GrblController(settings=STAGE, speed_up=SPEED_UP) as controller, DrawnCamera(controller) as camera:
+        plan = write_plan(folder, camera, controller, count=images, step_mm=RESOLUTION_MM)
         uwlts.write_calibration(folder / "nominal.json", uwlts.nominal(folder / "sensor.toml", medium="air"))
         desk = subprocess.Popen(
-            [sys.executable, "-m", "uwlts.cli", "desk", str(folder), "--plan", str(folder / "plan.toml")],
+            [sys.executable, "-m", "uwlts.cli", "desk", str(folder), "--plan", str(plan)],
             stdout=subprocess.PIPE,
             text=True,
         )

@@ -5,6 +5,7 @@ import os
 import socket
 import stat
 import threading
+import time
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_char_p, "arv_get_device_id arv_get_device_serial_nbr arv_get_device_address", [c_uint]),
     (c_char_p, "arv_get_device_protocol", [c_uint]),
     (c_int, "arv_camera_is_gv_device arv_gv_device_is_controller arv_buffer_get_status", [c_void_p]),
+    (c_int, "arv_gv_device_take_control", [c_void_p, POINTER(POINTER(_GError))]),
     (c_void_p, "arv_camera_get_device", [c_void_p]),
     (c_uint16, "arv_gv_stream_get_port", [c_void_p]),
     (None, "arv_stream_push_buffer", [c_void_p, c_void_p]),
@@ -88,6 +90,8 @@ def _text(value: bytes | None) -> str:
 
 _ANSWER_S = 0.1
 """A camera on this machine answers a search within some ms."""
+_HEARTBEAT_S = 4.0
+"""GigE Vision's time is 3 s unless a program has set another."""
 _SOCKET_BYTES = 2**23
 """Room for the packets of some frames of 1280 x 1024 px."""
 # GigE Vision's discovery command: key, acknowledge, command 2, no content, request 1.
@@ -157,10 +161,8 @@ class AravisCamera(CameraDevice):
         self._camera = self._call("new", self._identifier())
         try:
             # A GigE camera obeys one program at a time; Aravis opens it for reading where that is another one.
-            if functions.arv_camera_is_gv_device(self._camera):
-                device = functions.arv_camera_get_device(self._camera)
-                if not functions.arv_gv_device_is_controller(device):
-                    raise HardwareError(f"the camera {self.address} is used by another program: end that one first")
+            if functions.arv_camera_is_gv_device(self._camera) and not self._controlled():
+                raise HardwareError(f"the camera {self.address} is used by another program: end that one first")
             width, height = self._numbers("get_sensor_size", 2)
             maker, model, serial = (
                 _text(self._call(f"get_{part}")) or "?"
@@ -171,6 +173,18 @@ class AravisCamera(CameraDevice):
             self._close()
             raise
         return CameraInfo(f"{maker} {model}", serial, width, height, bits)
+
+    def _controlled(self) -> bool:
+        """Whether the camera obeys this program; one whose program was killed does when it has missed its heartbeat."""
+        device, deadline = self._functions.arv_camera_get_device(self._camera), time.monotonic() + _HEARTBEAT_S
+        while not self._functions.arv_gv_device_is_controller(device):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(_ANSWER_S)
+            error = POINTER(_GError)()
+            if not self._functions.arv_gv_device_take_control(device, byref(error)) and error:
+                self._functions.g_error_free(error)
+        return True
 
     def _identifier(self) -> bytes:
         """Name of the camera in Aravis: an IP address as it is, for everything else there is a search."""

@@ -257,6 +257,7 @@ class GrblLine:
             self._hang_up_on_close()
             self._guard = Heartbeat(self._serial.fileno())
             self.version = self._greeting(boot_s)
+            self._heard_out()
         except BaseException as error:
             self.close(error)
             raise
@@ -413,7 +414,13 @@ class GrblLine:
         """Reset by Ctrl-X: the laser goes off and a fault is over; the position is kept only if nothing moved."""
         self.darkened_by_hand = False
         self._reset()
-        # After an alarm there may be a greeting more, which must not look like a restart of its own.
+        self._heard_out()
+
+    def _heard_out(self) -> None:
+        """Throw away what else is said after a restart; another greeting must not look like a restart of its own.
+
+        There is one after an alarm, and where the resets by which a program has ended come after the port's opening.
+        """
         while self._read_line(time.monotonic() + _QUIET_S) is not None:
             pass
 

@@ -252,13 +252,13 @@ class Rig:
             try:
                 frame = self._one()
             except HardwareError as error:
+                # At once: closing a camera that is gone takes its time.
+                with suppress(HardwareError):
+                    self._rest()
+                # A camera whose driver hangs has the guard switch the laser off; what to mend is the camera.
                 if self._stage.faulty or not self._camera.running:
-                    # At once: closing a camera that is gone takes its time.
-                    with suppress(HardwareError):
-                        self._rest()
                     raise
                 last = error
-                self._laser(False)
                 self.repeated += 1
             else:
                 # Also shows whether the laser was on all the time.

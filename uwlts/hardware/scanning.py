@@ -331,13 +331,18 @@ class _Taking:
         image = self._rig.image("laser", place.exposure_ms)[0]
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
         slip_mm, error_mm = relief.slip(centres_of(stripe_of(image, self._sensor, background=unlit)))
-        if relief.is_significant(slip_mm, error_mm):
-            raise HardwareError(
-                f"the stage has lost steps, or sensor or object were moved: back at {place.position_mm:g} mm the "
-                f"stripe lies as if the stage stood {slip_mm:+.2f} mm (std {error_mm:.2f} mm) beside it. All images "
-                "are recorded, but from somewhere on at wrong positions: find the cause (feed, acceleration, something "
-                "in the way) and scan again with --overwrite, or take them as they are with --resume"
-            )
+        if not np.isfinite(slip_mm):
+            seen = "shows no stripe where it was; or the laser has failed since the last image"
+        elif relief.is_significant(slip_mm, error_mm):
+            seen = f"looks as if the stage stood {slip_mm:+.2f} mm (std {error_mm:.2f} mm) beside it"
+        else:
+            return
+        raise HardwareError(
+            f"the stage has lost steps, or sensor or object were moved: the image back at {place.position_mm:g} mm "
+            f"{seen}. All images are recorded, but from somewhere on at wrong positions: find the cause (feed, "
+            "acceleration, something in the way) and scan again with --overwrite, or take them as they are with "
+            "--resume"
+        )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:
         """Settle the exposure of a light again if it turns out to be too long; False if that does not help."""

@@ -267,6 +267,21 @@ def test_opening_reads_version_settings_and_state(controller):
         assert termios.tcgetattr(stage._line._serial.fd)[2] & termios.HUPCL
 
 
+def test_resets_of_the_program_before_are_no_fault(controller, monkeypatch):
+    """A program and its guard end with Ctrl-X; on a busy machine the board greets for it after the next opening."""
+    say, greeted = controller._say, []
+
+    def again(data: bytes) -> None:
+        say(data)
+        if data.lstrip().startswith(b"Grbl") and not greeted:
+            greeted.append(True)
+            threading.Timer(0.05, controller.inject, ("restart",)).start()
+
+    monkeypatch.setattr(controller._firmware, "_say", again)
+    with GrblStage(controller.port) as stage:
+        assert greeted and stage.home() == pytest.approx(2.0, abs=STEP_MM)
+
+
 def test_a_board_that_does_not_reset_is_woken_and_keeps_its_position():
     with GrblController(**FAST, resets_when_opened=False) as controller:
         for known in (False, True):

@@ -1,0 +1,243 @@
+"""A scan that is ended from outside, or whose hardware or disk fails, at any moment.
+
+The laser is off afterwards, what was recorded can be read, and the scan is resumed to the whole capture. Camera and
+controller speak their real protocols.
+"""
+
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.system.drawn_hardware import STAGE, DrawnCamera, write_plan
+from tests.system.in_process import uwlts
+from tests.waiting import within
+from twin.devices.grbl_controller import GrblController
+from uwlts.storage.capture import Capture, part_path
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).resolve().parents[2]
+COUNT, STEP_MM = 6, 2.0
+
+
+@pytest.fixture(scope="module")
+def camera() -> Iterator[DrawnCamera]:
+    with DrawnCamera() as running:
+        yield running
+
+
+class Bench:
+    """The hardware with a plan for it, and the capture that is recorded."""
+
+    def __init__(self, camera: DrawnCamera, folder: Path, stack: ExitStack):
+        self.camera, self.folder, self.out, self._stack = camera, folder, folder / "scan.h5", stack
+        self.new_controller()
+        camera.lit = 0
+
+    def new_controller(self) -> None:
+        # Homing that is never acknowledged is given up by the time that these speeds need.
+        controller = GrblController(settings=STAGE | {24: 3000, 25: 10000, 120: 1000}, speed_up=50.0, boot_s=0.2)
+        self.controller = self.camera.controller = self._stack.enter_context(controller)
+
+    def plan(self, *, count: int = COUNT, laser_ms: str = "0.4") -> Path:
+        return write_plan(self.folder, self.camera, self.controller, count=count, step_mm=STEP_MM, laser_ms=laser_ms)
+
+    def words(self, plan: Path) -> list[str]:
+        """A scan's arguments: resumed where something is left of it."""
+        return ["scan", str(plan), "--out", str(self.out), "--home", *(["--resume"] if self.kept() is not None else [])]
+
+    def start(self, plan: Path, *, largest_file: int | None = None) -> "subprocess.Popen[str]":
+        """A scan in a process of its own; ``largest_file`` in bytes stands for a disk that is full."""
+
+        def limit() -> None:
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            if largest_file is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+        program = subprocess.Popen(
+            [sys.executable, "-m", "uwlts.cli", *self.words(plan)],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=limit,
+        )
+        self._stack.callback(program.wait)
+        self._stack.callback(program.kill)
+        return program
+
+    def wait(self, program: "subprocess.Popen[str]", lights: int) -> None:
+        """Until a running scan has had so many images with laser from now on."""
+        wanted = self.camera.lit + lights
+        assert within(30.0, lambda: self.camera.lit >= wanted or program.poll() is not None)
+
+    def lit(self) -> bool:
+        return self.controller.state().laser_on
+
+    def moving(self) -> bool:
+        return self.controller.state().moving
+
+    def dark(self) -> bool:
+        """Whether the laser goes off within a second of its exposure."""
+        return within(1.0, lambda: not self.lit())
+
+    def kept(self) -> int | None:
+        """Images that an interrupted scan has left, every one readable; None if there is no file of it."""
+        if not part_path(self.out).exists():
+            return None
+        return self._complete(part_path(self.out))
+
+    @staticmethod
+    def _complete(path: Path) -> int:
+        with Capture(path) as capture:
+            for number in range(len(capture)):
+                assert capture.image(number).max() > 100
+            np.testing.assert_allclose(capture.stage_mm, 5.0 + STEP_MM * np.arange(len(capture)), atol=0.002)
+            assert (np.diff(capture.time_s) > 0).all()
+            return len(capture)
+
+    def completed(self, count: int = COUNT, **plan: str) -> None:
+        """What is left is taken, and the capture is whole."""
+        if not self.out.exists():
+            done = uwlts(*self.words(self.plan(count=count, **plan)))
+            assert done.returncode == 0, done.stderr
+        assert self._complete(self.out) == count and not part_path(self.out).exists()
+
+
+@pytest.fixture
+def bench(camera: DrawnCamera, tmp_path: Path) -> Iterator[Bench]:
+    camera.connect()
+    with ExitStack() as stack:
+        yield Bench(camera, tmp_path, stack)
+
+
+def test_a_scan_killed_at_twelve_moments_loses_nothing(bench):
+    """Each run is killed so many ms after the laser's first, second or fourth light: in it or after it."""
+    count, kept = 30, 0
+    plan = bench.plan(count=count)
+    moments = [(light, after_ms) for after_ms in (0, 3, 10, 30) for light in (1, 2, 4)]
+    for light, after_ms in moments:
+        program = bench.start(plan)
+        bench.wait(program, light)
+        time.sleep(1e-3 * after_ms)
+        program.kill()
+        assert program.wait() == -signal.SIGKILL
+        assert bench.dark(), (light, after_ms)
+        found = bench.kept()
+        # An image that is being taken is lost, and no other.
+        assert found is None or found >= kept
+        kept = found or kept
+    assert kept > len(moments)
+    bench.completed(count)
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGSEGV])
+def test_a_signal_ends_a_scan_in_the_dark(bench, ending):
+    program = bench.start(bench.plan())
+    bench.wait(program, 3)
+    program.send_signal(ending)
+    _, errors = program.communicate(timeout=20)
+    assert program.returncode == (130 if ending == signal.SIGINT else -ending), errors
+    assert "Traceback" not in errors
+    assert bench.dark()
+    assert (bench.kept() or 0) >= 1
+    bench.completed()
+
+
+PHASES: dict[str, Callable[[Bench], bool]] = {
+    "homing": lambda bench: bench.moving(),
+    "exposures": lambda bench: bench.lit(),
+    "moving": lambda bench: bench.camera.lit >= 2 and bench.moving(),
+    "exposing": lambda bench: bench.camera.lit >= 2 and bench.lit(),
+    "checking": lambda bench: bench.camera.lit == COUNT and bench.moving(),
+}
+"""Phases of a scan and how each is noticed from outside."""
+FAULTS = {
+    "camera": "check power and cable",
+    "stage": "gone|connection|lost",
+    "alarm": "ALARM:1",
+    "mute": "hangs|does not answer",
+    "restart": "restarted by itself",
+    "break-laser": "no laser light|the laser has failed|shows no stripe",
+}
+"""What fails, and what the message names."""
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("phase", PHASES)
+def test_hardware_that_fails_in_any_phase_ends_the_scan_in_the_dark(bench, phase, fault):
+    laser_ms = '"auto"' if phase == "exposures" else "0.4"
+
+    def fail() -> None:
+        assert within(20.0, lambda: PHASES[phase](bench))
+        match fault:
+            case "camera":
+                bench.camera.disconnect()
+            case "stage":
+                bench.controller.disconnect()
+            case _:
+                bench.controller.inject(fault)
+
+    words = bench.words(bench.plan(laser_ms=laser_ms))
+    failing = threading.Thread(target=fail)
+    failing.start()
+    done = uwlts(*words)
+    failing.join()
+    errors = [line for line in done.stderr.splitlines() if line.strip()]
+    assert done.returncode == 2 and re.search(FAULTS[fault], errors[-1]), done.stderr
+    if fault in ("mute", "break-laser"):
+        bench.controller.inject(fault, 0)
+    assert bench.dark()
+    assert not bench.out.exists()
+    kept = bench.kept() or 0
+    assert kept >= {"homing": 0, "exposures": 0, "moving": 1, "exposing": 1, "checking": COUNT}[phase]
+    if fault == "camera":
+        bench.camera.connect()
+    elif fault == "stage":
+        bench.new_controller()
+    bench.completed(laser_ms=laser_ms)
+
+
+def test_a_disk_that_is_full_costs_the_image_at_hand(bench):
+    program = bench.start(bench.plan(), largest_file=400_000)
+    _, errors = program.communicate(timeout=60)
+    assert program.returncode == 2 and "Traceback" not in errors, errors
+    assert re.search("full|large", errors), errors
+    assert bench.dark() and not bench.out.exists()
+    assert bench.kept()
+    bench.completed()
+
+
+def test_a_folder_that_goes_away_ends_the_scan(bench, tmp_path):
+    bench.out = tmp_path / "stick" / "scan.h5"
+    bench.out.parent.mkdir()
+    program = bench.start(bench.plan())
+    bench.wait(program, 2)
+    shutil.rmtree(bench.out.parent)
+    _, errors = program.communicate(timeout=60)
+    assert program.returncode == 2 and "Traceback" not in errors and str(bench.out.parent) in errors, errors
+    assert bench.dark()
+
+
+def test_hardware_and_capture_belong_to_one_scan(bench):
+    plan = bench.plan()
+    program = bench.start(plan)
+    bench.wait(program, 2)
+    for out in (bench.out, bench.folder / "other.h5"):
+        second = uwlts("scan", plan, "--out", out, "--home")
+        assert second.returncode == 2 and "Traceback" not in second.stderr, second.stderr
+    _, errors = program.communicate(timeout=60)
+    assert program.returncode == 0, errors
+    bench.completed()
