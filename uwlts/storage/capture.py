@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import h5py
 import hdf5plugin
@@ -107,6 +108,11 @@ def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None)
     return {"plan": plan, "images": str(dtype), "header": header.model_dump(mode="json")}
 
 
+def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """A capture's datasets by their names, in a file of this program's."""
+    return {name: cast(h5py.Dataset, file[name]) for name in ("frames", *_PER_FRAME)}
+
+
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
     dataset = find_dataset(file, name, path=path)
     if dataset is None or dataset.ndim == 0:
@@ -154,6 +160,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             # Nothing is locked: whoever looks at a running recording must not stop it.
             self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
             self._file.swmr_mode = True
+            self._arrays = _arrays(self._file)
             self._claimed = claimed.pop_all()
 
     def _left_over(self) -> "Capture":
@@ -198,6 +205,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                     kind, chunks = bool if name == "laser_on" else float, (256, *shape)
                     # No checksum: a kill while 256 rows are rewritten would then lose them all, not only the last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
+                self._arrays = _arrays(self._file)
                 for frame in unfinished:
                     self._store(frame)
             _cut_to_used(fresh)
@@ -207,7 +215,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
 
     def __len__(self) -> int:
         """Number of complete frames written."""
-        return len(_dataset(self._file, "time_s", self._part))
+        return len(self._arrays["time_s"])
 
     def append(self, frame: Frame) -> None:
         """Store one frame; once this returns, the frame survives the end of the program.
@@ -243,7 +251,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
         for name, value in values.items():
-            dataset = _dataset(self._file, name, self._part)
+            dataset = self._arrays[name]
             dataset.resize(count + 1, axis=0)
             dataset[count] = value
             dataset.flush()
