@@ -29,7 +29,12 @@ NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "google-chrome-
 DEBIAN_PACKAGES = ("chromium-headless-shell", "chromium")
 DEBIAN_FONT = "fonts-dejavu-core"
 """Without any font a page shows no text."""
-SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-gpu-compositing")
+SOFTWARE_WEBGL = (
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-gpu-compositing",
+)
 """WebGL by the processor, the same on machines with and without a graphics card."""
 START_SECONDS = 60
 """Starting takes about 0.1 s; on a slow network drive much longer."""

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.system.in_process import run_program
 from tests.waiting import within
+from twin import cli
 from twin.design.description import load_study
 from twin.design.screening import parts, read_parts, screen
 from uwlts.model.library import load_sensor
@@ -65,9 +67,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
 
 
 def run(study: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*SWEEP, str(study), "--out", str(out), "--verify", "0", *more], capture_output=True, text=True, timeout=300
-    )
+    return run_program(cli.app, "twin", "sweep", study, "--out", out, "--verify", "0", *more)
 
 
 def begun(study: Path, out: Path, *more: str) -> subprocess.Popen[str]:
@@ -138,24 +138,8 @@ def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, 
     before = contents(out)
     assert run(study, out).returncode == 0
     assert contents(out) == before
-    simulated = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "twin.cli",
-            "simulate",
-            str(_scene(tmp_path)),
-            "--sensor",
-            str(out / "winner.toml"),
-            "--out",
-            str(tmp_path / "plane.h5"),
-            "--spp",
-            "1",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    words = ("simulate", _scene(tmp_path), "--sensor", out / "winner.toml", "--out", tmp_path / "plane.h5")
+    simulated = run_program(cli.app, "twin", *words, "--spp", "1")
     assert simulated.returncode == 0, simulated.stderr
     assert (tmp_path / "plane.h5").is_file()
 
