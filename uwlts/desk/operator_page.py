@@ -28,11 +28,13 @@ from uwlts.measurement.reconstruction import reconstruct
 from uwlts.model.command_files import own_files
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.report.inventory import describe
-from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud, read_thinned_cloud, write_cloud
 from uwlts.storage.files import refuse_unsuitable
 
 _LIST_S = 2.0
 _MOST_SHOWN = 300_000
+_MOST_OPENED = 5_000_000
+"""Points of a file that are kept in memory, to be measured."""
 _JOGS_MM = (-10.0, -1.0, -0.1, 0.1, 1.0, 10.0)
 _FREE = (InstrumentState.READY, InstrumentState.LOCKED)
 _RUNNING = (InstrumentState.SCANNING, InstrumentState.PAUSED)
@@ -143,8 +145,8 @@ class _Desk:
         """The calibrations to choose from."""
         return [file.name for file in listed(self.folder) if file.kind == "calibration"]
 
-    def show_cloud(self, name: str, cloud: PointCloud) -> None:
-        """Show a cloud, thinned if it is large, and have it measured."""
+    def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None) -> None:
+        """Show a cloud, a part ``of`` so many points, thinned if it is large, and have it measured."""
         self.opened = _Opened(cloud)
         self.board.cloud.clear()
         self.board.cloud_name = name
@@ -152,9 +154,8 @@ class _Desk:
         known = cloud.uncertainty
         std = None if known is None else np.linalg.norm(known[kept].std_mm(), axis=1)
         deviation = None if cloud.deviation_mm is None else cloud.deviation_mm[kept]
-        self.board.cloud.add(
-            cloud.points_mm[kept], len(cloud), intensity=cloud.intensity[kept], deviation=deviation, uncertainty=std
-        )
+        total, intensity = of or len(cloud), cloud.intensity[kept]
+        self.board.cloud.add(cloud.points_mm[kept], total, intensity=intensity, deviation=deviation, uncertainty=std)
 
     def measured(self) -> PointCloud:
         """The cloud to measure: the opened one, else what a scan shows."""
@@ -434,7 +435,12 @@ class _OperatorPage:
 
     async def _show(self, name: str) -> None:
         path = file_in(self._desk.folder, name)
-        self._desk.show_cloud(name, await asyncio.to_thread(read_cloud, path))
+        cloud, total = await asyncio.to_thread(read_thinned_cloud, path, _MOST_OPENED)
+        if total > len(cloud):
+            self._board.say(
+                f"{name} has {total:,} points: {len(cloud):,}, evenly chosen, are shown and measured", "warning"
+            )
+        self._desk.show_cloud(name, cloud, of=total)
         self._view.mark([])
 
     async def _about(self, name: str) -> None:

@@ -16,7 +16,7 @@ from uwlts.model.errors import CaptureError
 from uwlts.model.input_file import opened, parsed_json, require_plain, require_regular_file, shortened
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.files import written_aside
-from uwlts.storage.hdf5_file import format_of, read_array, read_label, write_label
+from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
@@ -191,11 +191,24 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     CaptureError
         The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
     """
+    return read_thinned_cloud(path)[0]
+
+
+def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
+    """Every n-th point of a cloud's file, ``at_most`` so many, and the number of points in the file; see `read_cloud`.
+
+    Of HDF5 and binary PLY only these are held in memory.
+    """
     path = Path(path)
     try:
-        return _read_hdf5(path) if _in_hdf5(path) else _read_ply(path)
+        return _read_hdf5(path, at_most) if _in_hdf5(path) else _read_ply(path, at_most)
     except CaptureError as error:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def _every(count: int, at_most: int | None) -> slice:
+    """The selection of every n-th of so many points."""
+    return slice(None, None, 1 if at_most is None else max(1, -(-count // at_most)))
 
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
@@ -257,7 +270,7 @@ def _metadata(comments: list[str]) -> Table:
     return metadata
 
 
-def _read_ply(path: Path) -> PointCloud:
+def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
     with opened(path, called="cloud") as file:
         _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
     try:
@@ -268,8 +281,8 @@ def _read_ply(path: Path) -> PointCloud:
         raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
     if "vertex" not in ply:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
-    vertices = ply["vertex"].data
-    names = vertices.dtype.names or ()
+    whole = ply["vertex"].data
+    vertices, names = whole[_every(len(whole), at_most)], whole.dtype.names or ()
     if missing := [axis for axis in "xyz" if axis not in names]:
         raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
     known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
@@ -296,7 +309,7 @@ def _read_ply(path: Path) -> PointCloud:
         random, position, patterns = columns[:6].T.copy(), columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
         uncertainty = PointUncertainty(random, position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
     deviation = column("deviation", np.nan)
-    return PointCloud(
+    cloud = PointCloud(
         points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
         intensity=column("intensity", np.nan),
         frame=indices("frame"),
@@ -305,6 +318,7 @@ def _read_ply(path: Path) -> PointCloud:
         uncertainty=uncertainty,
         metadata=_metadata(ply.comments),
     )
+    return cloud, len(whole)
 
 
 def _refuse_impossible_header(start: bytes, *, size: int, path: Path) -> None:
@@ -355,13 +369,18 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         aside.write_bytes(content.getbuffer())
 
 
-def _read_hdf5(path: Path) -> PointCloud:
+def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
     names = [part.name for part in fields(PointUncertainty)]
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
-            found = {name: read_array(file, name, path=path) for name in (*_KINDS, *names)}
+            points = find_dataset(file, "points_mm", path=path)
+            total = 0 if points is None or not points.ndim else len(points)
+            every = _every(total, at_most)
+            rows: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (every,))
+            rows["patterns_mm"] = (slice(None), every)
+            found = {name: read_array(file, name, path=path, selection=rows[name]) for name in rows}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
     arrays = {name: values for name, values in found.items() if values is not None}
@@ -378,4 +397,4 @@ def _read_hdf5(path: Path) -> PointCloud:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
     known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
-    return PointCloud(**per_point, uncertainty=known, metadata=header.metadata)
+    return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total

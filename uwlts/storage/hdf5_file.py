@@ -11,6 +11,7 @@ import math
 import os
 from contextlib import ExitStack
 from pathlib import Path
+from types import EllipsisType
 from typing import TYPE_CHECKING, TypeVar
 
 import h5py
@@ -148,8 +149,10 @@ def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Datase
     return dataset
 
 
-def read_array(file: h5py.File, name: str, *, path: str | Path) -> np.ndarray | None:
-    """All values of a dataset as from `find_dataset`; CaptureError also where the file cannot hold so many."""
+def read_array(
+    file: h5py.File, name: str, *, path: str | Path, selection: tuple[slice | EllipsisType, ...] = (...,)
+) -> np.ndarray | None:
+    """Values of a dataset as from `find_dataset`; CaptureError also where the file cannot hold so many."""
     dataset = find_dataset(file, name, path=path)
     if dataset is None:
         return None
@@ -159,7 +162,7 @@ def read_array(file: h5py.File, name: str, *, path: str | Path) -> np.ndarray | 
             f"{path} is damaged: '{name}' has the shape {dataset.shape}, of which {stored:,} bytes are there"
         )
     require_small_chunks(dataset, name, path=path)
-    return dataset[...]
+    return dataset[selection]
 
 
 def require_small_chunks(dataset: h5py.Dataset, name: str, *, path: str | Path) -> None:

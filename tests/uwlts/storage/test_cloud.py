@@ -3,6 +3,8 @@
 import errno
 import os
 import resource
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from tests.system.in_process import uwlts
 from tests.uwlts import drawn_stripes
 from uwlts.model.errors import CaptureError, OutputError
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud, PointUncertainty, is_cloud, read_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud, PointUncertainty, is_cloud, read_cloud, read_thinned_cloud, write_cloud
 from uwlts.storage.files import written_aside
 
 KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
@@ -65,6 +67,41 @@ def test_a_cloud_comes_back_bit_by_bit(tmp_path, name):
     assert back.metadata == cloud.metadata
     assert os.listdir(tmp_path) == [name]
     assert is_cloud(tmp_path / name)
+
+
+@KINDS
+@pytest.mark.parametrize("known", [False, True])
+def test_of_a_large_cloud_every_nth_point_is_read(tmp_path, name, known):
+    cloud = some_cloud(1001, uncertainty=some_uncertainty(1001) if known else None)
+    write_cloud(tmp_path / name, cloud)
+    thinned, total = read_thinned_cloud(tmp_path / name, 150)
+    assert (len(thinned), total) == (143, 1001)
+    for field in ("points_mm", "intensity", "frame", "line", "deviation_mm"):
+        np.testing.assert_array_equal(getattr(thinned, field), getattr(cloud, field)[::7])
+    if known:
+        np.testing.assert_allclose(thinned.covariance_mm2, cloud.covariance_mm2[::7], rtol=1e-5)
+    assert thinned.metadata == cloud.metadata
+    assert len(read_thinned_cloud(tmp_path / name, 1001)[0]) == len(read_thinned_cloud(tmp_path / name)[0]) == 1001
+
+
+@pytest.mark.slow
+@KINDS
+def test_a_cloud_larger_than_memory_allows_is_read_thinned(tmp_path, name):
+    """Four million points take 144 MB as arrays alone; some of them are read within 50 MB."""
+    count = 4_000_000
+    points = np.arange(3.0 * count).reshape(-1, 3)
+    write_cloud(tmp_path / name, PointCloud(points, np.zeros(count), np.zeros(count, int), np.zeros(count, int)))
+    program = (
+        "import resource, sys\nfrom uwlts.storage.cloud import read_thinned_cloud\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024\n"
+        "before = peak()\ncloud, total = read_thinned_cloud(sys.argv[1], 100_000)\n"
+        "print(len(cloud), total, cloud.points_mm[-1, 0], peak() - before)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, tmp_path / name], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    read, total, last, grown_mb = done.stdout.split()
+    assert (int(read), int(total), float(last)) == (100_000, count, 3.0 * (count - 40))
+    assert int(grown_mb) < 50
 
 
 @KINDS
