@@ -12,6 +12,7 @@ WIDTH_PX, HEIGHT_PX = 96, 512
 TRAVEL_MM, RESOLUTION_MM = 120.0, 0.001
 STAGE = {100: 1 / RESOLUTION_MM, 130: TRAVEL_MM}
 """Settings of the controller."""
+START_MM = 5.0
 PX_PER_MM = 3.0
 """How far a stripe moves in the image where the stage moves by a millimetre."""
 
@@ -46,7 +47,7 @@ def write_plan(
     path = folder / "plan.toml"
     path.write_text(
         f'title = "Drawn"\nsensor = "sensor.toml"\nmedium = "air"\ncamera = "{camera.address}"\nlaser_ms = {laser_ms}\n'
-        f'[stage]\nport = "{controller.port}"\nstart_mm = 5.0\nstep_mm = {step_mm!r}\ncount = {count}\n'
+        f'[stage]\nport = "{controller.port}"\nstart_mm = {START_MM}\nstep_mm = {step_mm!r}\ncount = {count}\n'
         "feed_mm_per_min = 900.0\n",
         encoding="utf-8",
     )

@@ -32,7 +32,7 @@ DESCRIPTIONS = {
 }
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def served(board: Scene, sensor: Sensor) -> Iterator[ServedTwin]:
     with serve(board, sensor=sensor, spp=4, speed_up=50.0) as running:
         yield running

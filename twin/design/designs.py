@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -68,12 +69,16 @@ class Marked:
     design: EvaluatedDesign
 
 
-def sensor_of(study: Study, design: Design) -> Sensor:
-    """The design's sensor, before anything follows the stand-off; errors where the values make no description."""
+def sensor_of(study: Study, design: Design, *, described: dict[str, Any] | None = None) -> Sensor:
+    """The design's sensor, before anything follows the stand-off; errors where the values make no description.
+
+    ``described`` is the study's sensor as a table, which many designs share.
+    """
     changes: dict[str, Value] = {}
     for name, value in design.values.items():
         changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
-    return _changed(study.sensor, changes, f"design {design.number}")
+    described = study.sensor.model_dump(exclude_none=True) if described is None else described
+    return _changed(described, changes, f"design {design.number}")
 
 
 def built(study: Study, design: Design) -> Sensor:
@@ -86,17 +91,17 @@ def built(study: Study, design: Design) -> Sensor:
         "volume": {"volume.near_mm": found.near_mm, "volume.far_mm": found.far_mm},
     }
     changes: dict[str, Value] = {path: value.item() for name in study.follow for path, value in numbers[name].items()}
-    return _changed(sensor, changes, f"design {design.number}")
+    return _changed(sensor.model_dump(exclude_none=True), changes, f"design {design.number}")
 
 
-def _changed(sensor: Sensor, changes: Mapping[str, Value], source: str) -> Sensor:
-    """The sensor with values at paths of its description replaced."""
-    table = sensor.model_dump(exclude_none=True)
+def _changed(described: dict[str, Any], changes: Mapping[str, Value], source: str) -> Sensor:
+    """The sensor of a table in which values at paths are replaced; the table stays as it is."""
+    table = dict(described)
     for path, value in changes.items():
         *parents, key = path.split(".")
         place = table
         for parent in parents:
-            place = place.setdefault(parent, {})
+            place[parent] = place = dict(place.get(parent, {}))
         place[key] = value
     return validated(Sensor, table, source)
 
@@ -108,9 +113,10 @@ def judged(study: Study, designs: Sequence[Design]) -> Columns:
     "failure", see `EvaluatedDesign`. A design that fails has figures NaN and an infinite violation.
     """
     numbers, failures = {}, [""] * len(designs)
+    described = study.sensor.model_dump(exclude_none=True)
     for place, design in enumerate(designs):
         try:
-            sensor = sensor_of(study, design)
+            sensor = sensor_of(study, design, described=described)
             numbers[place] = numbers_of(sensor, study.medium_of(sensor))
         except Error as error:
             failures[place] = str(error)

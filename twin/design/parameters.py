@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from types import ModuleType
 from typing import Literal
@@ -183,16 +183,12 @@ def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> SensorA
 
 def stacked(rows: Sequence[SensorArrays]) -> SensorArrays:
     """Parameters of N sensors, each of plain numbers, as arrays (N, 1, 1)."""
-    nodes = max(len(row.fan_nodes_rad) for row in rows)
-
-    def filled(table: tuple[float, ...]) -> tuple[float, ...]:
+    columns = {name: [vars(row)[name] for row in rows] for name in vars(rows[0])}
+    for name in ("fan_nodes_rad", "fan_powers"):
+        nodes = max(map(len, columns[name]))
         # Short tables are filled up with their last node, which adds nothing.
-        return (*table, *table[-1:] * (nodes - len(table)))
-
-    full = [replace(row, fan_nodes_rad=filled(row.fan_nodes_rad), fan_powers=filled(row.fan_powers)) for row in rows]
-    return SensorArrays(
-        **{one.name: _columns([getattr(row, one.name) for row in full]) for one in fields(SensorArrays)}
-    )
+        columns[name] = [(*table, *table[-1:] * (nodes - len(table))) for table in columns[name]]
+    return SensorArrays(**{name: _columns(values) for name, values in columns.items()})
 
 
 def _columns(values: Sequence[Array]) -> Array:
