@@ -117,8 +117,8 @@ def tab(page: "Page", name: str) -> None:
 
 
 def says(page: "Page", text: str) -> None:
-    """Wait until the log says something."""
-    page.locator(".log").get_by_text(text).first.wait_for()
+    """Wait until the log says something, a regular expression."""
+    page.locator(".log").get_by_text(re.compile(text)).first.wait_for()
 
 
 def shows(page: "Page", text: str) -> None:
@@ -380,6 +380,11 @@ def test_mistakes_are_said_and_cost_nothing(desk, page, served):
         press(page, "start")
         says(page, words)
     assert (desk.folder / "taken.h5").read_bytes() == b"a capture"
+    page.get_by_label("name of the capture").fill("scan")
+    for positions in ("0", "2.5"):
+        page.get_by_label("positions").fill(positions)
+        press(page, "start")
+        says(page, f"count: .*found {positions}")
     tab(page, "Measure")
     press(page, "length")
     says(page, "click two points")

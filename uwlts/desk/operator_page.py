@@ -22,11 +22,12 @@ from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.page import BoardView, build_board, laser_off_button, timed
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.guided.plan import load_guided_plan
-from uwlts.hardware.scan_plan import ScanPlan, load_plan
+from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.measurement.inspection import Shape, length_between, point_near, shape_near
 from uwlts.measurement.reconstruction import reconstruct
 from uwlts.model.command_files import own_files
 from uwlts.model.errors import DescriptionError, Error
+from uwlts.model.library import validated
 from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud, read_thinned_cloud, write_cloud
 from uwlts.storage.files import refuse_unsuitable
@@ -166,6 +167,17 @@ class _Desk:
         return PointCloud(points[:, :3], points[:, 3], none, none, metadata={})
 
 
+class _Number(ui.number):
+    """A field for a number that stays as it was typed.
+
+    NiceGUI's own is rewritten when it loses the focus, by a number that may be older than what was typed before the
+    page was connected.
+    """
+
+    def sanitize(self) -> None:
+        """Nothing: limits are checked where the number is used."""
+
+
 class _OperatorPage:
     """The operator's page in one browser."""
 
@@ -257,7 +269,7 @@ class _OperatorPage:
             self._light.on_value_change(lambda event: self._look(event.value))
             self._button("find exposure", self._instrument.find_exposure, (InstrumentState.READY,)).props("outline")
         self._exposed = self._exposure_now()
-        self._exposure = ui.number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
+        self._exposure = _Number("exposure, ms", value=self._exposed[1], min=0.001, step=0.1, format="%.3g")
         self._exposure.on("change", self._expose)
         ui.label("With the laser's light the laser is lit only while an image is exposed.").classes("text-xs")
 
@@ -295,7 +307,7 @@ class _OperatorPage:
 
     def _expose(self) -> None:
         light, value = self._instrument.light, self._exposure.value
-        if light is not None and value:
+        if light is not None and value and value > 0:
             self._instrument.exposure_ms[light] = float(value)
 
     # Stage
@@ -312,7 +324,7 @@ class _OperatorPage:
                     f'outline dense aria-label="move by {by:+g} mm"'
                 )
         with ui.row().classes("items-center"):
-            place = ui.number("position, mm", value=0.0, format="%.3f")
+            place = _Number("position, mm", value=0.0, format="%.3f")
             self._button("move", lambda: self._instrument.move(float(place.value or 0.0)), (InstrumentState.READY,))
 
     # Calibrate
@@ -347,9 +359,9 @@ class _OperatorPage:
         stage = None if plan is None else plan.stage
         start, step, count = (None, None, None) if stage is None else (stage.start_mm, stage.step_mm, stage.count)
         with ui.row():
-            self._start = ui.number("first position, mm", value=start, format="%.3f")
-            self._step = ui.number("step, mm", value=step, format="%.4f")
-            self._number = ui.number("positions", value=count, min=1, precision=0)
+            self._start = _Number("first position, mm", value=start, format="%.3f")
+            self._step = _Number("step, mm", value=step, format="%.4f")
+            self._number = _Number("positions", value=count, min=1, precision=0)
         self._extent = ui.label().classes("text-sm")
         self._show_extent()
         for each in (self._start, self._step, self._number):
@@ -377,8 +389,8 @@ class _OperatorPage:
         start, step, count = self._start.value, self._step.value, self._number.value
         if start is None or step is None or count is None:
             raise DescriptionError("give the first position, the step and the number of positions")
-        moved = {"start_mm": start, "step_mm": step, "count": int(count)}
-        stage = type(plan.stage).model_validate(plan.stage.model_dump() | moved)
+        moved = {"start_mm": start, "step_mm": step, "count": count}
+        stage = validated(StagePlan, plan.stage.model_dump() | moved, "the scan")
         out = new_in(self._desk.folder, self._out.value or "", suffix=".h5")
         overwrite = bool(self._overwrite.value)
         if out.exists() and not overwrite and not resume:
@@ -478,7 +490,7 @@ class _OperatorPage:
             self._button("length", self._length)
             self._button("forget points", self._forget).props("flat")
         with ui.row().classes("items-center"):
-            self._radius = ui.number("radius about the point, mm", value=15.0, min=0.01)
+            self._radius = _Number("radius about the point, mm", value=15.0, min=0.01)
             for shape in get_args(Shape):
                 self._button(shape, partial(self._shape, shape)).props("outline dense")
         self._results = ui.column().classes("w-full gap-1 text-sm font-mono")
@@ -508,6 +520,8 @@ class _OperatorPage:
         if not picked:
             raise DescriptionError("click a point in the cloud first")
         radius = float(self._radius.value or 0.0)
+        if radius <= 0:
+            raise DescriptionError("give the radius about the point, above 0 mm")
         self._result((await asyncio.to_thread(shape_near, cloud, picked[-1], radius, shape)).text())
 
     def _result(self, text: str) -> None:
