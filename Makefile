@@ -11,7 +11,7 @@ export PIP_NO_INPUT := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-full check fuzz soak bench docs setup clean
+.PHONY: help demo test test-full check style types fuzz soak bench docs setup clean
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
@@ -31,16 +31,24 @@ demo: setup
 test: PYTEST_OPTIONS := -m "not slow"
 # Threads of two test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
-test test-full: check
+test test-full: style
 	@$(PYTHON) -m twin.devices.aravis_install
 	@# Without a browser only the tests of pages fail.
 	-@$(PYTHON) -m tests.browser
-	@$(PYTHON) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS)
+	@# Types are checked beside the tests, in time that those leave: many wait for simulated hardware and for pages.
+	@found=$$(mktemp); nice $(VENV)/bin/basedpyright >$$found 2>&1 & checking=$$!; \
+	trap 'kill $$checking 2>/dev/null; rm -f $$found' EXIT; trap 'exit 130' INT TERM; \
+	$(PYTHON) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); tested=$$?; \
+	wait $$checking; typed=$$?; echo "types:"; cat $$found; exit $$((tested ? tested : typed))
 
-check: setup
+check: style types
+
+style: setup
 	@$(PYTHON) -m ruff format --check --quiet .
 	@$(PYTHON) -m ruff check --quiet .
 	@$(VENV)/bin/lint-imports --no-logo
+
+types: setup
 	@$(VENV)/bin/basedpyright --threads 2
 
 fuzz: setup
